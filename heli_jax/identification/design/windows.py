@@ -1,4 +1,4 @@
-"""The windows of a record with most information on the free parameters, by Fisher's information.
+"""Windows of a record with the most information (Fisher) on the free parameters.
 
 The record is cut into windows side by side, each with an initial state of its own, as multiple
 shooting does; with filter error a window is its part of the one filter. One Jacobian at the start

@@ -1,4 +1,4 @@
-"""Does the model explain what was measured, beside noise and disturbance?"""
+"""Adequacy of the model, beside noise and disturbance."""
 
 from collections.abc import Iterator
 
@@ -48,7 +48,7 @@ def outputs_explained(c: Context) -> Iterator[Finding]:
 
 
 def _advice(c: Context, output: OutputAdequacy) -> str:
-    """Advice on an output that is not explained: the most telling that is not followed yet."""
+    """Advice on an output that is not explained: the most useful step that is not taken yet."""
     problem, name = c.problem, output.output
     filtered = problem.noise_model == "disturbance"
     diverged = any(
@@ -89,7 +89,7 @@ def _why(output: OutputAdequacy, ahead: float | None) -> str:
 
 
 def simulation_as_expected(c: Context) -> Iterator[Finding]:
-    """Agreement that looks bad because of the estimated disturbance."""
+    """Outputs that look bad because of the estimated disturbance."""
     if not c.fitted or c.adequacy.by_chance:
         return
     if c.adequacy.ahead is not None:
@@ -129,8 +129,7 @@ def outputs_unmoved(c: Context) -> Iterator[Finding]:
 
 
 def responses_explained(c: Context) -> Iterator[Finding]:
-    """Fitted frequency responses that are not explained, by their squared errors over the
-    variance."""
+    """Squared errors of fitted responses over their variance, which gusts do not change."""
     if c.responses is None or c.unrelated:
         return
     if c.responses.misfit:
@@ -155,7 +154,7 @@ WRONG_OPTIMUM = "search.wrong-optimum"
 
 
 def residual_follows_excitation(c: Context) -> Iterator[Finding]:
-    """Residuals in frequency that still follow the excitation."""
+    """Residuals in frequency that still follow what excites the vehicle."""
     if not c.fitted or c.unrelated:
         return
     level, failed = LEVEL / max(len(c.followed), 1), c.failed
@@ -181,7 +180,7 @@ def residual_follows_excitation(c: Context) -> Iterator[Finding]:
 
 
 def outputs_follow_excitation(c: Context) -> Iterator[Finding]:
-    """Outputs that do not follow the excitation, so that their residuals do not either."""
+    """Records of which no output follows the excitation: residuals that do not are no merit."""
     if not c.unrelated:
         return
     least = min(c.unrelated.values())
@@ -228,7 +227,7 @@ def held_out_predicted(c: Context) -> Iterator[Finding]:
 
 
 def _contradicted(flight: HeldOutFlight) -> Iterator[Finding]:
-    """A flight held out of a fit in frequency that contradicts it."""
+    """Contradictions of a fit in frequency by a flight held out."""
     label, furthest = flight.flight, flight.furthest
     if flight.worse:
         code = "held-out.worse-than-none"

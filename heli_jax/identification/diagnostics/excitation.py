@@ -1,4 +1,4 @@
-"""Do the inputs excite what is asked, and what would excite it better?"""
+"""Excitation by the inputs, and the manoeuvre that would add most."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -67,10 +67,12 @@ def nothing_follows(c: Context) -> Iterator[Finding]:
 
 def excited_bands(c: Context) -> Iterator[Finding]:
     """The bands that the inputs excite, and the outputs that follow."""
+    if c.fitted:
+        return
     following = {
         n: f.explained for n, f in c.excitation.outputs.items() if f.explained >= LIMITS.nothing
     }
-    if following and not c.fitted:
+    if following:
         bands = c.excitation.powers
         yield found(
             "excitation.excited-band",

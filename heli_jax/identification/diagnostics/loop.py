@@ -1,4 +1,4 @@
-"""Do inputs follow the response, and what does that do to the estimates?"""
+"""Feedback from the response to the inputs, and its effect on the estimates."""
 
 from collections.abc import Iterator, Sequence
 
@@ -68,7 +68,7 @@ def inputs_follow_response(c: Context) -> Iterator[Finding]:
 
 
 def _frees_a_delay(problem: Problem, late: Sequence[str]) -> str:
-    """Advice on what to free, to separate inputs that are logged late from a closed loop."""
+    """Parameters to free, to tell inputs that are logged late from a closed loop."""
     own = dict(problem.model.delays)
     asked = problem.nuisance.time_shift or all(own.get(name) in problem.free for name in late)
     return "" if asked or not late else "fit.nuisance.time_shift, or delays of the model"

@@ -1,4 +1,4 @@
-"""Are signals cut off, stuck, astray, logged in coarse steps or smoothed?
+"""Signals that are cut off, stuck, astray, logged in coarse steps or smoothed.
 
 Judged as they were logged, where the flight knows it: what was resampled has no flat tops and no
 steps, and suffers from them all the same.

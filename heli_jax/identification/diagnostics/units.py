@@ -1,4 +1,4 @@
-"""Do signals have the signs and units that they are said to have?
+"""Signs and units of signals.
 
 What a record shows of that by itself is little: degrees fit as well as radians, and a turned input
 as well as a right one, with estimates that are off by 57 or of the other sign.

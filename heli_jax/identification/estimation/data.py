@@ -289,7 +289,7 @@ def _at_start(y: np.ndarray) -> float:
     seen = np.flatnonzero(np.isfinite(y[:_LINE]))
     if seen.size < 3:
         # Too few for a line that averages anything. A slow sensor's first sample comes later: the
-        # machine was near that, rather than at zero.
+        # vehicle was near that, rather than at zero.
         seen = seen if seen.size else np.flatnonzero(np.isfinite(y))
         return float(y[seen[0]]) if seen.size else float("nan")
     return float(np.polyval(np.polyfit(seen, y[seen], 1), 0.0))

@@ -1,6 +1,6 @@
 """Filter error: the innovations of a Kalman filter, over their standard deviations.
 
-Maximum likelihood where a disturbance acts on the machine (Jategaonkar, 2006, chapter 5): its
+Maximum likelihood where a disturbance acts on the vehicle (Jategaonkar, 2006, chapter 5): its
 intensity and correlation time are estimated beside the parameters, the scale of the measurement
 noise is concentrated out of the likelihood unless it is given.
 """
@@ -439,7 +439,7 @@ OBJECTIVE = FilterError()
 
 # Predictions some seconds ahead, from the state that a filter has estimated by then.
 #
-# A simulation of an unstable machine leaves any record, and one step ahead everything is predicted
+# A simulation of an unstable vehicle leaves any record, and one step ahead everything is predicted
 # well. In between stands what such a model can be judged by.
 
 

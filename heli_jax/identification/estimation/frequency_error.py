@@ -5,10 +5,10 @@ a frequency of the record's own,
 
 $$X = (zI - A_d)^{-1}\,[B_d U + z\,(x_0 - x_N)]$$
 
-is exact, for unstable machines too: nothing is simulated, and the ends of the record are n numbers
+is exact, for unstable vehicles too: nothing is simulated, and the ends of the record are n numbers
 that are found by linear least squares and projected out, with n more for the ends of slow gusts.
 The noise's spectrum, a matrix over the outputs, is estimated from the residual and weighs the
-frequencies; maximum likelihood then holds where gusts disturb the machine as well, as long as no
+frequencies; maximum likelihood then holds where gusts disturb the vehicle as well, as long as no
 feedback brings them into the inputs. Models that are not linear are linearised where they fly.
 
 Where flights hold an excitation that was added to an input and that no feedback reaches, the errors
@@ -148,14 +148,14 @@ class FrequencyError(Objective):
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
     ) -> tuple[Float[Array, " q"], Noise]:
         """The spectrum that the errors show, smoothed over frequency and flights."""
-        errors, machine = jax.device_get(errors_of_lines(layout, data, noise, z))
+        errors, vehicle = jax.device_get(errors_of_lines(layout, data, noise, z))
         rows = sum(2 * v.size for v in errors)
         freedom = rows / max(rows - len(layout.free), 1)
         errors = [v * freedom**0.5 for v in errors]
         # Powers of errors that overflow have no spectrum.
         with np.errstate(all="ignore"):
             try:
-                whitening = whitening_by(machine, errors)
+                whitening = whitening_by(vehicle, errors)
                 sound = all(np.isfinite(W).all() for W in whitening)
             except np.linalg.LinAlgError:
                 sound = False
@@ -244,7 +244,7 @@ OBJECTIVE = FrequencyError()
 
 
 _NOTHING = 100.0
-"""times the machine's precision: what of the information, of columns of one size, is rounding"""
+"""times the vehicle's precision: what of the information, of columns of one size, is rounding"""
 
 
 class Products(NamedTuple):
@@ -311,7 +311,7 @@ def products_of_lines(
     total = []
     for members in alike(layout, data):
         parts = parts_of_group(layout, noise, members)
-        machines, slopes = differentiated(
+        vehicles, slopes = differentiated(
             lambda v, members=members: machines_of(layout, data, unknowns(v), members), v
         )
 
@@ -326,10 +326,10 @@ def products_of_lines(
             ]
             return jax.tree.map(lambda *v: sum(v), *made)
 
-        direct = (machines.driving, slopes.driving)
-        by = None if machines.by is None else (machines.by, slopes.by)
+        direct = (vehicles.driving, slopes.driving)
+        by = None if vehicles.by is None else (vehicles.by, slopes.by)
         each = (direct, by, measured(layout, data, members))
-        common = (machines.matrices, slopes.matrices)
+        common = (vehicles.matrices, slopes.matrices)
         made = by_flight(data, members, ready, of_some, common, each)
         total.append(jax.tree.map(lambda v: jnp.sum(v, axis=0), made))
     return jax.tree.map(lambda *v: sum(v), *total)
@@ -347,7 +347,7 @@ def _of_record(
     """Of one record of a few flights, with a leading axis.
 
     Args:
-        direct: what drives the machines, and its derivatives by the unknowns.
+        direct: what drives the vehicles, and its derivatives by the unknowns.
         by: the same by instrument.
     """
     m, dm = matrices
@@ -358,7 +358,7 @@ def _of_record(
         return by_block(lines.reshape(*lines.shape[:2], *v.shape[2:]), len(at.z), axis=1)
 
     own = (e.rows, e.X, *jax.tree.map(blocks, (direct, by)))
-    # What passes a machine by, without its states, hangs on no unknown of most.
+    # What passes a vehicle by, without its states, hangs on no unknown of most.
     passes = any(v is not None for v in (dm.C, dm.D, direct[1].held))
 
     # Block by block: the derivatives at all lines would leave every cache.

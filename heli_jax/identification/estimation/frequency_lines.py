@@ -165,7 +165,7 @@ class Matrices(NamedTuple):
 
 
 class Driving(NamedTuple):
-    """What drives a machine, in time or at the lines."""
+    """What drives a vehicle, in time or at the lines."""
 
     U: Array
     """what B multiplies, (N, r)"""
@@ -253,13 +253,13 @@ def by_flight(
     """`body(prepared(common), some of each)` over the flights of a group, with a leading axis.
 
     Args:
-        prepared: what of it is the same for flights that have one machine.
+        prepared: what of it is the same for flights that have one vehicle.
         body: of a few flights, which have a leading axis in what it is given and what it returns.
-        common: of the machine; with a leading axis where each flight has its own.
+        common: of the vehicle; with a leading axis where each flight has its own.
     """
     count = len(members)
     one_machine = _one_machine(data, members)
-    # A few at a time: what is read for every line of a machine is then read once for all of them,
+    # A few at a time: what is read for every line of a vehicle is then read once for all of them,
     # and what is on the way to a few sums of a flight still fits into memory.
     size = max(n for n in range(1, together + 1) if count % n == 0) if one_machine else 1
     some = jax.tree.map(lambda v: v.reshape(count // size, size, *v.shape[1:]), each)
@@ -324,7 +324,7 @@ def with_shared(layout: Layout, u: Unknowns, v: Float[Array, " q"]) -> Unknowns:
 
 _NUMBERS = 20_000
 """outputs times states times lines in a block at most: 256 lines of a helicopter, and the whole
-record of a small machine, whose blocks would take longer to begin than to go through"""
+record of a small vehicle, whose blocks would take longer to begin than to go through"""
 
 
 _NO_END = 1e-10
@@ -339,7 +339,7 @@ _SPARED = 0.1
 
 
 class Resolved(NamedTuple):
-    """What a machine does at the lines of a record, by block (b, ...); without a derivative."""
+    """What a vehicle does at the lines of a record, by block (b, ...); without a derivative."""
 
     z: Complex[Array, "b k"]
     T: Complex[Array, "n n"]
@@ -379,7 +379,7 @@ def by_block(v: Array, count: int, axis: int = 0) -> Array:
 
 
 def resolved(m: Matrices, record: Record, whitening: Complex[Array, "K p p"]) -> Resolved:
-    """A machine at the lines of a record."""
+    """A vehicle at the lines of a record."""
     (p, n), K = m.C.shape, record.lines
     W = by_block(whitening, -(-K * m.C.size // _NUMBERS))
     count, size = W.shape[:2]
@@ -483,7 +483,7 @@ def errors_of_some(
     acting: Driving,
     y: Float[Array, "f N p"],
 ) -> Errors:
-    """Of one record of each of a few flights of one machine, with a leading axis.
+    """Of one record of each of a few flights of one vehicle, with a leading axis.
 
     Args:
         acting: over the whole flights.
@@ -564,7 +564,7 @@ class LineErrors(NamedTuple):
 
     errors: list[Complex[Array, "K p"]]
     """by record, its ends taken off, not whitened"""
-    machine: Matrices
+    vehicle: Matrices
     """of the first flight"""
 
 
@@ -574,7 +574,7 @@ def errors_of_lines(layout: Layout, data: Data, noise: Noise, z: Float[Array, " 
     u, errors, first = unpack(layout, data, z), {}, None
     for members in alike(layout, data):
         parts = parts_of_group(layout, noise, members)
-        machines, y = machines_of(layout, data, u, members), measured(layout, data, members)
+        vehicles, y = machines_of(layout, data, u, members), measured(layout, data, members)
 
         def ready(m: Matrices, parts: Any = parts) -> Any:
             return m, [resolved(m, record, W) for record, W in parts]
@@ -588,9 +588,9 @@ def errors_of_lines(layout: Layout, data: Data, noise: Noise, z: Float[Array, " 
                 made.append(e.beyond - by_real(X[:, : record.lines], m.C.T))
             return made
 
-        first = first_machine(machines.matrices) if first is None else first
-        each = (machines.driving, y)
-        made = by_flight(data, members, ready, of_some, machines.matrices, each)
+        first = first_machine(vehicles.matrices) if first is None else first
+        each = (vehicles.driving, y)
+        made = by_flight(data, members, ready, of_some, vehicles.matrices, each)
         for k, i in enumerate(members):
             errors[i] = [left[k] for left in made]
     assert first is not None

@@ -111,12 +111,7 @@ def knots_of(
     K: int, part: float = PART, least: float = LEAST
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
     """Lines (from 0) at which a spectrum of K lines is computed, and of each line the knot below
-    and how far it is on the way to the next.
-
-    Args:
-        part: sd of the Gaussian as a part of the frequency.
-        least: the same in lines, at least.
-    """
+    and how far it is on the way to the next."""
     knots = [0]
     while knots[-1] < K - 1:
         width = max(least, part * (knots[-1] + 1))
@@ -156,8 +151,6 @@ def averages(
 
     Args:
         counts: lines of a record and how many there are of them, for each length.
-        part: sd of the Gaussian as a part of the frequency.
-        least: the same in lines, at least.
     """
     at, _ = knots_of(K, part, least)
     kernels = [(n, *_kernel(K, other, part, least)) for other, n in counts]
@@ -180,9 +173,9 @@ def log_determinants(W: Complex[np.ndarray, "K p p"]) -> Float[np.ndarray, " K"]
     return np.sum(np.log(np.abs(np.diagonal(np.asarray(W), axis1=1, axis2=2))), axis=1)
 
 
-# The noise's spectrum by what the machine makes of gusts, and a mean over lines of what is left.
+# The noise's spectrum by what the vehicle makes of gusts, and a mean over lines of what is left.
 #
-# Gusts come out of a machine with its integrations and modes in them: outputs that are coherent
+# Gusts come out of a vehicle with its integrations and modes in them: outputs that are coherent
 # with a gain that changes from line to line. A mean over lines makes something else of that,
 # estimates lose most of what the record tells, and intervals are too narrow. So the spectrum is
 # first described as
@@ -224,11 +217,11 @@ def machine_of(layout: Layout, data: Data, z: Float[Array, " q"]) -> Matrices:
 
 
 def whitening_by(
-    machine: Matrices, errors: Sequence[Complex[np.ndarray, "K p"]]
+    vehicle: Matrices, errors: Sequence[Complex[np.ndarray, "K p"]]
 ) -> tuple[Complex[np.ndarray, "K p p"], ...]:
     """By record what makes its errors white; of records of one length the same array."""
     counts = Counter(len(e) for e in errors)
-    before = _prewhitening(machine, errors, list(counts))
+    before = _prewhitening(vehicle, errors, list(counts))
     left = smoothed(
         [np.einsum("kij,kj->ki", before[len(e)], e) for e in errors], GUST_PART, least=GUST_LEAST
     )
@@ -243,10 +236,10 @@ def whitening_by(
 
 
 def _prewhitening(
-    machine: Matrices, errors: Sequence[Complex[np.ndarray, "K p"]], lengths: list[int]
+    vehicle: Matrices, errors: Sequence[Complex[np.ndarray, "K p"]], lengths: list[int]
 ) -> dict[int, Complex[np.ndarray, "K p p"]]:
-    """By length of the record S0^(-1/2); ones where the machine says nothing of the errors."""
-    Ad, C = np.asarray(machine.Ad, float), np.asarray(machine.C, float)
+    """By length of the record S0^(-1/2); ones where the vehicle says nothing of the errors."""
+    Ad, C = np.asarray(vehicle.Ad, float), np.asarray(vehicle.C, float)
     cells = []
     for K in lengths:
         of_length = np.stack([e for e in errors if len(e) == K])

@@ -153,32 +153,16 @@ def _in_time(
     return jnp.real(jnp.fft.ifft(lines * of_lines, N, axis=-1) * in_time)
 
 
-class _Group(NamedTuple):
-    """Flights that differ in numbers alone."""
-
-    members: list[int]
-    """their numbers"""
-    starts: tuple[int, ...]
-    """first samples of the windows"""
-    outputs: np.ndarray
-    """which of the outputs in windows they have"""
-
-
-def _groups(layout: Layout, data: Data, weights: ResponseWeights) -> list[_Group]:
-    """Those that have windows."""
-    w, made = weights.windows, []
-    for members in alike(layout, data):
-        seen = np.array([n in layout.outputs[members[0]] for n in w.outputs])
-        if starts := w.starts[members[0]]:
-            made.append(_Group(members, starts, np.flatnonzero(seen)))
-    return made
+def _groups(layout: Layout, data: Data, weights: ResponseWeights) -> list[list[int]]:
+    """Flights that have windows and differ in numbers alone."""
+    return [g for g in alike(layout, data) if weights.windows.starts[g[0]]]
 
 
 class _Measured(NamedTuple):
     """Of a flight."""
 
     y: Float[Array, "p N"]
-    """the outputs in windows; zero where nothing is measured"""
+    """zero where nothing is measured"""
     Z: Array | np.ndarray
     """(W, k, m), see `Windowed`"""
     seen: Array | np.ndarray
@@ -201,7 +185,7 @@ def _by_flight(
     data: Data,
     weights: ResponseWeights,
     u: Unknowns,
-    group: _Group,
+    group: list[int],
     ends: Float[Array, "f n"] | None,
     body: Callable[[Array, Array, _Measured], Any],
 ) -> Any:
@@ -213,18 +197,15 @@ def _by_flight(
         ends: of each flight; zero unless given.
     """
     w = weights.windows
-    N = next(iter(data.flights[group.members[0]].outputs.values())).shape[0]
+    N = next(iter(data.flights[group[0]].outputs.values())).shape[0]
     of_windows = dataclasses.replace(layout, outputs=(w.outputs,) * len(data.flights))
-    machines = machines_of(of_windows, data, u, group.members)
+    vehicles = machines_of(of_windows, data, u, group)
 
     def windows(y: Array) -> Complex[Array, "p *c W k"]:
-        """Of the group's outputs (., *c, N), zero for the others."""
-        y = jnp.zeros((len(w.outputs), *y.shape[1:]), y.dtype).at[group.outputs].set(y)
-        E = window_transforms(y.reshape(-1, N), group.starts, w.length, w.numbers, w.dt)
+        E = window_transforms(y.reshape(-1, N), w.starts[group[0]], w.length, w.numbers, w.dt)
         return jnp.asarray(E).reshape(*y.shape[:-1], *E.shape[1:])
 
     def ready(m: Matrices) -> tuple[Matrices, Resolved, Array]:
-        m = m._replace(C=m.C[group.outputs], D=m.D[group.outputs])
         at = resolved(m, N)
         return m, at, windows(at.ends(N))
 
@@ -232,14 +213,14 @@ def _by_flight(
         m, at, effects = of
 
         def of_one(driving: Driving, measured: _Measured, ends: Any) -> Any:
-            left = measured.y[group.outputs] - bounded_outputs(m, driving, at, ends)
+            left = measured.y - bounded_outputs(m, driving, at, ends)
             return body(windows(left), effects, measured)
 
         return jax.vmap(of_one)(*some)
 
-    each = (machines.driving, _measured(data, w, group.members), ends)
+    each = (vehicles.driving, _measured(data, w, group), ends)
     # One at a time: what is made of a flight's windows for each unknown fills the caches.
-    return by_flight(data, group.members, ready, of_some, machines.matrices, each, together=1)
+    return by_flight(data, group, ready, of_some, vehicles.matrices, each, together=1)
 
 
 def _cross(measured: _Measured, E: Complex[Array, "p c W k"]) -> Complex[Array, "k p m c"]:
@@ -266,52 +247,39 @@ def rows_of_responses(
     layout: Layout, data: Data, weights: ResponseWeights, u: Unknowns
 ) -> Float[Array, " r"]:
     """Whitened errors of all responses, without what the ends of the records may add."""
-    rest, groups = jax.lax.stop_gradient(u), _groups(layout, data, weights)
+    v, groups = shared_of(layout, u), _groups(layout, data, weights)
+    at, rest = jax.lax.stop_gradient((v, u))
 
     def sums(v: Array, ends: Sequence[Array | None], body: Callable[..., Any]) -> list[Any]:
         here = with_shared(layout, rest, v)
         each = zip(groups, ends, strict=True)
         return [_by_flight(layout, data, weights, here, g, end, body) for g, end in each]
 
-    def projected(v: Array) -> tuple[Array, Array, list[Array]]:
-        """The rows, directions of what the ends add, and by group the ends that suit the errors
-        best."""
+    def with_effects(E: Array, effects: Array, own: _Measured) -> Any:
+        return _cross(own, E[:, None]), _cross(own, effects)
 
-        def body(E: Array, effects: Array, own: _Measured) -> Any:
-            return _cross(own, E[:, None]), _cross(own, effects)
+    made = sums(at, [None] * len(groups), with_effects)
+    rows = _whitened(weights, _summed(S for S, _ in made))[:, 0]
+    # Directions of what the ends add: the states of each flight in turn, as columns.
+    columns = [jnp.moveaxis(e, 0, 3).reshape(*e.shape[1:4], -1) for _, e in made]
+    basis = _whitened(weights, jnp.concatenate(columns, axis=3))
+    S = orthonormal(basis.T @ basis)
+    Q = basis @ S
+    along = Q.T @ rows
+    # By group the ends that suit the errors best.
+    each = jnp.split(S @ along, np.cumsum([c.shape[3] for c in columns])[:-1])
+    ends = [v.reshape(len(e), -1) for v, (_, e) in zip(each, made, strict=True)]
 
-        made = sums(v, [None] * len(groups), body)
-        rows = _whitened(weights, _summed(S for S, _ in made))[:, 0]
-        effects = [of_ends for _, of_ends in made]
-        # The states of each flight in turn, as columns.
-        columns = [jnp.moveaxis(e, 0, 3).reshape(*e.shape[1:4], -1) for e in effects]
-        basis = _whitened(weights, jnp.concatenate(columns, axis=3))
-        S = orthonormal(basis.T @ basis)
-        Q = basis @ S
-        along = Q.T @ rows
-        each = jnp.split(S @ along, np.cumsum([c.shape[3] for c in columns])[:-1])
-        ends = [v.reshape(len(e), -1) for v, e in zip(each, effects, strict=True)]
-        return rows - Q @ along, Q, ends
+    def errors(v: Array) -> Array:
+        return _whitened(
+            weights, _summed(sums(v, ends, lambda E, _, own: _cross(own, E[:, None])))
+        )[:, 0]
 
-    @jax.custom_jvp
-    def rows(v: Array) -> Array:
-        return projected(v)[0]
-
-    # Once for the unknowns that all flights share, and not for each nuisance.
-    @rows.defjvp
-    def _(at: tuple[Array], along: tuple[Array]) -> tuple[Array, Array]:
-        made, Q, ends = projected(at[0])
-
-        def errors(v: Array) -> Array:
-            each = sums(v, ends, lambda E, _, own: _cross(own, E[:, None]))
-            return _whitened(weights, _summed(each))[:, 0]
-
-        J = jax.jacfwd(errors)(at[0])
-        # Variable projection: about the ends that suit these unknowns best, whose own effect moves
-        # with the unknowns.
-        return made, (J - Q @ (Q.T @ J)) @ along[0]
-
-    return rows(shared_of(layout, u))
+    # Variable projection: about the ends that suit these unknowns best, whose own effect moves
+    # with the unknowns. Once for the unknowns that all flights share, and not for each nuisance.
+    J = jax.jacfwd(errors)(at)
+    rows, J = jax.lax.stop_gradient((rows - Q @ along, J - Q @ (Q.T @ J)))
+    return rows + J @ (v - at)
 
 
 @eqx.filter_jit
@@ -338,7 +306,7 @@ def errors_in_windows(
 
     for group in _groups(layout, data, weights):
         made = _by_flight(layout, data, weights, u, group, None, left)
-        of_flight |= {i: jnp.moveaxis(made[j], 0, -1) for j, i in enumerate(group.members)}
+        of_flight |= {i: jnp.moveaxis(made[j], 0, -1) for j, i in enumerate(group)}
     return jnp.concatenate([of_flight[i] for i in sorted(of_flight)])
 
 

@@ -88,17 +88,17 @@ def trusted_columns(
         z: where.
     """
     # Of parameters of 1e6 and 1e-8 the columns differ by 1e14 for their units alone. Rounding may
-    # leave as little of a column that is zero; it does not foretell what the residuals do.
+    # leave as little of a column that is zero; it does not predict what the residuals do.
     trusted = nothing_trusted(layout)
     norms = np.linalg.norm(np.asarray(J), axis=0)
     small = (norms > 0) & (norms <= _SMALL * np.max(norms, initial=0.0)) & without_size(layout)
     for i in np.flatnonzero(small):
         step = _TRIAL * max(float(jnp.linalg.norm(r)), 1.0) / norms[i]
-        foretold = np.asarray(J)[:, i] * step
+        predicted = np.asarray(J)[:, i] * step
         with np.errstate(all="ignore"):  # so small a column that the step overflows
             change = np.asarray(evaluate(z.at[i].add(step))[0]) - np.asarray(r)
-            missed = np.linalg.norm(change - foretold)
-        trusted[i] = bool(missed < 0.5 * np.linalg.norm(foretold))
+            missed = np.linalg.norm(change - predicted)
+        trusted[i] = bool(missed < 0.5 * np.linalg.norm(predicted))
     return trusted
 
 

@@ -179,18 +179,6 @@ class Search:
         return z
 
 
-def gauss_newton_gain(r: Array | np.ndarray, J: Array | np.ndarray) -> float:
-    """Return the fall of the sum of squares of r (n,) that the linear model J (n, q) predicts for a
-    Gauss-Newton step; NaN if either is not finite."""
-    r, J = np.asarray(r, np.float64), np.asarray(J, np.float64)
-    if not (np.isfinite(r).all() and np.isfinite(J).all()):
-        return float("nan")
-    # The step takes away the part of r that lies in the span of J's columns.
-    norms = np.linalg.norm(J, axis=0)
-    Q, _ = np.linalg.qr(J / np.where(norms > 0, norms, 1.0))
-    return float(np.sum((Q.T @ r) ** 2))
-
-
 def named_values(
     layout: Layout, data: Data, z: Float[Array | np.ndarray, " q"]
 ) -> dict[str, float]:

@@ -11,7 +11,7 @@ from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
-from heli_jax.identification.estimation.multistart import Search, gauss_newton_gain
+from heli_jax.identification.estimation.multistart import Search
 from heli_jax.identification.estimation.noise_scales import own_changed, slopes_changed
 from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Free, Problem
@@ -24,7 +24,7 @@ _ROUNDS = 30
 _UNCHANGED = 1e-3
 """change in the logarithm of every sd below which the relaxation has ended"""
 _SETTLED = 0.01
-"""way that the optimum has still to go, in joint standard deviations, below which it has ended"""
+"""move of the optimum, in joint standard deviations, below which it has ended as well"""
 
 
 class RelaxedOptimum(NamedTuple):
@@ -84,7 +84,7 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
     """
     layout, objective = search.layout, search.layout.objective
     trace = [(int(best.steps), float(best.cost))]
-    moved, left, notes = np.inf, np.inf, ()
+    moved, notes = np.inf, ()
     for _ in range(_ROUNDS):
         z, new = objective.relax(layout, search.data, noise, best.z)
         change = _changed(noise, new)
@@ -97,14 +97,11 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
         # the noise of the round before, and where one stays so does the other.
         best, noise = best._replace(z=z), new
         # A search that failed with one noise is not repeated with another.
-        if change < _UNCHANGED or left < _SETTLED or not (moves and bool(best.converged)):
+        if change < _UNCHANGED or moved < _SETTLED or not (moves and bool(best.converged)):
             break
         [best] = search.run(noise, _without_nuisances(layout, best.z)[None])
         trace.append((int(best.steps), float(best.cost)))
-        before, moved = moved, float(best.moved) ** 0.5
-        # Moves that shrink by about the same factor are a geometric series.
-        rest = moved / (before - moved) if moved < before else 1.0
-        left = moved * min(rest, 1.0) if np.isfinite(before) else moved
+        moved = float(best.moved) ** 0.5
     else:
         notes = (found("search.noise-not-settled", value=moved, rounds=_ROUNDS, limit=_SETTLED),)
     best = best._replace(z=objective.finish(layout, search.data, noise, best.z))
@@ -177,13 +174,17 @@ def gain_left(
         parameters -= len(at_bound)
     squares = float(np.sum(np.square(r)))
     least = squares * max(_SHARE, _PER_UNKNOWN * J.shape[1] / r.size)
-    # Negated: also what is not finite is none of this function's business.
-    if not gauss_newton_gain(r, J) > least:
+    if not (np.isfinite(r).all() and np.isfinite(J).all()):
         return None
     norms = np.linalg.norm(J, axis=0)
     units = np.where(norms > 0, norms, 1.0)
-    left, singular, right = np.linalg.svd(J / units, full_matrices=False)
-    along = left.T @ r
+    Q, R = np.linalg.qr(J / units)
+    along = Q.T @ r
+    # The whole of a Gauss-Newton step takes away the part of r in the span of J's columns.
+    if not np.sum(along**2) > least:
+        return None
+    left, singular, right = np.linalg.svd(R)
+    along = left.T @ along
     with np.errstate(divide="ignore", over="ignore"):
         steps = np.abs(along / singular)[:, None] * np.abs(right / units)[:, :parameters]
         # What the linear model promises for a step to far beyond where it holds is worth nothing:

@@ -1,6 +1,6 @@
 """Output error: the simulation against what was measured, (measured - bias - simulated) / sd.
 
-Maximum likelihood where the measurement noise is white and nothing disturbs the machine (Maine and
+Maximum likelihood where the measurement noise is white and nothing disturbs the vehicle (Maine and
 Iliff, 1985; Jategaonkar, 2006, chapter 4). With windows (multiple shooting; Bock, 1983) also the
 defects between them.
 """
@@ -121,7 +121,7 @@ def _step(layout: Layout, data: Data, noise: Noise, z: Array) -> tuple[Array, Ar
         stacked = jnp.concatenate([J, jnp.sqrt(damping) * sizes])
         step = jnp.linalg.lstsq(stacked, -jnp.concatenate([r, below]))[0]
         cost = jnp.sum(rows(part + step) ** 2)
-        # The simulation of an unstable machine over a whole record may be no number.
+        # The simulation of an unstable vehicle over a whole record may be no number.
         return step, jnp.where(jnp.isfinite(cost), cost, jnp.inf)
 
     dampings = _DAMPED[:1] if layout.model.linear else _DAMPED

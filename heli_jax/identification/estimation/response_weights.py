@@ -62,6 +62,11 @@ _SMALLEST = 1e-9
 none of their own"""
 
 
+type Described = Callable[[np.ndarray, list[int]], np.ndarray | None]
+"""of raw spectral matrices (k, q, q) of some outputs, by their place in the windows, what the
+vehicle makes of gusts, and white noise: (k, q, q), or None where that says nothing"""
+
+
 class Averages(NamedTuple):
     """What the inputs alone say of the responses' errors; p outputs, m inputs, k lines."""
 
@@ -174,19 +179,22 @@ def noise_density(
     w: Windowed,
     at: Averages,
     E: Complex[np.ndarray, "W k p"],
-    described: Callable[[np.ndarray, list[int]], np.ndarray | None] | None = None,
+    described: Described | None = None,
 ) -> Complex[np.ndarray, "k p p"]:
     """The spectral matrix of what no response explains of the errors, smoothed over frequency.
 
     Args:
         E: errors (W, k, p); zero in windows that an output does not have.
-        described: of raw spectral matrices (k, q, q) of some outputs, by their place, what is known
-            of their shape: the mean over lines is taken of what is left by that (`None`: nothing).
+        described: the mean over lines is taken of what is left by it.
     """
     own = np.real(np.einsum("kii->ki", _left(w, E, w.seen)))
     p, power = own.shape[1], np.mean(np.abs(w.Y) ** 2, axis=(0, 1))
     floor = np.maximum(_ROUNDING * power, 1e-300)
-    kernel = _kernel(w)
+    averages = np.maximum(w.averages - len(w.inputs), 0.5)
+    least = _ENOUGH * len(w.outputs) / (_LINES * float(np.min(averages)))
+    width = np.clip(least, 0.5 * _WIDEST, _WIDEST) * np.maximum(1.0, _PART * w.lines)
+    kernel = np.exp(-0.5 * ((w.lines[:, None] - w.lines[None, :]) / width[:, None]) ** 2)
+    kernel = kernel / np.sum(kernel, axis=1, keepdims=True)
     if not w.together:
         each = [_smoothed(kernel, own[:, i, None, None], [i], described) for i in range(p)]
         S = np.concatenate(each, axis=1) * np.eye(p)
@@ -202,20 +210,11 @@ def noise_density(
     return _definite(S * size[:, :, None] * size[:, None, :], floor) / at.power[:, None, None]
 
 
-def _kernel(w: Windowed) -> Float[np.ndarray, "k k"]:
-    """Weights of the mean over lines."""
-    freedom = np.maximum(np.sum(w.seen, axis=0) / PER_AVERAGE - len(w.inputs), 0.5)
-    least = _ENOUGH * len(w.outputs) / (_LINES * float(np.min(freedom)))
-    width = np.clip(least, 0.5 * _WIDEST, _WIDEST) * np.maximum(1.0, _PART * w.lines)
-    kernel = np.exp(-0.5 * ((w.lines[:, None] - w.lines[None, :]) / width[:, None]) ** 2)
-    return kernel / np.sum(kernel, axis=1, keepdims=True)
-
-
 def _smoothed(
     kernel: Float[np.ndarray, "k k"],
     S: Complex[np.ndarray, "k q q"],
     outputs: list[int],
-    described: Callable[[np.ndarray, list[int]], np.ndarray | None] | None,
+    described: Described | None,
 ) -> Complex[np.ndarray, "k q q"]:
     """The mean over lines of spectral matrices, divided by what is known of their shape."""
     known = None if described is None else described(S, outputs)
@@ -373,7 +372,6 @@ def first_weights(problem: Problem, flights: Sequence[Flight]) -> ResponseWeight
         ValueError: windows, band or pairs do not fit the flights, or too little is left.
     """
     options = problem.frequency
-    _require_names(problem, options)
     w = windowed(flights, options, instruments_of(problem))
     at = averages(w)
     sound = np.isfinite(response_of(w, at, w.Y))
@@ -385,7 +383,7 @@ def first_weights(problem: Problem, flights: Sequence[Flight]) -> ResponseWeight
     coherence = partial_coherence(w, at)
     at = at._replace(P=np.nan_to_num(at.P))
     used = pairs_used(w, options, coherence, sound)
-    _require_lines(w, options, used)
+    _require_lines(problem, w, used)
     density = noise_density(w, at, w.Y)
     weights = weighed(ResponseWeights(w, at, coherence, used, density, None, None), density)
     _require_numbers(problem, weights)
@@ -402,19 +400,16 @@ def weighed(weights: ResponseWeights, density: Complex[np.ndarray, "k p p"]) -> 
     return weights._replace(density=density, whitening=W, share=share)
 
 
-def _require_names(problem: Problem, options: ResponseOptions) -> None:
+def _require_lines(problem: Problem, w: Windowed, used: Bool[np.ndarray, "k p m"]) -> None:
+    options, model = problem.frequency, problem.model
     for i, pair in enumerate(options.pairs):
-        for role, record in (("input", problem.model.Inputs), ("output", problem.model.Outputs)):
+        for role, record in (("input", model.Inputs), ("output", model.Outputs)):
             name, known = getattr(pair, role), naming.names(record)
             if name not in known:
                 raise ValueError(
-                    f"frequency.pairs[{i}].{role}: model {problem.model.name} has no {role} "
+                    f"frequency.pairs[{i}].{role}: model {model.name} has no {role} "
                     f"{name!r}{nearest(name, known)}"
                 )
-
-
-def _require_lines(w: Windowed, options: ResponseOptions, used: Bool[np.ndarray, "k p m"]) -> None:
-    for i, pair in enumerate(options.pairs):
         place = f"frequency.pairs[{i}] ({pair.input} to {pair.output})"
         if pair.input not in w.inputs:
             raise ValueError(f"{place}: {pair.input} does not move, expected an input that does")
@@ -456,10 +451,10 @@ def back(weights: ResponseWeights) -> ResponseWeights:
     return jax.tree.map(lambda v: np.asarray(v) if isinstance(v, jax.Array) else v, weights)
 
 
-# What the machine makes of gusts, as windows show it: a shape for the noise of responses.
+# What the vehicle makes of gusts, as windows show it: a shape for the noise of responses.
 #
 # The noise's spectrum in windows is a mean over few of their lines. Gusts come through the
-# machine's own modes, which are no wider than that: the mean makes a wide and low hill of a mode,
+# vehicle's own modes, which are no wider than that: the mean makes a wide and low hill of a mode,
 # and what the record tells of the mode is weighed by too much noise beside it and too little at it.
 # So
 #
@@ -478,20 +473,15 @@ _OFFSETS = np.arange(-1.875, 2.0, 0.25)
 is zero, where integrations have no finite response"""
 
 
-Described = Callable[[np.ndarray, list[int]], np.ndarray | None]
-"""of raw spectral matrices (k, q, q) of some outputs, by their place in the windows, what the
-machine makes of gusts, and white noise: (k, q, q), or None where that says nothing"""
-
-
 def gusts_through(layout: Layout, data: Data, z: Float[Array, " q"], w: Windowed) -> Described:
-    """The shape that the first flight's machine gives to the noise."""
+    """The shape that the first flight's vehicle gives to the noise."""
     seen = dataclasses.replace(layout, outputs=(w.outputs,) * len(data.flights))
-    machine = machine_of(seen, data, z)
-    return described(np.asarray(machine.Ad, float), np.asarray(machine.C, float), w)
+    vehicle = machine_of(seen, data, z)
+    return described(np.asarray(vehicle.Ad, float), np.asarray(vehicle.C, float), w)
 
 
 def described(Ad: Float[np.ndarray, "n n"], C: Float[np.ndarray, "p n"], w: Windowed) -> Described:
-    """The shape that a machine gives to the noise."""
+    """The shape that a vehicle gives to the noise."""
     # Each line by itself at first, then those within a part of the frequency.
     first = [0]
     while (

@@ -113,7 +113,7 @@ def coarse_guess(
     """z0 with the disturbance and the time shift from a coarse search each, and a single gain by
     linear least squares; what is not among the unknowns stays."""
     z0 = noise_guess_at(layout, data, noise, z0) if layout.disturbance else z0
-    # A machine that is held through its instruments leaves a simulation by its inputs.
+    # A vehicle that is held through its instruments leaves a simulation by its inputs.
     by_inputs = data.flights[0].by_instrument is None
     if not (by_inputs and (layout.shift or len(layout.gains) == 1)):
         return z0

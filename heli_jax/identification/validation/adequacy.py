@@ -1,4 +1,4 @@
-"""Adequacy of the model: does it explain what was measured, beside noise and disturbance?
+"""Adequacy: does the model explain what was measured, beside noise and disturbance?
 
 That an optimiser converged and that the data determine the parameters says nothing of it: the best
 parameters of a wrong model are found and determined as well as those of the right one.
@@ -46,7 +46,7 @@ _GROWTH = 3.0
 
 
 class OutputAdequacy(NamedTuple):
-    """The numbers that show if one output is explained."""
+    """Adequacy of one output, and the numbers behind it."""
 
     # The names of the fields are keys of fit.json.
     output: str
@@ -76,7 +76,7 @@ class OutputAdequacy(NamedTuple):
 
 
 class Record(NamedTuple):
-    """Signals that are compared, by flight: SI, NaN where nothing is measured."""
+    """Compared signals of a flight: SI, NaN where nothing is measured."""
 
     label: str
     dt: float
@@ -135,8 +135,8 @@ class Adequacy(NamedTuple):
 
     @property
     def explains_nothing(self) -> bool:
-        """True if the model follows every output worse than its mean, so that the record
-        determines none of its parameters."""
+        """True if the model follows every output worse than its mean, so that the record determines
+        none of its parameters."""
         # A disturbance, or predictions ahead, let a good model's simulation be as poor.
         if not self.denied or self.ahead is not None:
             return False
@@ -145,7 +145,7 @@ class Adequacy(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """The evidence on adequacy: the fitted flights and their residuals."""
+    """The fitted flights and their residuals, by which adequacy is assessed."""
 
     records: tuple[Record, ...]
     agreement: Mapping[str, Metrics]
@@ -173,14 +173,14 @@ def misses(expected: Mapping[str, float]) -> bool:
 
 
 def joined_metrics(name: str, records: Sequence[Record]) -> Metrics:
-    """The adequacy of one output over all records that have it."""
+    """Metrics of one output over all records that have it."""
     both = [(r.measured[name], r.simulated[name]) for r in records if name in r.measured]
     measured, predicted = (np.concatenate(v) for v in zip(*both, strict=True))
     return metrics(measured, predicted)
 
 
 def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
-    """The adequacy of the model to the fitted flights.
+    """Assess the adequacy of the model to the fitted flights.
 
     Args:
         params: the vehicle with the estimates in place, a record of the model's Params, SI.
@@ -229,7 +229,7 @@ def _of_all_flights(name: str, records: tuple[Record, ...]) -> np.ndarray:
 
 
 def _still(name: str, records: tuple[Record, ...]) -> bool:
-    """True if an output never moves: nothing is to be explained."""
+    """True if an output never moves, so that nothing is to be explained."""
     # By its range: the mean of equal numbers, and so their variance, is off by rounding. As
     # `metrics` has it, so that what has no VAF is not judged by one.
     return all(
@@ -280,7 +280,7 @@ def _explained(error: list[np.ndarray], measured: np.ndarray) -> tuple[float, fl
 
 # Do the inputs explain anything? A filter follows any record, if need be by its disturbance alone.
 #
-# What is then estimated is the colour of the noise, and not how the vehicle answers: from other
+# What is then estimated is the colour of the noise, and not how the vehicle responds: from other
 # starts, or with another disturbance, it is something else, with an interval as narrow.
 
 

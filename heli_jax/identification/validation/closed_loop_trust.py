@@ -225,8 +225,8 @@ class Loop(NamedTuple):
 
     @property
     def inputs(self) -> list[str]:
-        """The inputs without an instrument that follow the response; all that move freely if
-        none was found."""
+        """Inputs without an instrument that follow the response; all that move freely if none
+        does."""
         direct = [one for one in self.found if one.input not in self.instruments]
         those = [one for one in direct if one.present] or direct
         return list(dict.fromkeys(one.input for one in those))

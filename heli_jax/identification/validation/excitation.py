@@ -270,7 +270,7 @@ class _Bands(NamedTuple):
 
     @property
     def per_line(self) -> Float[np.ndarray, "b p c"]:
-        """The power by line that is not explained."""
+        """Power that is not explained, by line."""
         return np.maximum(self.whole - self.parts, 0.0) / (self.lines - self.rank)[:, :, None]
 
     @property
@@ -290,7 +290,7 @@ class _Bands(NamedTuple):
 
     @property
     def asked(self) -> Bool[np.ndarray, "b p"]:
-        """True at lines where the first signal is more than what follows the excitation."""
+        """True if the first signal is more than what follows the excitation."""
         return (self.rank > 0) & (self.whole[:, :, 0] > self.parts[:, :, 0])
 
 

@@ -59,7 +59,7 @@ class Correlated(NamedTuple):
 def correlations_with_sums(
     u: Float[np.ndarray, " N"], e: Float[np.ndarray, "N p"], blocks: Sequence[tuple[int, int]]
 ) -> Correlated:
-    """Correlation of u with the sums of each column of e over each block of lags.
+    """Correlate u with the sums of each column of e over each block of lags.
 
     Args:
         u: NaN where it is missing.
@@ -95,7 +95,7 @@ def correlations_with_sums(
 
 
 def _products_over_lags(x: Float[np.ndarray, "N p"]) -> Float[np.ndarray, "N p"]:
-    """Autocorrelation of each column, by lag."""
+    """Products of each column with itself, by lag."""
     size = scipy.fft.next_fast_len(2 * len(x), real=True)
     return np.fft.irfft(np.abs(np.fft.rfft(x, size, axis=0)) ** 2, size, axis=0)[: len(x)]
 
@@ -117,8 +117,8 @@ _RIDGE = 1e-12
 def arx_residuals(
     y: Float[np.ndarray, "N p"], past: Float[np.ndarray, "N z"]
 ) -> Float[np.ndarray, "N p"] | None:
-    """The part of y that a constant and earlier samples of other signals (their `past`) do not
-    predict, NaN where one is missing; None if the record is too short."""
+    """Residuals of an ARX model of y by a constant and earlier samples of signals (their `past`);
+    NaN where one is missing; None if the record is too short."""
     longest, (N, z) = _ORDERS[-1], past.shape
     scale = np.nanstd(past, axis=0)
     past = (past - np.nanmean(past, axis=0)) / np.where(scale > 0, scale, 1.0)
@@ -181,8 +181,7 @@ _SEEN = 0.8
 
 
 class Feedback(NamedTuple):
-    """The result of the test for one input of one flight. The names of the fields are keys of
-    fit.json."""
+    """Result for one input of one flight. The names of the fields are keys of fit.json."""
 
     flight: str
     input: str
@@ -259,7 +258,7 @@ def _rates_of(flight: Flight) -> tuple[float, ...]:
 
 
 def _frames(u: np.ndarray) -> float:
-    """The share of an input's moving samples that have a new value."""
+    """Share of the samples at which a moving input has a new value."""
     at = np.flatnonzero(np.diff(u) != 0.0)
     return 1.0 / float(np.median(np.diff(at))) if at.size > 1 else np.inf
 
@@ -311,8 +310,8 @@ def _views(flight: Flight, steps: Mapping[str, int], rate: float) -> list[_View]
 def _unforeseen(
     u: Float[np.ndarray, " N"], own: Float[np.ndarray, "N m"]
 ) -> Float[np.ndarray, " N"] | None:
-    """The part of an input (N,) that its own past (N, m) does not predict, without its jumps; None
-    where nothing is left.
+    """Residual (N,) of an input after its own past (N, m), without its jumps; None if nothing is
+    left.
 
     A pilot's test steps are larger than what he does about a gust, and would drown it. What is left
     out is chosen by the input alone, so that the test stays one.
@@ -333,7 +332,7 @@ def _unforeseen(
 
 
 def _moves_freely(u: Float[np.ndarray, " N"]) -> bool:
-    """True if there is anything in an input that could follow."""
+    """True if an input has motion that could follow something."""
     # A commanded input that stays for twenty samples and jumps follows nothing in between; no more
     # does one whose steps are rounded off, as a programmed doublet's: what an autoregression leaves
     # of its corners rings on into the rest, as it does in the response.
@@ -408,7 +407,8 @@ def _decimated(flight: Flight, earlier: Mapping[str, int], rate: float) -> _Deci
 def feedback_of(
     problem: Problem, delays: Mapping[str, tuple[float, float | None]] | None = None
 ) -> tuple[Feedback, ...]:
-    """The test for all fitted flights; empty where sensors are compared with each other.
+    """Test all fitted flights; nothing where sensors are compared with each other, of which none is
+    a stick that anybody moves.
 
     Args:
         delays: value and sd of what a fit found, among it `time_shift` and the parameters that are
@@ -432,7 +432,7 @@ def feedback_of(
 def _delay(
     problem: Problem, flight: Flight, name: str, delays: Mapping[str, tuple[float, float | None]]
 ) -> tuple[float, float, bool]:
-    """Delay and sd [s] of an input, as far as they are known, and if the delay was estimated."""
+    """Delay of an input and its sd [s], as far as they are known, and True if it was estimated."""
     delay, variance, estimated = 0.0, 0.0, False
     own = dict(problem.model.delays).get(name)
     if own is not None and own not in delays:

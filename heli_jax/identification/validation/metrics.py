@@ -1,4 +1,4 @@
-"""Agreement of simulated and measured signals, and whiteness of residuals."""
+"""Agreement of a simulated signal with a measured one, and whiteness of the residual."""
 
 from typing import NamedTuple, cast
 
@@ -46,7 +46,8 @@ FAR = 1e4
 
 def diverges(m: Metrics, times: float = 10.0) -> bool:
     """True if a simulation left what was measured: it is not finite, or its error has several
-    times the variance of the signal."""
+    times the variance of the signal.
+    """
     return not np.isfinite(m.rmse) or m.vaf < 1.0 - times
 
 
@@ -81,7 +82,7 @@ def metrics(measured: np.ndarray, simulated: np.ndarray) -> Metrics:
 
 
 class Whiteness(NamedTuple):
-    """The test of residuals for whiteness over all their lags."""
+    """Whiteness of residuals over all their lags."""
 
     white: bool
     p_value: float
@@ -156,7 +157,7 @@ def kept(signal: np.ndarray) -> np.ndarray:
 
 
 def lags_for(n: int) -> int:
-    """The number of lags for a record of n samples: a quarter of it, at most 500."""
+    """Number of lags for a record of n samples: a quarter of it, at most 500."""
     # Beyond a quarter an autocorrelation is the mean of too few products (Box and Jenkins).
     return max(1, min(n // 4, 500))
 
@@ -191,8 +192,8 @@ def whiteness(
 
 
 def band99(pairs: np.ndarray, whole: np.ndarray) -> np.ndarray:
-    """The limits within which 99 % of white noise's autocorrelations lie (lags,), as
-    `seen_autocorrelation` counts them times the part of the record that a lag leaves."""
+    """Band that holds 99 % of white noise's autocorrelations (lags,), as `seen_autocorrelation`
+    counts them times the part of the record that a lag leaves."""
     return BAND99 * np.sqrt(whole / pairs)
 
 

@@ -42,8 +42,8 @@ _AT_LEAST = 14.0
 """gain below which no p value is computed: by one filter alone chance makes it in 1 of 1000"""
 _ROUNDING = 1e-9
 """part of a column below which nothing is left of it"""
-_WILD = 5.0 / 0.6745
-"""times the median of whitened residuals' sizes, beyond which they are wild: 5 sd of normal ones"""
+_MEDIAN = 0.6745
+"""of the size of a standard normal number"""
 _EULER = 0.5772156649015329
 _AT_ONCE = 8
 """residuals that are multiplied with all columns together"""
@@ -106,11 +106,13 @@ def lines_of(
     J: Float[np.ndarray, "N q"],
     drives: Float[np.ndarray, "N d"],
     holes: Sequence[int] = (),
+    most: float = np.inf,
 ) -> Lines | None:
     """Whitened by the residual's autoregression; None of records too short or without a residual.
 
     Args:
         holes: the samples before which others are missing.
+        most: robust sds of the whitened residual, at which it is bounded (Huber, 1981).
     """
     n = e.size - ORDER
     if (n - 1) // 2 < max(_LEAST, 2 * J.shape[1]) or not np.std(e) > 0:
@@ -125,7 +127,9 @@ def lines_of(
     # What jumps because samples are missing is no answer: the filter's order after a hole is as if
     # nothing had been measured.
     white[:, across(holes, e.size)[ORDER:]] = 0.0
-    white[0] = bounded(white[0])
+    if np.isfinite(most):
+        most *= float(np.median(np.abs(white[0][white[0] != 0.0]))) / _MEDIAN
+        white[0] = np.clip(white[0], -most, most)
     v = np.asarray(scipy.fft.rfft(white))[:, 1 : 1 + (n - 1) // 2] / np.sqrt(n)
     # Of a bias rounding alone is left, which no step of it makes up for.
     mean_squares = np.mean(np.real(v) ** 2 + np.imag(v) ** 2, axis=1, keepdims=True)
@@ -136,13 +140,6 @@ def lines_of(
     q = J.shape[1]
     angles = 2.0 * np.pi * np.arange(1, v.shape[1] + 1) / n
     return Lines(v[0], v[1 : 1 + q].T, v[1 + q :].T, angles, size)
-
-
-def bounded(e: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
-    """Bound whitened residuals at 5 robust standard deviations (Huber's psi; Huber, 1981): a few
-    wild samples have most of the power, and go with some drive by chance."""
-    most = _WILD * float(np.median(np.abs(e[e != 0.0]))) if np.any(e) else 0.0
-    return np.clip(e, -most, most)
 
 
 def across(holes: Sequence[int], size: int) -> np.ndarray:

@@ -67,8 +67,8 @@ def rates_and_angles(model: Model) -> list[tuple[str, str]]:
 def angle_over_rate(
     angle: Float[np.ndarray, " N"], rate: Float[np.ndarray, " N"], dt: float
 ) -> AngleOverRate | None:
-    """The motion of an angle over that of the integral of its rate; None if nothing can be
-    compared: a gap is long, the record is short, or the two have little in common.
+    """Compare the motion of an angle with the integral of its rate; None if a gap is long, the
+    record is short, or the two have little in common.
 
     Args:
         angle: [rad], NaN where missing.
@@ -103,7 +103,7 @@ def _log_sd(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def integral(rate: Float[np.ndarray, " N"], dt: float) -> Float[np.ndarray, " N"]:
-    """The integral from zero of a signal with straight lines between its samples.
+    """Integral of a signal with straight lines between its samples, from zero.
 
     Args:
         rate: without a missing sample.
@@ -197,7 +197,7 @@ def sticks_of(model: Model) -> dict[str, str]:
 
 
 class _Sign(NamedTuple):
-    """The correlation of an output with the simulated one in a flight, where that is sure."""
+    """Correlation of an output with the simulated one in a flight, where it is significant."""
 
     correlation: float
     size: float
@@ -214,7 +214,7 @@ def _signs(flight: Flight, run: Mapping[str, np.ndarray]) -> dict[str, _Sign]:
 
 
 def _counts(name: str, sign: _Sign, by_flight: Sequence[Mapping[str, _Sign]]) -> bool:
-    """True if no flight with more information on an output shows that its sign is right."""
+    """True unless a flight that shows more of an output shows that its sign is right."""
     others = (signs[name] for signs in by_flight if name in signs)
     return sign.correlation > 0 or not any(
         o.correlation > 0 and o.size > _MORE * sign.size for o in others
@@ -413,7 +413,7 @@ def _units_by_size(signal: Signal, values: np.ndarray) -> tuple[str, str]:
 
 
 def _size(measured: np.ndarray, simulated: np.ndarray) -> float:
-    """The ratio of an output's motion to the simulated one; 0 if nothing can be compared."""
+    """Measured over simulated motion of an output; 0 if there is none."""
     seen = np.isfinite(measured)
     with np.errstate(over="ignore", invalid="ignore"):
         far = float(np.std(simulated[seen])) if seen.any() else 0.0

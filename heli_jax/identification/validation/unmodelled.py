@@ -262,6 +262,8 @@ _ROUNDS = 6
 """steps at most to where a whitened residual is least"""
 _VARIES = 0.1
 """of the mean, by which an amplitude has to vary to tell what goes with it"""
+_WILD = 5.0
+"""robust sds of a whitened residual, at which it is bounded to see whether a finding holds"""
 _ENOUGH = 1.0
 """of twice the log-likelihood, by which a further step says nothing else"""
 
@@ -314,7 +316,10 @@ def unmodelled(
         if not drives:
             continue
         strong = _where_least(at, name, drives, records, level, flights)
-        if strong.p_value < level:
+        # What rests on a few wild samples is chance: they have most of the power.
+        if strong.p_value < level and (
+            strongest(_lines(at, e, name, J, flights, _WILD)[1], drives).p_value < level
+        ):
             lacking.append(_told(at, e, name, strong, J))
     asked, k = [records for _, records in each.values() if records], len(layout.of_interest)
     chances = [pulled_away(records, k) for records in asked]
@@ -369,12 +374,14 @@ def _lines(
     name: str,
     J: Mapping[tuple[int, str], np.ndarray],
     called: Sequence[str],
+    most: float = np.inf,
 ) -> tuple[list[Drive], list[Lines]]:
     """The drives that the residual of an output may follow, none where nothing can be tested, and
     its lines by flight.
 
     Args:
         called: the flights' names.
+        most: robust sds at which the whitened residual is bounded.
     """
     moving, samples = moving_inputs(at), of_one_clock(at, e, name)
     k, m = len(at.layout.of_interest), len(moving)
@@ -390,7 +397,7 @@ def _lines(
         X += [slopes[own.rows] * (other == place) for other in range(len(samples))]
         X += [(slopes * by[:, None])[own.rows] for by in (shape, np.sign(shape))]
         left = np.asarray(e.raw[i][name])[own.rows]
-        found = lines_of(left, J[i, name][own.rows], np.concatenate(X, axis=1), own.holes)
+        found = lines_of(left, J[i, name][own.rows], np.concatenate(X, axis=1), own.holes, most)
         if found is not None:
             lines.append((place, found))
     records = [one for _, one in lines]
