@@ -300,9 +300,9 @@ def _freedom(measured: Measured, unknowns: int) -> float:
 def _stable(scaled: _Scaled, best, zeros: int, freedom: float):
     """Reflect fast unstable poles of the optimum, unless the data prefer them.
 
-        In the band 1 / (p - s) is nearly 1 / (p + s) with a delay that is shorter by 2 / p, so a
-            vehicle has the stable pole unless there is much evidence. Slow poles in the band are left.
-        """
+    In the band 1 / (p - s) is nearly 1 / (p + s) with a delay that is shorter by 2 / p, so a
+    vehicle has the stable pole unless there is much evidence. Slow poles in the band are left.
+    """
     poles = _roots(best, zeros)
     growing = _fast_growing(poles)
     if not growing.any():
