@@ -30,7 +30,7 @@ class FrequencyErrorStart(NamedTuple):
 
     @property
     def findings(self) -> list[Finding]:
-        """What was taken from where."""
+        """The source of one start value."""
         taken = [n for n, v in self.values.items() if v.origin == "frequency error"]
         run = {"status": self.status, "seconds": self.seconds}
         if not taken:

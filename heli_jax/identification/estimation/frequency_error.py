@@ -111,7 +111,7 @@ class FrequencyError(Objective):
         return refused or cannot_linearise(problem)
 
     def flight_facts(self, problem: Problem, flights: Sequence[Flight]) -> tuple[FlightFacts, ...]:
-        """Where all outputs are there, and about what the model is linearised."""
+        """Lines where all outputs are there, and the point about which the model is linearised."""
         return tuple(
             FlightFacts(parts_of(f), f.dt, condition_of(problem.model, f)) for f in flights
         )
@@ -181,8 +181,8 @@ class FrequencyError(Objective):
         return in_time(layout, data, noise, z) if layout.model.linear else z
 
     def log_likelihood(self, layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
-        """Of complex normal errors at the lines used, in SI units of the outputs; NaN for an
-        estimate by instrument, which has none.
+        """Log-likelihood of complex normal errors at the lines used, in SI units of the outputs;
+        NaN for an estimate by instrument, which has none.
 
         Args:
             noise: that `e` was evaluated with.
@@ -199,8 +199,8 @@ class FrequencyError(Objective):
     def findings(
         self, at: Solution, e: Evaluation, names: Sequence[str], ill: bool
     ) -> list[Finding]:
-        """How much of flights with missing samples is used, where models were linearised, and what
-        there is not by instrument."""
+        """Notes on flights with missing samples, on points of linearisation, and on what an
+        instrument leaves out."""
         return [
             *cut_notes(at.layout, at.data, names),
             *linearisation_notes(at, e),
@@ -248,8 +248,8 @@ _NOTHING = 100.0
 
 
 class Products(NamedTuple):
-    """Of whitened errors e (of white noise of variance 1), their derivatives J by the unknowns and
-    instruments Z, all without what the ends of the records may add."""
+    """Rows of whitened errors e (of white noise of variance 1), their derivatives J by the
+    unknowns and instruments Z, all without what the ends of the records may add."""
 
     ee: Float[Array, ""]
     Ze: Float[Array, " q"]
@@ -258,7 +258,7 @@ class Products(NamedTuple):
 
 
 def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Float[Array, " r"]:
-    """Those rows, with the derivative that a step of Gauss and Newton needs.
+    """The rows, with the derivative that a step of Gauss and Newton needs.
 
     Args:
         noise: with the whitening of each record, and whether instruments are used.
@@ -344,7 +344,7 @@ def _of_record(
     by: tuple[Driving, Driving] | None,
     y: Float[Array, "f N p"],
 ) -> Products:
-    """Of one record of a few flights, with a leading axis.
+    """Rows of one record of a few flights, with a leading axis.
 
     Args:
         direct: what drives the vehicles, and its derivatives by the unknowns.

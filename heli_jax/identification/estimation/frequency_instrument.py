@@ -41,7 +41,7 @@ def instruments_of(problem: Problem) -> tuple[str, ...]:
 
 
 def _lacks(flights: Sequence[Flight], name: str) -> str | None:
-    """Why flights have no instrument of an input, in words; None where they have."""
+    """The reason why flights have no instrument of an input, in words; None where they have."""
     for flight in flights:
         if name not in flight.instruments:
             return f"{flight.name or 'a flight'} holds none (signals.instruments)"
@@ -51,7 +51,7 @@ def _lacks(flights: Sequence[Flight], name: str) -> str | None:
 
 
 def absent_instrument(problem: Problem) -> str | None:
-    """Which instrument that was asked for is not there, or is none; None where all are."""
+    """The instrument that was asked for and is not there, or is none; None where all are."""
     known = naming.names(problem.model.Inputs)
     for name in problem.instrument or ():
         if name not in known:
@@ -146,7 +146,7 @@ def inputs_by_instrument(data: Data) -> tuple[str, ...]:
 
 
 def instrument_notes(data: Data) -> list[Finding]:
-    """What there is not of an estimate by instrument."""
+    """The parts of a fit that an estimate by instrument lacks."""
     if data.flights[0].by_instrument is None:
         return []
     words = (

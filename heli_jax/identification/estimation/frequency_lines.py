@@ -35,7 +35,7 @@ from heli_jax.simulation.stepping import held_columns
 
 
 class FlightFacts(NamedTuple):
-    """What is fixed of a flight before anything is traced."""
+    """Facts of a flight that are fixed before anything is traced."""
 
     parts: tuple[tuple[int, int], ...]
     """first sample, and that behind the last, of each part that is a record of its own"""
@@ -99,7 +99,7 @@ def records_of(layout: Layout) -> list[Record]:
 
 
 def without_parts(flights: Sequence[Flight]) -> str | None:
-    """Why a flight leaves no record, and what to do; None where each leaves one."""
+    """The reason why a flight leaves no record, and what to do; None where each leaves one."""
     for flight in flights:
         if parts_of(flight):
             continue
@@ -115,7 +115,7 @@ def without_parts(flights: Sequence[Flight]) -> str | None:
 
 
 def other_outputs(flights: Sequence[Flight]) -> str | None:
-    """Which flights have not the outputs of the others, and what to do; None where all have."""
+    """The flights without the outputs of the others, and what to do; None where all have them."""
     # The noise's spectrum is one matrix over the outputs.
     common = set.intersection(*(set(f.outputs) for f in flights))
     for flight in flights:
@@ -165,7 +165,7 @@ class Matrices(NamedTuple):
 
 
 class Driving(NamedTuple):
-    """What drives a vehicle, in time or at the lines."""
+    """Inputs of a vehicle, in time or at the lines."""
 
     U: Array
     """what B multiplies, (N, r)"""
@@ -198,7 +198,7 @@ def alike(layout: Layout, data: Data) -> list[list[int]]:
 
 
 def machines_of(layout: Layout, data: Data, u: Unknowns, members: list[int]) -> Machines:
-    """Those of one group."""
+    """The matrices of one group."""
     first = members[0]
     own = [(data.flights[i], u.states[i], u.offsets[i]) for i in members]
 
@@ -288,7 +288,7 @@ def parts_of_group(layout: Layout, noise: Noise, members: list[int]) -> list[tup
 
 
 def measured(layout: Layout, data: Data, members: list[int]) -> Float[Array, "f N p"]:
-    """What the flights of a group measured."""
+    """The measured signals of a group's flights."""
     names = layout.outputs[members[0]]
     columns = [[data.flights[i].outputs[n] for n in names] for i in members]
     return jnp.stack([jnp.stack([jnp.asarray(v) for v in of], axis=1) for of in columns])
@@ -339,7 +339,7 @@ _SPARED = 0.1
 
 
 class Resolved(NamedTuple):
-    """What a vehicle does at the lines of a record, by block (b, ...); without a derivative."""
+    """Responses of a vehicle at the lines of a record, by block (b, ...); without a derivative."""
 
     z: Complex[Array, "b k"]
     T: Complex[Array, "n n"]
@@ -358,7 +358,8 @@ class Resolved(NamedTuple):
 
 
 class Errors(NamedTuple):
-    """Of one record of each of a few flights, with what they came of; the first two by block."""
+    """Errors of one record of each of a few flights, with what they came of; the first two by
+    block."""
 
     rows: Float[Array, "b f s"]
     """measured less simulated, whitened, the ends of the record taken off; zero beyond the lines"""
@@ -409,7 +410,7 @@ def resolved(m: Matrices, record: Record, whitening: Complex[Array, "K p p"]) ->
 
 
 def basis_of(H: Complex[Array, "k p n"], ends: Complex[Array, "k e"]) -> Float[Array, "s m"]:
-    """What the ends' states, and behind these the gusts', add to the rows of a block."""
+    """The additions of the ends' states, and behind these the gusts', to the rows of a block."""
     # Together with what takes a block out of all of them the products would be several times
     # slower.
     H, ends = jax.lax.optimization_barrier((H, ends))
@@ -483,7 +484,7 @@ def errors_of_some(
     acting: Driving,
     y: Float[Array, "f N p"],
 ) -> Errors:
-    """Of one record of each of a few flights of one vehicle, with a leading axis.
+    """Errors of one record of each of a few flights of one vehicle, with a leading axis.
 
     Args:
         acting: over the whole flights.
@@ -560,7 +561,7 @@ def _times(M: Complex[Array, "k a b"], v: Complex[Array, "f k b"]) -> Complex[Ar
 
 
 class LineErrors(NamedTuple):
-    """Of all records."""
+    """Errors of all records."""
 
     errors: list[Complex[Array, "K p"]]
     """by record, its ends taken off, not whitened"""

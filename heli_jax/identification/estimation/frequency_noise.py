@@ -211,7 +211,7 @@ _UNSEEN = 1e-20
 
 @eqx.filter_jit
 def machine_of(layout: Layout, data: Data, z: Float[Array, " q"]) -> Matrices:
-    """That of the first flight: records of one length share a spectrum."""
+    """The spectrum of the first flight: records of one length share it."""
     members = alike(layout, data)[0]
     return first_machine(machines_of(layout, data, unpack(layout, data, z), members).matrices)
 

@@ -97,7 +97,7 @@ class Resolved(NamedTuple):
     """C (zI - Ad)^-1"""
 
     def ends(self, samples: int) -> Float[Array, "p n N"]:
-        """What the ends of a record add to the outputs, for each state."""
+        """The additions of a record's ends to the outputs, for each state."""
         z, turns = _lines(samples)
         return _in_time(jnp.moveaxis(self.H * z[:, None, None], 0, -1), turns)
 
@@ -131,7 +131,7 @@ def bounded_outputs(
 
 
 def _lines(N: int) -> tuple[np.ndarray, np.ndarray]:
-    """Of half of the lines z (K,), the others being conjugate, and exp(i pi t / N) (N,)."""
+    """Windows of half of the lines z (K,), the others being conjugate, and exp(i pi t / N) (N,)."""
     # The odd record's line at Nyquist's frequency is its own conjugate.
     k = np.arange((N + 1) // 2)
     return np.exp(1j * np.pi * (2 * k + 1) / N), np.exp(1j * np.pi * np.arange(N) / N)
@@ -159,7 +159,7 @@ def _groups(layout: Layout, data: Data, weights: ResponseWeights) -> list[list[i
 
 
 class _Measured(NamedTuple):
-    """Of a flight."""
+    """The windows of a flight."""
 
     y: Float[Array, "p N"]
     """zero where nothing is measured"""
@@ -170,7 +170,7 @@ class _Measured(NamedTuple):
 
 
 def _measured(data: Data, w: Windowed, members: list[int]) -> _Measured:
-    """Of each of some flights, with a leading axis."""
+    """The sums of each of some flights, with a leading axis."""
     first, made = np.cumsum([0, *(len(s) for s in w.starts)]), []
     for i in members:
         outputs, own = data.flights[i].outputs, slice(first[i], first[i + 1])
@@ -234,7 +234,7 @@ def _summed(each: Iterable[Array]) -> Array:
 
 
 def _whitened(weights: ResponseWeights, S: Complex[Array, "k p m c"]) -> Float[Array, "r c"]:
-    """What such sums over all flights make of the responses, in rows of variance 1."""
+    """The responses that sums over all flights make, in rows of variance 1."""
     w, (k, c) = weights.windows, (S.shape[0], S.shape[3])
     S = S / jnp.sum(w.seen, axis=0).astype(S.dtype)[None, :, None, None]
     dH = jnp.einsum("pkmz,kpzc->kpmc", weights.averages.P, S)
@@ -359,7 +359,8 @@ class FrequencyResponse(Objective):
         return z, Noise(sd, np.asarray(level), on_device(weights))
 
     def log_likelihood(self, layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
-        """Of complex normal errors of the responses, in SI units of output over input.
+        """Log-likelihood of complex normal errors of the responses, in SI units of output over
+        input.
 
         Args:
             noise: that `e` was evaluated with.
@@ -370,7 +371,7 @@ class FrequencyResponse(Objective):
         return 2.0 * weights.log_determinant - 0.5 * squares - constant
 
     def numbers(self, layout: Layout, data: Data, noise: Noise) -> int:
-        """Those that the noise's spectrum is taken from at the lines used."""
+        """The windows that the noise's spectrum is taken from at the lines used."""
         # The nuisances are not taken from them.
         return int(noise.whitening.numbers_of_noise) + layout.determined
 

@@ -369,7 +369,7 @@ def descend(
     max_steps: int,
     compiled: Compiled,
 ) -> "_Run":
-    """Step until arrived, from `first`, residuals and Jacobian at the start.
+    """Step until converged, from `first`, residuals and Jacobian at the start.
 
     The residuals are evaluated by the one program that evaluates them for everything else: it
     takes longer to compile than to run. With `BATCHED` all has a leading axis, the runs'.

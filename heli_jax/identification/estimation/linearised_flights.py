@@ -44,7 +44,8 @@ def condition_of(model: Model, flight: Flight) -> Condition | None:
 
 
 def cannot_linearise(problem: Problem) -> str | None:
-    """Why a flight's model has no point to be linearised about; None where each has one."""
+    """The reason why a flight's model has no point to be linearised about; None where each has
+    one."""
     for flight in problem.training:
         condition = condition_of(problem.model, flight)
         if condition is None:
@@ -121,7 +122,7 @@ _FEWEST = 10
 
 
 class _LeftOut(NamedTuple):
-    """What the linear model leaves out of a flight."""
+    """The part of a flight that the linear model leaves out."""
 
     signal: np.ndarray
     """(p, N), zero where nothing was simulated"""
@@ -132,7 +133,7 @@ class _LeftOut(NamedTuple):
 
 
 def linearisation_notes(at: Solution, e: Evaluation) -> list[Finding]:
-    """How much of the motion the linearised model leaves out, and what that does to estimates."""
+    """The part of the motion that the linearised model leaves out, and its effect on estimates."""
     layout, data, noise, _ = at
     if layout.model.linear:
         return []
@@ -155,7 +156,7 @@ def linearisation_notes(at: Solution, e: Evaluation) -> list[Finding]:
 
 @eqx.filter_jit
 def _linear_model(layout: Layout, data: Data, z: Array, i: int) -> tuple[Drive, Array, Array]:
-    """What drives a flight's linear model, its matrix, and True if its point is one of rest."""
+    """The inputs of a flight's linear model, its matrix, and True if its point is one of rest."""
     u = unpack(layout, data, z)
     condition = layout.flight_facts[i].condition
     model, drive, rest = linear_drive(layout, driven(layout, data, u, i), condition)

@@ -143,7 +143,7 @@ class FusedRuns:
 
 
 def _refused(layout: Layout) -> str | None:
-    """Why a problem has no such program; None where it may have one."""
+    """The reason why a problem has no such program; None where it may have one."""
     if type(layout.objective) is not OutputError:
         return "a method other than output error"
     if layout.shift:

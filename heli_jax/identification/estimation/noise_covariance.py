@@ -159,9 +159,9 @@ def gain_left(
     at_bound: Collection[int] = (),
 ) -> float | None:
     """The share of the sum of squares that a modest step would take away, where that is so much
-    that no optimiser can have arrived; None where it is not.
+    that no optimiser can have converged; None where it is not.
 
-    An optimiser calls its last step short and itself arrived also where every longer one failed,
+    An optimiser calls its last step short and itself converged also where every longer one failed,
     as among the roundings of a simulation that grows by orders of magnitude. What the data
     determine is then no question to ask of that point.
 

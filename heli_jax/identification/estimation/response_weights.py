@@ -68,7 +68,7 @@ vehicle makes of gusts, and white noise: (k, q, q), or None where that says noth
 
 
 class Averages(NamedTuple):
-    """What the inputs alone say of the responses' errors; p outputs, m inputs, k lines."""
+    """The errors of responses as the inputs alone determine them; p outputs, m inputs, k lines."""
 
     P: np.ndarray
     """(p, k, m, m) inverses of the cross-spectra from instruments to inputs, of the windows that
@@ -84,7 +84,7 @@ class Averages(NamedTuple):
 
 
 def averages(w: Windowed) -> Averages:
-    """Of flights in windows."""
+    """The spectra of flights in windows."""
     turns = np.outer(w.lines, np.arange(w.length)) / w.length
     g = hann(w.length) * np.exp(-2j * np.pi * turns)
     g = g - np.mean(g, axis=1, keepdims=True)
@@ -109,8 +109,8 @@ def _cross(seen: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _correlations(g: np.ndarray, d: int, step: int) -> dict[int, np.ndarray]:
-    """Of the transform of white noise at each line in a window with that at the d-th line after it
-    in another window, (k - d,), by how many steps that one begins later.
+    """Correlation of the transform of white noise at each line in a window with that at the d-th
+    line after it in another window, (k - d,), by how many steps that one begins later.
 
     Args:
         g: windows times the turning of each line (k, samples), less their means.
@@ -257,7 +257,7 @@ def _definite(S: np.ndarray, floor: np.ndarray) -> np.ndarray:
 
 
 def covariance(at: Averages, S: Complex[np.ndarray, "k p p"]) -> Complex[np.ndarray, "k p m p m"]:
-    """Of the errors of all responses at one frequency."""
+    """Covariance of the errors of all responses at one frequency."""
     P = np.nan_to_num(at.P)
     return np.einsum("ikxa,ijkab,jkyb,kij->kixjy", P, at.V, np.conj(P), S, optimize=True)
 
@@ -265,8 +265,8 @@ def covariance(at: Averages, S: Complex[np.ndarray, "k p p"]) -> Complex[np.ndar
 def whitening(
     at: Averages, S: Complex[np.ndarray, "k p p"], used: Bool[np.ndarray, "k p m"]
 ) -> Complex[np.ndarray, "k r r"]:
-    """What makes rows of variance 1 of the errors of the responses that are used, independent of
-    one another at a line; the rows of the others are zero. r = p m."""
+    """Factors that make rows of variance 1 of the errors of the responses that are used,
+    independent of one another at a line; the rows of the others are zero. r = p m."""
     k, p, m = used.shape
     taken = used.reshape(k, -1)
     C = covariance(at, S).reshape(k, p * m, p * m)
@@ -280,8 +280,7 @@ def whitening(
 
 
 def partial_coherence(w: Windowed, at: Averages) -> Float[np.ndarray, "k p m"]:
-    """Of each output with each input, what the others explain taken out; 0 where inputs move as
-    one."""
+    """Partial coherence of each output with each input; 0 where inputs move as one."""
     H = response_of(w, at, w.Y)
     left = (w.Y - np.einsum("wkm,kpm->wkp", w.U, np.nan_to_num(H))) * w.seen[:, None, :]
     density = np.sum(np.abs(left) ** 2, axis=0) / np.sum(w.seen, axis=0)
@@ -300,7 +299,7 @@ def pairs_used(
     coherence: Float[np.ndarray, "k p m"],
     sound: Bool[np.ndarray, "k p m"],
 ) -> Bool[np.ndarray, "k p m"]:
-    """Which responses take part at which frequencies."""
+    """The responses that take part, by frequency."""
     used = np.zeros(sound.shape, bool)
     omega = 2.0 * np.pi * w.hz
     everything = tuple(PairOptions(i, o) for i in w.inputs for o in w.outputs)
@@ -339,7 +338,7 @@ class ResponseWeights(NamedTuple):
 
     @property
     def log_determinant(self) -> float:
-        """Of the whitening of the responses that take part, lines by their share."""
+        """Weights of the responses that take part, lines by their share."""
         r = np.arange(self.whitening.shape[1])
         diagonal = np.real(np.asarray(self.whitening)[:, r, r])
         taken = np.asarray(self.used).reshape(diagonal.shape)
@@ -366,7 +365,8 @@ class ResponseWeights(NamedTuple):
 
 
 def first_weights(problem: Problem, flights: Sequence[Flight]) -> ResponseWeights:
-    """Of what is measured alone: the noise is what no response explains of the outputs.
+    """The spectra of the measured signals alone: the noise is what no response explains of the
+    outputs.
 
     Raises:
         ValueError: windows, band or pairs do not fit the flights, or too little is left.
@@ -517,7 +517,7 @@ def ways_of(
 
 
 def _weights(lines: Float[np.ndarray, " c"], length: int) -> Float[np.ndarray, "c o"]:
-    """How much of the power at each offset windows bring to a line."""
+    """The share of the power at each offset that windows bring to a line."""
     t, window = np.arange(length), hann(length)
     lobe = np.exp(2j * np.pi * np.outer(_OFFSETS, t) / length) @ window
     # What the mean of a window takes off is a part of the first line.
