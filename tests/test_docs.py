@@ -10,6 +10,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -130,6 +131,12 @@ def test_the_python_of_the_pages_imports_what_there_is():
                 if isinstance(node, ast.ImportFrom) and str(node.module).startswith("heli_jax"):
                     home = importlib.import_module(str(node.module))
                     assert [a.name for a in node.names if not hasattr(home, a.name)] == [], page
+
+
+def test_every_extra_stands_in_the_table_of_extras():
+    content = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    rows = re.findall(r"^\| `(\w+)` \|", (ROOT / "docs/index.md").read_text("utf-8"), re.MULTILINE)
+    assert set(rows) == set(content["project"]["optional-dependencies"])
 
 
 def test_the_gates_that_the_page_names_are_those_of_the_card():

@@ -42,7 +42,9 @@ PAGES = ("README.md", *(str(p.relative_to(ROOT)) for p in sorted(ROOT.glob("docs
 
 @pytest.mark.parametrize("page", PAGES)
 def test_the_configurations_of_the_pages_are_yaml(page):
-    for block in re.findall(r"```yaml\n(.*?)```", (ROOT / page).read_text("utf-8"), re.DOTALL):
+    for block in re.findall(
+        r"```yaml[^\n]*\n(.*?)```", (ROOT / page).read_text("utf-8"), re.DOTALL
+    ):
         assert parse_mapping(block, page)
 
 

@@ -2,8 +2,8 @@
 
 A page asks for it by a line `<!-- generated: NAME -->`; NAME is an entry of `_PARTS`, or
 `console`, which runs the block of commands below it and shows what each prints; exit codes have to
-be 0, unless `$ echo $?` follows. Beside them stand the figures and the report of the demo, of which
-nothing is kept in the repository.
+be 0, unless `$ echo $?` follows. A block with a title is a file that these commands find. Beside
+them stand the figures and the report of the demo, of which nothing is kept in the repository.
 
 Where HELI_JAX_SITE is `links` nothing is simulated, fitted or run: blocks stay as they are, and
 empty files stand for the demo's, so that tests can follow every link within seconds.
@@ -29,6 +29,7 @@ from mkdocs.structure.files import File, Files
 _ROOT = Path(__file__).parents[2]
 _LINKS_ALONE = os.environ.get("HELI_JAX_SITE") == "links"
 _MARK = re.compile(r"^<!-- generated: (\S+) -->$(?:\n```console\n((?:.*\n)*?)```$)?", re.MULTILINE)
+_TITLED = re.compile(r'^```\w+ title="([\w.-]+)"\n(.*?)^```$', re.MULTILINE | re.DOTALL)
 _ENDS = re.compile(r"([|<>])")
 _PAGE = re.compile(r"docs/([\w-]+)\.md")
 # Of these the demo has the figures that the gallery shows; the report has all.
@@ -61,6 +62,8 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     with tempfile.TemporaryDirectory(prefix="heli_jax-page-") as folder:
         for part in ("configs", "runs"):
             shutil.copytree(_made() / part, Path(folder) / part)
+        for name, text in _TITLED.findall(markdown):
+            (Path(folder) / name).write_text(text, encoding="utf-8")
         return _MARK.sub(
             lambda m: _console(m[2], folder) if m[1] == "console" else _PARTS[m[1]](), markdown
         )

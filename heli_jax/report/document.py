@@ -17,6 +17,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypedDict
 import numpy as np
 from pydantic import (
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     TypeAdapter,
     ValidationError,
@@ -649,6 +650,11 @@ class _Read(NamedTuple):
 _PLAIN = {bool: "true | false", int: "integer", float: "number", str: "text"}
 
 
+def _as_tuple(value: Any) -> Any:
+    # JSON has lists alone, and strict validation takes none for a tuple.
+    return tuple(value) if isinstance(value, list) else value
+
+
 @functools.cache
 def _read(kind: Any) -> _Read:
     origin, items = typing.get_origin(kind), typing.get_args(kind)
@@ -671,7 +677,8 @@ def _read(kind: Any) -> _Read:
     if origin is tuple and Ellipsis not in items:
         each = [_read(item) for item in items]
         words = ", ".join(item.words for item in each)
-        return _Read(f"[{words}]", tuple[tuple(item.checked for item in each)])  # type: ignore[misc]
+        numbers = tuple[tuple(item.checked for item in each)]  # type: ignore[misc]
+        return _Read(f"[{words}]", Annotated[numbers, BeforeValidator(_as_tuple)])
     if origin in (list, tuple, Sequence):
         of = _read(items[0])
         return _Read(f"list of {of.words}", list[of.checked], of.within("[]"))

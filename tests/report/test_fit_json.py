@@ -6,7 +6,9 @@ import json
 import math
 
 from heli_jax import compare_runs
+from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.report import files
+from heli_jax.report.document import model_of
 from heli_jax.report.saved_fit import load_fit
 
 
@@ -33,3 +35,10 @@ def test_what_is_not_determined_has_no_number_in_the_file(not_identifiable, tmp_
     for row in csv.DictReader(io.StringIO(compared.to_csv())):
         numbers = {row[k] for k in ("value", "sd", "lower95", "upper95")}
         assert (numbers == {""}) == (row["parameter"] in fit.estimates)
+
+
+def test_a_pair_of_numbers_is_read_back():
+    feedback = Feedback("one", "lat", "p", -0.2, (0.04, 0.06), 1e-9)
+    written = json.dumps(feedback._asdict())
+    read = model_of(Feedback).model_validate_json(written, strict=True)
+    assert read.lag == feedback.lag
