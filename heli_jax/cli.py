@@ -74,7 +74,7 @@ _CONFIG = (
 )
 _OUT = _arg("--out", metavar="DIR", help="directory (default: runs/NAME-DATE-TIME)")
 _JSON = _arg("--json", help="print everything as JSON, for other programs")
-_VERBOSE = _arg("--verbose", help="all findings in full (default: the three most severe)")
+_VERBOSE = _arg("--verbose", help="all findings, agreement and gates (default: three findings)")
 _LOG = _arg("log", metavar="LOG", help="a table or an autopilot's log: docs/logs.md")
 _OTHER_LOG = _arg("log", nargs="?", metavar="LOG",
                   help="read as the configuration's first (default: its own)")

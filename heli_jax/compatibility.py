@@ -131,7 +131,7 @@ def run_compatibility(
 
 
 def _agreement(compatibility: Compatibility) -> SensorAgreement:
-    """Return the sentences above the fit's own page, whose first line knows nothing of sensors."""
+    """Return the sentences above the fit's own page, whose statements know nothing of sensors."""
     head, rows = table(compatibility)
     # The fit's findings stand on its page already.
     doubts = tuple(d for d in compatibility.doubts if d not in compatibility.run.fit.findings)

@@ -38,7 +38,7 @@ class Finding(NamedTuple):
     shifts: Mapping[str, float] = MappingProxyType({})
     """by parameter: how far this misfit moves its estimate [SI], by one step of the score test"""
     brief: str = ""
-    """the finding in a few words, for the first line of a report"""
+    """the finding in a few words, for the statements of a report"""
     denies: bool = False
     """whether it shows that the model does not explain the record"""
     distrusts: tuple[str, ...] = ()
@@ -181,7 +181,7 @@ def weighed(findings: Iterable[Finding], estimates: Mapping[str, Any]) -> list[F
 
 
 def exit_code(status: str, adequate: bool, distrusts: Mapping[str, Distrust]) -> int:
-    """The exit code of a fit, which the first line and the page's light follow.
+    """The exit code of a fit, which the statements and the page's light follow.
 
     0: the intervals may be used as they stand. 3: something in the record contradicts the numbers
     (not identifiable, or not trusted). 4: not converged, or the model does not explain the record.

@@ -26,7 +26,7 @@ class Message(NamedTuple):
     """a sentence, with fields for the finding's numbers"""
     remedy: str = ""
     brief: str = ""
-    """the finding in a few words, for the first line of a report"""
+    """the finding in a few words, for the statements of a report"""
     measure: str = ""
     """what the finding's value is, and the limit that it is held against"""
     page: str = ""

@@ -16,9 +16,7 @@ from heli_jax.identification.equation_error.start import EquationErrorStart
 from heli_jax.identification.fit import Check, Estimate
 from heli_jax.identification.frequency_start import FrequencyErrorStart
 from heli_jax.identification.identifiability.verdict import Verdict
-from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
 from heli_jax.numbers import (
-    WORST,
     measured,
     percent,
     plain_cell,
@@ -74,17 +72,7 @@ def _print_details(run: FitRun) -> None:
         _tell_table(side_by_side)
         for sentence in supplementary.methods.sentences:
             tell(f"! {sentence}")
-    # From the weakest claim to the strongest: simulation and prediction of the fitted flights, then
-    # of those held out, where a model that was fitted too closely shows.
-    for agreement, what in (
-        (fit.metrics, "simulated"),
-        (fit.one_step, "one step ahead"),
-        (fit.validation, "held out, simulated"),
-        (fit.validation_free_run, "held out, simulated in one piece"),
-        (fit.one_step_validation, "held out, one step ahead"),
-    ):
-        for name, m in agreement.items():
-            _print_agreement(f"{name}, {what}", m)
+    _tell_table(report_tables.agreement(fit, None))
     if (held := report_tables.held_out_flights(fit.held_out_frequency)) is not None:
         _tell_table(held)
     _print_handling(run)
@@ -166,15 +154,6 @@ _MOST_OFFSETS = 4
 """offsets of inputs that the terminal shows"""
 _GATES = 5
 """failed gates that the terminal names; the report has all"""
-
-
-def _print_agreement(what: str, m: Metrics) -> None:
-    # An unstable vehicle leaves any record: numbers would say nothing.
-    if diverges(m, FAR):
-        tell(f"{what}: diverges")
-        return
-    fit = "worse than the mean" if m.vaf < WORST else f"{m.nrmse_fit_percent:.1f} %"
-    tell(f"{what}: VAF {vaf_text(m.vaf, 2)}, fit {fit}, TIC {m.tic:.4f}")
 
 
 def _print_baseline(b: Baseline) -> None:

@@ -1,6 +1,6 @@
 """The acceptance card: the usual gates of rotorcraft identification, each passed or failed.
 
-Its first gates are the first line's own statements: whatever makes a `no` there, no gate of a usual
+Its first gates are the three statements of a fit: whatever makes a `no` there, no gate of a usual
 card may see it, and a card that is passed must not stand beside a `no`.
 """
 
@@ -140,7 +140,7 @@ def _least(what: str, of: str, value: float, unit: str, least: float, remark: st
 
 
 def _of_verdicts(fit: Fit) -> list[Gate]:
-    """Gates of the first line: the reason for its `no` need not show in any number of the card."""
+    """Gates of the statements: the reason for its `no` need not show in any number of the card."""
     determined = "determined" if fit.verdict.identifiable else "not determined"
     shares = {n: s for n, s in fit.verdict.prior_share.items() if s > _RESTS}
     if fit.verdict.identifiable and shares:

@@ -111,7 +111,7 @@ class AdequacyContent(TypedDict):
     """Adequacy of the model for the record."""
 
     summary: Annotated[str, "adequate_in_words"]
-    """the answer in a few words, as the first line has it"""
+    """the answer in a few words, as the statement on adequacy has it"""
     judged: Annotated[list[OutputAdequacy], "adequacy.judged"]
     by_chance: Annotated[bool, "adequacy.by_chance"]
     """whether nothing measured stands out of the noise, so that any optimum is one of chance"""

@@ -109,13 +109,11 @@ def _outputs(flights: Sequence[Flight], by: Sequence[str]) -> dict[str, Followed
     """By output the part that follows the excitation."""
     sums: dict[str, np.ndarray] = {}
     for flight in flights:
-        drives = [flight.instruments[n] if n in by else u for n, u in flight.inputs.items()]
-        drives = [v for v in drives if np.ptp(v) > 0]
+        X = _drives(flight, by)
         measured = {n: _bridged(y) for n, y in flight.outputs.items() if _seen(y) >= _SEEN}
         measured = {n: y for n, y in measured.items() if np.ptp(y) > 0}
-        if not drives or not measured:
+        if X is None or not measured:
             continue
-        X = lines_of(np.stack(drives, axis=1))
         # What ends elsewhere than it began, as a slow mode does, has its leap at all lines: what is
         # left above a straight line between its ends is asked, too.
         above = [y - np.linspace(y[0], y[-1], y.size) for y in measured.values()]
@@ -137,6 +135,16 @@ def _outputs(flights: Sequence[Flight], by: Sequence[str]) -> dict[str, Followed
         for name, s in sums.items()
         if np.all(s[:, 1] > 0)
     }
+
+
+def _drives(
+    flight: Flight, by: Sequence[str], part: slice = slice(None)
+) -> Complex[np.ndarray, "K m"] | None:
+    """The lines of what excites a part of a flight: the logged excitation of the inputs `by` which
+    it is taken, else the inputs; None if nothing moves."""
+    drives = [flight.instruments[n] if n in by else u for n, u in flight.inputs.items()]
+    moving = [v[part] for v in drives if np.ptp(v[part]) > 0]
+    return lines_of(np.stack(moving, axis=1)) if moving else None
 
 
 def _seen(y: Float[np.ndarray, " N"]) -> float:
@@ -224,11 +232,9 @@ def errors_against_excitation(
     for record, e, W in zip(records_of(layout), errors, noise.whitening, strict=True):
         flight, part = flights[record.flight], slice(record.first, record.last)
         names = layout.outputs[record.flight]
-        drives = [flight.instruments[n] if n in by else u for n, u in flight.inputs.items()]
-        drives = [v[part] for v in drives if np.ptp(v[part]) > 0]
-        if not drives:
+        X = _drives(flight, by, part)
+        if X is None:
             continue
-        X = lines_of(np.stack(drives, axis=1))
         y = lines_of(np.stack([flight.outputs[n][part] for n in names], axis=1))
         # Records of one length share their whitening.
         if id(W) not in sizes:

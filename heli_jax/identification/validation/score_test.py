@@ -196,8 +196,8 @@ def strongest(records: Sequence[Lines], drives: Sequence[Drive]) -> Strongest:
     anew = _without(known.astype(np.float32), anew)
     anew *= np.sqrt(freedom / np.sum(anew**2, axis=0))
     of_chance = [each.gains(known_lines, _complex(anew).T).max(axis=(0, 1)) for each in trials]
-    beside = len(one.columns) - 2 * len(one.drives)
-    through = one.columns[[*range(beside), beside + 2 * at, beside + 2 * at + 1]]
+    own = one.beside + 2 * at
+    through = one.columns[[*range(one.beside), own, own + 1]]
     steps = _steps(rows, _real((one.response[of_filter] * through).T), residual)
     p_value = _by_chance(gain, np.max(of_chance, axis=0))
     return Strongest(drive, gain, p_value, damping, frequency, *steps)
@@ -214,6 +214,11 @@ class _Trial(NamedTuple):
     columns: Complex[np.ndarray, "c2 K"]
     """those beside first, then the drives, each by itself and one sample later"""
 
+    @property
+    def beside(self) -> int:
+        """The number of columns before those of the drives."""
+        return len(self.columns) - 2 * len(self.drives)
+
     def gains(
         self, known: Complex[np.ndarray, "q K"], residuals: Complex[np.ndarray, "r K"]
     ) -> Float[np.ndarray, "f d r"]:
@@ -225,7 +230,7 @@ class _Trial(NamedTuple):
         Args:
             known: orthonormal; the residuals have nothing of it.
         """
-        f, d, b = len(self.response), len(self.drives), len(self.columns) - 2 * len(self.drives)
+        f, d, b = len(self.response), len(self.drives), self.beside
         columns = self.columns
         power = np.real(self.response) ** 2 + np.imag(self.response) ** 2
         whole = np.stack([power @ np.real(columns * np.conj(v)).T for v in columns[:b]], axis=2)
