@@ -82,8 +82,8 @@ class Regression(NamedTuple):
         return tuple(dict.fromkeys(e for r in self.records for e in r.structure.equations))
 
     def rows(self, values: Float[np.ndarray, " q"], weights: Mapping[str, float]) -> Rows | None:
-        """Return residuals and their derivatives at values (q,), SI; None where they are not finite,
-        as at a parameter of zero that something is divided by."""
+        """Return residuals and their derivatives at values (q,), SI; None where they are not
+        finite, as at a parameter of zero that something is divided by."""
         parts, begin, order = [], 0, self.equations
         for one in self.records:
             names = one.structure.equations
