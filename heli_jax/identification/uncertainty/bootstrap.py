@@ -59,9 +59,8 @@ def refit(
     """Estimate the parameters of a fit anew from other records, side by side.
 
     Each record has the flights of the fit, of the same length and rate, with inputs and outputs of
-    its own; model, free parameters, priors, noise levels and the scales of weak priors are those of
-    the fit, and all searches begin at its optimum. No verdict is made of a record, and no interval:
-    for these it is fitted by itself.
+    its own; all else is the fit's, and all searches begin at its optimum. No verdict is made of a
+    record, and no interval.
 
     Args:
         fit: with output error or filter error.
@@ -89,7 +88,6 @@ def refit(
         inputs.append(at.layout.model.Inputs(**each))
         outputs.append({n: stacked(lambda f, n=n: f.outputs[n], i) for n in flight.outputs})
     optima = _optima(at, len(flights), tuple(outputs), tuple(inputs), say=say)
-    # Of every output as many samples as `fit` asks for; there are none but the fit's outputs.
     enough = np.array(
         [
             all(np.isfinite(y).sum() >= FEWEST_SEEN for f in record for y in f.outputs.values())
@@ -117,11 +115,10 @@ def _optima(
         flights = [f._replace(outputs=y) for f, y in zip(at.data.flights, by_flight, strict=True)]
         if driven is not None:
             flights = [f._replace(inputs=u) for f, u in zip(flights, driven, strict=True)]
-        changed = at.data._replace(flights=tuple(flights))
-        return changed if means is None else changed._replace(prior_mean=means)
+        means = at.data.prior_mean if means is None else means
+        return at.data._replace(flights=tuple(flights), prior_mean=means)
 
-    each = (outputs, inputs, prior_means)
-    return optimise_many(at, data, count, each, say)
+    return optimise_many(at, data, count, (outputs, inputs, prior_means), say)
 
 
 def _values(at: Solution, z: Any) -> dict[str, np.ndarray]:
@@ -207,8 +204,7 @@ def bootstrap(
     else:
         optima = _optima(at, runs, records, None, jnp.asarray(means, at.z.dtype), say)
         z, converged = optima.z, np.asarray(optima.converged)
-    # No nuisances: weak priors hold them, which are not drawn anew, so that they would scatter less
-    # than they are uncertain.
+    # No nuisances: weak priors hold them, which are not drawn anew.
     fitted = np.flatnonzero(converged)
     estimates = _values(at, np.asarray(z)[fitted])
     return Bootstrap(estimates, runs - fitted.size, tuple(map(int, fitted)))
@@ -225,7 +221,6 @@ def _records(
     for i, (flight, sds, outputs) in enumerate(each):
         if fit.coloured:
             residuals = [fit.signals[i].residual(n) for n in at.layout.outputs[i]]
-            # All outputs at once: their noises are correlated.
             coloured = drawn(np.stack(residuals), runs, rng)
         by_output = {}
         for n, y in flight.outputs.items():
@@ -234,28 +229,17 @@ def _records(
             if fit.coloured:
                 noise = coloured[:, at.layout.outputs[i].index(n)]
             record = np.asarray(outputs[n]) + float(u.biases[i][n]) + noise
-            # The same gaps: they are part of what the data can tell.
             record = np.where(np.isnan(np.asarray(y)), np.nan, record)
             by_output[n] = jnp.asarray(record, at.z.dtype)
         records.append(by_output)
     return tuple(records)
 
 
-# Bootstrap of fits in frequency: residuals, drawn line by line, on the estimated response.
-#
-# Whitened by its spectrum the residual at one frequency is as good as that at any other, with any
-# phase. So the model's response and the ends of each record stay, and to every line comes a
-# residual that another one had, at the size that the spectrum gives it there. Nothing is simulated
-# in time: unstable vehicles are no exception. The spectrum is estimated anew with each record.
-#
-# Source: Franke and Härdle (1992), On bootstrapping kernel spectral estimates.
-
-
 def _fit_by_lines(
     at: Solution, means: Float[np.ndarray, "runs p"], rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "runs q"], Bool[np.ndarray, " runs"]]:
-    """Fit drawn records one by one, each with its means of the priors; return the unknowns, and
-    whether they converged."""
+    """Fit drawn records one by one, each with its means of the priors and its own spectrum; return
+    the unknowns, and whether they converged."""
     z, converged = [], []
     begun = Optimum(
         at.z, jnp.zeros((), at.z.dtype), np.asarray(0), np.asarray(True), np.asarray(np.inf)
@@ -281,7 +265,12 @@ class _FromOptimum(Search):
 
 
 def _spectrum_records(at: Solution, rng: np.random.Generator) -> Iterator[Data]:
-    """Yield the numbers of the problem, again and again with other noise."""
+    """Yield the numbers of the problem, again and again with other noise.
+
+    The model's response and the ends of each record stay, and every line gets a whitened residual
+    that another one had, with any phase, at the size that the spectrum gives it there (Franke and
+    Härdle, 1992, On bootstrapping kernel spectral estimates). Nothing is simulated in time.
+    """
     layout, noise = _in_lines(at)
     errors = jax.device_get(errors_of_lines(layout, at.data, noise, at.z).errors)
     records = records_of(layout)
@@ -305,7 +294,6 @@ def _spectrum_records(at: Solution, rng: np.random.Generator) -> Iterator[Data]:
         for record, e, W in zip(records, errors, noise.whitening, strict=True):
             names = layout.outputs[record.flight]
             pool, K = pools[names], len(e)
-            # Residuals of other lines, with any phase, at the size of each.
             turned = np.exp(2j * np.pi * rng.random(K))[:, None]
             drawn_anew = pool[rng.integers(len(pool), size=K)] * turned
             other = np.linalg.solve(np.asarray(W), drawn_anew[:, :, None])[:, :, 0]
