@@ -78,19 +78,14 @@ def alternatives(
     """
     problems: dict[str, Problem] = {}
     nested = []
-    vehicles = {"": (model, dict(problem.free))}
-    if without_stand is not None:
-        free = {n: f for n, f in problem.free.items() if n not in ("kappa", "zeta")}
-        vehicles[", no stand"] = (without_stand, free)
-    for ending, (vehicle, free) in vehicles.items():
-        # Without the stand's own parameters nothing may be left to estimate.
-        if not free:
-            continue
+    vehicles = {"": (model, problem)}
+    free = {n: f for n, f in problem.free.items() if n not in ("kappa", "zeta")}
+    if without_stand is not None and free:
+        vehicles[", no stand"] = (without_stand, replace(problem, free=free))
+    for ending, (vehicle, base) in vehicles.items():
         for words, poles in (("no disturbance", 0), ("one pole", 1), ("two poles", 2)):
             disturbed = with_disturbance(vehicle, axis, max(poles, 1))
-            problems[words + ending] = _by_filter_error(
-                replace(problem, free=free), disturbed, silent=not poles
-            )
+            problems[words + ending] = _by_filter_error(base, disturbed, silent=not poles)
             # One pole is no special case of two: both of these have the same time constant.
             if poles:
                 nested.append((f"no disturbance{ending}", words + ending))
@@ -274,13 +269,10 @@ def same_parameters(model: Model, other: Model) -> dict[str, str]:
 def _inside(free: Free, value: float) -> float:
     """Return the value, or the nearest that is well inside the bounds."""
     # An optimum may lie on a bound, where the coordinates of a bounded parameter are at infinity.
-    low, high = free.lower, free.upper
-    size = high - low if low is not None and high is not None else abs(value) or abs(free.start)
-    if low is not None:
-        value = max(value, low + 1e-3 * size)
-    if high is not None:
-        value = min(value, high - 1e-3 * size)
-    return value
+    low = -math.inf if free.lower is None else free.lower
+    high = math.inf if free.upper is None else free.upper
+    size = high - low if math.isfinite(high - low) else abs(value) or abs(free.start)
+    return min(max(value, low + 1e-3 * size), high - 1e-3 * size)
 
 
 def _test(small: Candidate, large: Candidate) -> Nested:

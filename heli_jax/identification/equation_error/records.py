@@ -101,8 +101,7 @@ def segments(outputs: Mapping[str, np.ndarray]) -> tuple[list[slice], dict[str, 
     """Return where all outputs are seen, and the outputs with short gaps interpolated."""
     bridged = {name: _bridged(y) for name, y in outputs.items()}
     seen = np.all([np.isfinite(y) for y in bridged.values()], axis=0)
-    edges = np.flatnonzero(np.diff(np.r_[False, seen, False].astype(int)))
-    return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)], bridged
+    return np.ma.clump_masked(np.ma.array(seen, mask=seen)), bridged
 
 
 def _bridged(y: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
@@ -186,7 +185,7 @@ class Structure(NamedTuple):
     signals: tuple[str, ...]
     """measured outputs, then inputs: the columns of `shown`"""
     shown: dict[int, Float[np.ndarray, "r z"]]
-    """by state: the coefficients of each derivative of each signal that make it"""
+    """coefficients of each derivative of each signal that make a state"""
     equations: tuple[str, ...]
     """the states and outputs of `rows`"""
     rows: tuple[int, ...]

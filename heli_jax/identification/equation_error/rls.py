@@ -338,9 +338,9 @@ def _samples(model: Model, flight: Flight, least: int) -> tuple[str, slice, list
     names = sorted(names, key=lambda n: naming.unit(model.Outputs, n) != "rad")
     parts = {}
     for name in names:
-        missing = np.r_[True, np.isnan(flight.outputs[name]), True]
-        edges = np.flatnonzero(np.diff(missing.astype(int))).reshape(-1, 2)
-        parts[name] = slice(*max(edges.tolist(), key=lambda e: e[1] - e[0], default=(0, 0)))
+        seen = ~np.isnan(flight.outputs[name])
+        clumps = np.ma.clump_masked(np.ma.array(seen, mask=seen))
+        parts[name] = max(clumps, key=lambda s: s.stop - s.start, default=slice(0, 0))
     output = next((n for n in names if parts[n].stop - parts[n].start >= least), names[0])
     part, missing = parts[output], int(np.isnan(flight.outputs[output]).sum())
     findings = []

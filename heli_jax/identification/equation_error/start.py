@@ -38,7 +38,7 @@ from heli_jax.identification.problem import Free, Sign
 from heli_jax.vehicle import of_helicopter
 
 _APART = 1_000_000
-"""instants between segments and flights: longer than any lag over which residuals are correlated"""
+"""instants between segments and flights, longer than any lag"""
 _EVALUATIONS = 40
 """of the residuals in one search, at most"""
 _SMALL = 1e-6
@@ -185,7 +185,7 @@ def search(
     start: Float[np.ndarray, " q"],
     keep_sign: np.ndarray,
     weights: Mapping[str, float],
-) -> tuple[np.ndarray, Rows] | None:
+) -> "_Optimum | None":
     """Minimise the equation error from values `start` (q,), SI, those with `keep_sign` (q,) in
     their logarithms; None where it is not finite at the start."""
     first = regression.rows(start, weights)
@@ -220,7 +220,7 @@ def search(
         xtol=_SMALL,
         max_nfev=_EVALUATIONS,
     ).x
-    return values(end), at(tuple(end)) or first
+    return _Optimum(values(end), at(tuple(end)) or first, weights)
 
 
 _LAGS = 2.0
@@ -368,17 +368,13 @@ class EquationErrorStart(NamedTuple):
     @property
     def findings(self) -> list[Finding]:
         """The origin of each value."""
-        out = [
-            found(
-                "start.equation-error",
-                "note",
-                names=[n for n, v in self.values.items() if v.origin == "equation error"]
-                or ["nothing"],
-                equations=[e.name for e in self.equations],
-                explained=[e.r_squared for e in self.equations],
-                half_width=self.half_width,
-            )
-        ]
+        names = [n for n, v in self.values.items() if v.origin == "equation error"]
+        explained = {
+            "equations": [e.name for e in self.equations],
+            "explained": [e.r_squared for e in self.equations],
+            "half_width": self.half_width,
+        }
+        out = [found("start.equation-error", "note", names=names or ["nothing"], **explained)]
         if self.hidden:
             out.append(found("start.hidden-states", "note", names=self.hidden))
         return out + reasons_of(self.values)
@@ -446,12 +442,16 @@ def equation_error_start(
         out = dict.fromkeys(set(regression.names) - set(selection.selected), 0.0)
         regression = regression._replace(names=selection.selected, base={**regression.base, **out})
         optimum = _optimum(regression, keep) if selection.selected else optimum
-    structures = [one.structure for one in regression.records]
-    sd = np.sqrt(np.maximum(np.diag(covariance(optimum.rows)), 0.0))
+    structures, rows = [one.structure for one in regression.records], optimum.rows
+    equations = []
+    for i, (name, size) in enumerate(_sizes(regression).items()):
+        left = float(np.mean((rows.r[rows.equation == i] / optimum.weights[name]) ** 2))
+        equations.append(Equation(name, 1.0 - left / size**2))
+    sd = np.sqrt(np.maximum(np.diag(covariance(rows)), 0.0))
     estimates = dict(zip(regression.names, zip(optimum.values, sd, strict=False), strict=False))
     return EquationErrorStart(
         {n: _value(regression, n, free[n], estimates.get(n), reasons.get(n)) for n in free},
-        _explained(regression, optimum),
+        tuple(equations),
         half * flights[0].dt,
         tuple(dict.fromkeys(s.states[i] for s in structures for i in s.hidden)),
         selection,
@@ -470,8 +470,7 @@ def _regression(
         )
     stated = {n: f.start for n, f in free.items() if math.isfinite(f.start)}
     base = {n: float(np.asarray(v)) for n, v in naming.asdict(vehicle).items()} | stated
-    # What is free has generic numbers: NaN is left only where a constant is missing that somebody
-    # has to give, and only where a parameter stands is asked.
+    # With generic numbers of what is free, NaN is left only where a constant is missing.
     some = base | dict(zip(free, generic(len(free)), strict=True))
     structures = []
     for flight in flights:
@@ -524,7 +523,7 @@ def _require_value(base: Mapping[str, float], name: str, why: str) -> None:
 class _Optimum(NamedTuple):
     values: np.ndarray
     rows: Rows
-    weights: dict[str, float]
+    weights: Mapping[str, float]
 
 
 def _keeps_sign(model: Model, name: str, sign: Sign | None, at_hand: float) -> bool:
@@ -541,23 +540,24 @@ def _optimum(regression: Regression, keep_sign: set[str]) -> _Optimum:
     # Equations differ in unit and noise, and share parameters. The first weights are the sizes of
     # their left-hand sides.
     weights = {n: 1.0 / size for n, size in _sizes(regression).items()}
-    values, rows = _first_search(regression, keep, weights)
+    optimum = _first_search(regression, keep, weights)
     for _ in range(_ROUNDS - 1):
+        rows = optimum.rows
         weights = {
             # The floor keeps an equation that is met exactly from drowning all others.
             name: w / max(float(np.sqrt(np.mean(rows.r[rows.equation == i] ** 2))), 1e-9)
             for i, (name, w) in enumerate(weights.items())
         }
-        again = search(regression, values, keep, weights)
+        again = search(regression, optimum.values, keep, weights)
         if again is None:
             break
-        values, rows = again
-    return _Optimum(values, rows, weights)
+        optimum = again
+    return optimum
 
 
 def _first_search(
     regression: Regression, keep: np.ndarray, weights: Mapping[str, float]
-) -> tuple[np.ndarray, Rows]:
+) -> _Optimum:
     """Return the best of searches from several values."""
     at_hand = np.array([regression.base[n] for n in regression.names])
     known = np.isfinite(at_hand) & (at_hand != 0)
@@ -567,7 +567,7 @@ def _first_search(
         starts.append(np.where(known, at_hand, starts[0]))
     runs = [search(regression, x, keep, weights) for x in starts]
     if None in runs:
-        # Something is divided by one of them: begun with any size, and either sign.
+        # Something is divided by one of them: any size and either sign are tried.
         tries = [np.where(keep, np.where(known, at_hand, abs(x)), x) for x in _TRIED]
         runs += [search(regression, x, keep, weights) for x in tries]
     finite = [run for run in runs if run is not None]
@@ -577,7 +577,7 @@ def _first_search(
             f"{', '.join(regression.names)} (zero, the vehicle's, {_TRIED[0]:g} and others): "
             "expected a start of each free parameter"
         )
-    return min(finite, key=lambda run: run[1].cost)
+    return min(finite, key=lambda run: run.rows.cost)
 
 
 def _sizes(regression: Regression) -> dict[str, float]:
@@ -587,14 +587,6 @@ def _sizes(regression: Regression) -> dict[str, float]:
         for k, name in enumerate(one.structure.equations):
             left[name] += [s.left[k] - s.left[k].mean() for s in one.segments]
     return {n: max(float(np.std(np.concatenate(v))), 1e-300) for n, v in left.items()}
-
-
-def _explained(regression: Regression, optimum: _Optimum) -> tuple[Equation, ...]:
-    equations = []
-    for i, (name, size) in enumerate(_sizes(regression).items()):
-        r = optimum.rows.r[optimum.rows.equation == i] / optimum.weights[name]
-        equations.append(Equation(name, 1.0 - float(np.mean(r**2)) / size**2))
-    return tuple(equations)
 
 
 def _undetermined(regression: Regression, rows: Rows) -> tuple[str, str] | None:
@@ -608,7 +600,7 @@ def _undetermined(regression: Regression, rows: Rows) -> tuple[str, str] | None:
         return None
     part = np.abs(directions[-1])
     involved = [i for i in np.argsort(-part) if part[i] > 0.1]
-    # One of them has to stay where it is; one with a value at hand can.
+    # One with a value at hand can stay where it is.
     first = ([i for i in involved if math.isfinite(regression.base[names[i]])] or involved)[-1]
     others = ", ".join(names[i] for i in involved if i != first)
     return names[first], f"the equations do not tell it from {others}"
@@ -617,13 +609,12 @@ def _undetermined(regression: Regression, rows: Rows) -> tuple[str, str] | None:
 def _forced(regression: Regression, keep_sign: set[str], optimum: _Optimum) -> list[str]:
     """Return the parameters that cannot be zero: something is divided by them, or they keep their
     sign."""
-    forced = []
-    for i, name in enumerate(regression.names):
-        values = optimum.values.copy()
-        values[i] = 0.0
-        if name in keep_sign or regression.rows(values, optimum.weights) is None:
-            forced.append(name)
-    return forced
+    without = optimum.values * ~np.eye(len(optimum.values), dtype=bool)
+    return [
+        name
+        for name, values in zip(regression.names, without, strict=True)
+        if name in keep_sign or regression.rows(values, optimum.weights) is None
+    ]
 
 
 def _value(
