@@ -84,8 +84,7 @@ def alternatives(
         vehicles[", no stand"] = (without_stand, replace(problem, free=free))
     for ending, (vehicle, base) in vehicles.items():
         for words, poles in (("no disturbance", 0), ("one pole", 1), ("two poles", 2)):
-            disturbed = with_disturbance(vehicle, axis, max(poles, 1))
-            problems[words + ending] = _by_filter_error(base, disturbed, silent=not poles)
+            problems[words + ending] = _by_filter_error(base, vehicle, (axis,), poles)
             # One pole is no special case of two: both of these have the same time constant.
             if poles:
                 nested.append((f"no disturbance{ending}", words + ending))
@@ -95,13 +94,14 @@ def alternatives(
     return Alternatives(problems, tuple(nested))
 
 
-def _by_filter_error(problem: Problem, model: Model, *, silent: bool = False) -> Problem:
-    """Return the problem by filter error with a disturbed model; `silent` fixes its one disturbance
-    at all but nothing, so that its likelihood can be compared with those of the others."""
+def _by_filter_error(problem: Problem, model: Model, on: Sequence[str], poles: int = 1) -> Problem:
+    """Return the problem by filter error with disturbances; without poles the one disturbance is
+    fixed at all but nothing, so that its likelihood can be compared with those of the others."""
+    model = with_disturbance(model, on, max(poles, 1))
     vehicle = naming.asdict(problem.vehicle)
     own = {n for d in disturbances_of(model) for n in (d.sigma, d.tau)}
     known = {n: vehicle[n] for n in naming.names(model.Params) if n in vehicle and n not in own}
-    if silent:
+    if not poles:
         [d] = disturbances_of(model)
         # Not zero, which has no logarithm: a billionth of the motion moves no digit.
         known |= {d.sigma: jnp.asarray(1e-9 * problem.motion), d.tau: jnp.asarray(1.0)}
@@ -338,26 +338,20 @@ def disturbed_sets(
     """
     if len(names) < 2:
         raise ValueError(f"expected two disturbances or more to choose from, got {len(names)}")
-    listed = ", ".join(names)
-
-    def candidate(on: Sequence[str], poles: int = 1, *, silent: bool = False) -> Problem:
-        return _by_filter_error(problem, with_disturbance(model, on, poles), silent=silent)
-
-    rests = {name: [n for n in names if n != name] for name in names}
-    smaller = {f"without {n}: {', '.join(rest)}": candidate(rest) for n, rest in rests.items()}
+    smaller = {}
+    for name in names:
+        rest = [n for n in names if n != name]
+        smaller[f"without {name}: {', '.join(rest)}"] = rest, 1
     if 0 < len(stated) < len(names) - 1:
-        smaller[f"only {', '.join(stated)}"] = candidate(stated)
-    everything = f"all: {listed}"
+        smaller[f"only {', '.join(stated)}"] = stated, 1
+    everything = f"all: {', '.join(names)}"
     # Two poles are no extension of one: the two are compared by AIC and not by a test.
-    disturbed = {
-        **smaller,
-        everything: candidate(names),
-        f"{everything}; two poles": candidate(names, 2),
-    }
+    disturbed = {**smaller, everything: (names, 1), f"{everything}; two poles": (names, 2)}
     nested = [("no disturbance", name) for name in disturbed]
     nested += [(name, everything) for name in smaller]
-    none = candidate(names[:1], silent=True)
-    return Alternatives({"no disturbance": none, **disturbed}, tuple(nested))
+    sets = {"no disturbance": (names[:1], 0), **disturbed}
+    problems = {n: _by_filter_error(problem, model, *of) for n, of in sets.items()}
+    return Alternatives(problems, tuple(nested))
 
 
 APART = 2.0

@@ -79,17 +79,11 @@ def rls_step(
     forgetting: Float[Array, ""],
     bound: Float[Array, ""],
 ) -> tuple[RLSState, RLSInfo]:
-    """One sample, eqs 29-33 with the gain of eq. 33 (which eq. 31 equals with the new P).
-
-    Args:
-        state: Theta (q,) and the square root of P (q, q).
-        phi: regressor (q,).
-        forgetting: in (0, 1]; a sample j steps ago weighs forgetting^j.
-    """
+    """One sample, eqs 29-33 with the gain of eq. 33 (which eq. 31 equals with the new P); a sample
+    j steps ago weighs forgetting^j."""
     theta, S = state
     f = jnp.sum(S * phi[:, None], axis=0)
-    power = jnp.sum(f * f)
-    alpha = forgetting + power
+    alpha = forgetting + jnp.sum(f * f)
     gain = jnp.sum(S * f[None, :], axis=1) / alpha
     error = y - jnp.sum(phi * theta)
     theta = theta + gain * error
@@ -143,8 +137,6 @@ def rls(
     zeros there.
 
     Args:
-        u: input.
-        y: output.
         order: n of Hd(z); the paper's is 4.
         forgetting: see `rls_regression`, as p0 and bound.
 
@@ -160,13 +152,10 @@ def rls(
             f"expected at least {2 * order + 1} samples for order {order}, got {u.shape[0]}"
         )
     phi = regressors(u, y, order)
-    # Zeros in place of an unrecorded past would be learnt as if the helicopter had rested.
-    run = rls_regression(phi[order:], y[order:], forgetting, p0, bound)
-
-    def padded(values: Array) -> Array:
-        return jnp.concatenate([jnp.zeros((order, *values.shape[1:]), values.dtype), values])
-
-    return RLSResult(run.theta, padded(run.history), padded(run.error), padded(run.largest))
+    theta, *run = rls_regression(phi[order:], y[order:], forgetting, p0, bound)
+    return RLSResult(
+        theta, *(jnp.zeros((u.size, *v.shape[1:]), v.dtype).at[order:].set(v) for v in run)
+    )
 
 
 def rls_regression(
@@ -271,7 +260,6 @@ def baseline(
     """Return RLS of one flight: its first output (an angle before its rate) from its first input.
 
     Args:
-        model: names the signals, and shows whether physical parameters can be read off.
         params: the model's Params, for the vehicle's geometry and rotor speed.
         order: n of Hd(z); the paper's is 4.
         forgetting: in (0, 1]; a sample j steps ago weighs forgetting^j.
@@ -289,7 +277,6 @@ def baseline(
     u, y = flight.inputs[input_][part], flight.outputs[output][part]
     # To unit rms, so that P(0) means the same whatever the units; a silent signal is left as it is.
     u_scale, y_scale = (float(np.sqrt(np.mean(v**2))) or 1.0 for v in (u, y))
-    # Numbers as arrays: otherwise they would be constants of a program for each value.
     run = rls(
         jnp.asarray(u / u_scale),
         jnp.asarray(y / y_scale),
@@ -297,7 +284,6 @@ def baseline(
         forgetting=jnp.asarray(forgetting),
         p0=jnp.asarray(_P0),
     )
-    # Coefficients of past outputs have no unit, those of inputs that of y over u.
     back = np.r_[np.ones(order), np.full(order + 1, y_scale / u_scale)]
     history = np.asarray(run.history) * back
     num, den = transfer_function(history[-1])
