@@ -13,7 +13,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.signal
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -287,10 +286,12 @@ def baseline(
     back = np.r_[np.ones(order), np.full(order + 1, y_scale / u_scale)]
     history = np.asarray(run.history) * back
     num, den = transfer_function(history[-1])
+    from scipy.signal import lfilter, lfiltic
+
     # Started from the first measured outputs, over the whole record: one step ahead any model
     # predicts well where sampling is fast.
-    begun = scipy.signal.lfiltic(num, den, y[order - 1 :: -1], u[order - 1 :: -1])
-    simulated = np.r_[y[:order], scipy.signal.lfilter(num, den, u[order:], zi=begun)[0]]
+    begun = lfiltic(num, den, y[order - 1 :: -1], u[order - 1 :: -1])
+    simulated = np.r_[y[:order], lfilter(num, den, u[order:], zi=begun)[0]]
     diverges = not np.abs(simulated).max() <= 1e6 * np.abs(y).max()
     agreement = NO_METRICS if diverges else metrics(y, simulated)
     if (size := float(np.max(np.abs(np.roots(den))))) >= 1.0:
@@ -397,7 +398,8 @@ def _bias(
     # Without a bias both errors are the same noise; past outputs in the regressor hide it from the
     # error of one step, not from the simulation.
     elif agreement.rmse > _WORSE * one_step:
-        both = {"ahead": one_step, "simulated": agreement.rmse}
-        value = agreement.rmse / one_step
-        findings.append(found("rls.biased", value=value, limit=_WORSE, **both))
+        ratio, simulated = agreement.rmse / one_step, agreement.rmse
+        findings.append(
+            found("rls.biased", value=ratio, limit=_WORSE, ahead=one_step, simulated=simulated)
+        )
     return findings if whiteness(errors).white else [*findings, found("rls.not-white")]

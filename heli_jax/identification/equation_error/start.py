@@ -15,7 +15,6 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import scipy.linalg
-import scipy.optimize
 from jaxtyping import Float
 
 from heli_jax import naming
@@ -188,6 +187,8 @@ def search(
 ) -> "_Optimum | None":
     """Minimise the equation error from values `start` (q,), SI, those with `keep_sign` (q,) in
     their logarithms; None where it is not finite at the start."""
+    from scipy.optimize import least_squares
+
     first = regression.rows(start, weights)
     if first is None:
         return None
@@ -209,7 +210,7 @@ def search(
         return (at(tuple(z)) or first).J * np.where(keep_sign, values(z), 1.0)
 
     z = np.where(keep_sign, 0.0, start)
-    end = scipy.optimize.least_squares(
+    end = least_squares(
         residuals,
         z,
         slopes,  # pyright: ignore[reportArgumentType]

@@ -228,7 +228,8 @@ def estimates_of(
             start = free.start
             if u.at_bound or u.name in problem.model.delay_parameters:
                 searched = transforms.limits(free)
-        numbers = (relative * u.reference, *map(float, np.clip(ends, *searched)))
+        low, high = (float(v) for v in np.clip(ends, *searched))
+        numbers = (relative * u.reference, low, high)
         whites = (white * u.reference, float(white * u.reference * alone[i]))
         if u.name in errors.verdict.not_identifiable:
             numbers, whites = (None, None, None), (None, None)
