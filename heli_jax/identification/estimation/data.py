@@ -13,7 +13,7 @@ from heli_jax.analysis.trim import is_full_nonlinear, trim
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
+from heli_jax.identification.estimation.residual import residual_and_jacobian
 from heli_jax.identification.estimation.simulated_flights import (
     SimulatedOutputs,
     simulated_at,

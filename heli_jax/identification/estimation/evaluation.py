@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax.identification.estimation.kalman import Innovations
-from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
+from heli_jax.identification.estimation.residual import residual_and_jacobian
 from heli_jax.identification.estimation.simulated_flights import simulated_at, with_biases
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
 from heli_jax.numerics.jitted import jitted

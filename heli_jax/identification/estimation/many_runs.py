@@ -21,13 +21,12 @@ from heli_jax.identification.estimation.levenberg_marquardt import (
     Optimum,
     Scaling,
     descend,
-    residual_and_jacobian,
     scaling,
     ties_of,
     trusted_columns,
 )
 from heli_jax.identification.estimation.output_error import OutputError
-from heli_jax.identification.estimation.residual import differentiate, prior_rows, weak_rows
+from heli_jax.identification.estimation.residual import prior_rows, residual_and_jacobian, weak_rows
 from heli_jax.identification.estimation.simulated_flights import driven, measured_counts
 from heli_jax.identification.unknowns.layout import (
     Data,
@@ -334,7 +333,7 @@ def _batch(
     """Residuals and Jacobians of a batch; all of `data` has a leading axis too."""
 
     def single(data: Data, z: Array) -> tuple[Array, Array]:
-        e = differentiate(layout, data, noise, z)
+        e = residual_and_jacobian(layout, data, noise, z)
         return e.r, e.J
 
     return jax.vmap(single)(data, z)

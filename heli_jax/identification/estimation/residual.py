@@ -181,7 +181,7 @@ class ResidualAndJacobian(NamedTuple):
 
 
 @jitted
-def differentiate(
+def residual_and_jacobian(
     layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
 ) -> ResidualAndJacobian:
     """Residuals and their Jacobian in forward mode, in one pass."""

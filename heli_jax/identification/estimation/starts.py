@@ -10,11 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax.dynamics.disturbance import disturbances_of
-from heli_jax.identification.estimation.levenberg_marquardt import (
-    residual_and_jacobian,
-    without_size,
-)
-from heli_jax.identification.estimation.residual import rows_of
+from heli_jax.identification.estimation.levenberg_marquardt import without_size
+from heli_jax.identification.estimation.residual import residual_and_jacobian, rows_of
 from heli_jax.identification.estimation.simulated_flights import predict, signal_numbers
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Free, Problem
 from heli_jax.identification.unknowns import transforms
