@@ -13,7 +13,12 @@ from heli_jax.identification.equation_error.start import equation_error_start
 from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.disturbance_search import NO_DISTURBANCE, with_noise_guess
 from heli_jax.identification.estimation.evaluation import evaluate
-from heli_jax.identification.estimation.multistart import FirstGuess, Search, named_values
+from heli_jax.identification.estimation.multistart import (
+    FirstGuess,
+    Search,
+    named_values,
+    sum_of_squares,
+)
 from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
 from heli_jax.identification.estimation.starts import draw
 from heli_jax.identification.identifiability.equivalents import second_solutions
@@ -125,13 +130,11 @@ def _needs_further_starts(at: SearchState) -> bool:
         return False
     if layout.noise_model == "white":
         # By the noise of the first guess: with the relaxed one each output would leave as much.
-        e, noise = evaluate(layout, at.search.data, best.noise, best.best.z), at.guess.noise
-        left = sum(
-            float(np.nansum(np.square(r / np.asarray(sd[n]))))
-            for raw, sd in zip(e.raw, noise.sd, strict=True)
-            for n, r in raw.items()
-        )
-        explained = 1.0 - left / at.search.variation(noise)
+        data, noise = at.search.data, at.guess.noise
+        left = sum_of_squares(evaluate(layout, data, best.noise, best.best.z).raw, noise)
+        outputs = [{n: np.asarray(y) for n, y in f.outputs.items()} for f in data.flights]
+        moved = [{n: y - np.nanmean(y) for n, y in of.items()} for of in outputs]
+        explained = 1.0 - left / sum_of_squares(moved, noise)
         return not (bool(best.best.converged) and explained > _LITTLE)
     return layout.noise_model == "spectrum" and left_stability(at.problem, at.search, best)
 
