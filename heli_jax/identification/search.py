@@ -93,9 +93,8 @@ def search(
     """
     layout, data = guess.layout, guess.data
 
-    known: Any = (guess.e.r, guess.e.J)
     if starts is None:
-        points = delay_start(problem, layout, guess.begun, guess.noise, guess.z, known)[None]
+        points = delay_start(problem, layout, guess.begun, guess.noise, guess.z, guess.e.J)[None]
     else:
         points = draw(layout, problem, guess.z, starts, seed)
 
@@ -105,8 +104,9 @@ def search(
     over = Search(problem, layout, data, first_steps)
     # Residuals at the first start are those of the first guess.
     same = guess.begun is data and bool(np.array_equal(points[0], guess.z))
+    known: Any = (guess.e.r, guess.e.J) if same else None
     first = Search(problem, layout, guess.begun, first_steps)
-    optima = first.run(guess.noise, points, report, known=known if same else None)
+    optima = first.run(guess.noise, points, report, known=known)
     best = relax_noise_covariance(over, guess.noise, min(optima, key=rank))
     over.max_steps = max_steps
     if layout.sigmas:

@@ -16,8 +16,8 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.residual import residual_and_jacobian
 from heli_jax.identification.estimation.simulated_flights import (
     SimulatedOutputs,
+    by_output,
     simulated_at,
-    with_biases,
 )
 from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Problem
@@ -163,7 +163,7 @@ def _before_it_grows(
     simulate = _simulated
     for _ in range(_HALVINGS):
         runs = jax.device_get(simulate(layout, data, z))
-        simulated = with_biases(layout, runs)
+        simulated = by_output(layout, runs)
         windows = [count for count, _ in layout.windows]
         far = any(
             runs_away(v, np.asarray(f.outputs[n]))

@@ -401,8 +401,7 @@ def optimise(
     """
 
     def evaluate(z: Array) -> tuple[Array, Array]:
-        e = residual_and_jacobian(layout, data, noise, z)
-        return e.r, e.J
+        return residual_and_jacobian(layout, data, noise, z)[:2]
 
     free = np.ones(layout.size, bool) if held is None else ~held
     count, ties = measured_count(data), ties_of(layout)

@@ -19,7 +19,6 @@ from heli_jax.identification.estimation.levenberg_marquardt import (
     BATCHED,
     Constants,
     Optimum,
-    Scaling,
     descend,
     scaling,
     ties_of,
@@ -331,12 +330,8 @@ def _batch(
     layout: Layout, data: Data, noise: Noise, z: Float[Array, "b q"]
 ) -> tuple[Float[Array, "b n"], Float[Array, "b n q"]]:
     """Residuals and Jacobians of a batch; all of `data` has a leading axis too."""
-
-    def single(data: Data, z: Array) -> tuple[Array, Array]:
-        e = residual_and_jacobian(layout, data, noise, z)
-        return e.r, e.J
-
-    return jax.vmap(single)(data, z)
+    each = jax.vmap(lambda data, z: residual_and_jacobian(layout, data, noise, z)[:2])
+    return each(data, z)
 
 
 def optimise_many(
@@ -355,7 +350,12 @@ def optimise_many(
         say: called with a sentence where many runs are no programs of machine code.
     """
     layout, noise = reached.layout, reached.noise
-    units = _units_at(reached)
+    r, J = residual_and_jacobian(*reached)[:2]
+
+    def at(z: Array) -> tuple[Array, Array]:
+        return residual_and_jacobian(layout, reached.data, noise, z)[:2]
+
+    units = scaling(r, J, trusted_columns(layout, at, reached.z, r, J))
     fused = _fused(reached, data, each, say) if k >= _MANY else None
     batch, optima = min(_BATCH if fused is None else _SIDE_BY_SIDE, k), []
     z0 = jnp.tile(reached.z[None, :], (batch, 1))
@@ -400,15 +400,3 @@ def _fused(
             f"there is no translation of {e}"
         )
         return None
-
-
-def _units_at(reached: Solution) -> Scaling:
-    """The units of runs that begin near an optimum."""
-    layout, data, noise, z = reached
-
-    def evaluate(z: Array) -> tuple[Array, Array]:
-        e = residual_and_jacobian(layout, data, noise, z)
-        return e.r, e.J
-
-    r, J = evaluate(z)
-    return scaling(r, J, trusted_columns(layout, evaluate, z, r, J))

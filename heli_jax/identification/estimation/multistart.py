@@ -92,12 +92,12 @@ class Search:
                 layout, self.data, noise, z, self.max_steps, held=self._held, known=first
             )
             # z stays on the device, from where the next program takes it.
-            return jax.device_get(end)._replace(z=end.z)
+            return jax.device_get(end)._replace(z=jnp.asarray(end.z))
 
         run = optimum(self.layout, start)
         # An optimiser can converge where the model explains nothing: its gradient is zero there.
         # The cost is a mean over the measured numbers, as that of no model is.
-        if run.cost > _GOOD:
+        if not run.cost <= _GOOD:
             nothing = self.misfit_of_nothing(noise) / measured_count(self.data)
             run = run._replace(converged=run.converged & (run.cost <= 1.5 * nothing + _GOOD))
         values = named_values(self.layout, self.data, run.z)

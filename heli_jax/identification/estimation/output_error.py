@@ -15,7 +15,6 @@ from heli_jax.identification.estimation.objective import Objective
 from heli_jax.identification.estimation.residual import Residuals
 from heli_jax.identification.estimation.simulated_flights import (
     Run,
-    joined_biases,
     measured_signals,
     predict,
     signal_numbers,
@@ -38,7 +37,8 @@ class OutputError(Objective):
         runs = predict(layout, data, u)
         y, sd = measured_signals(layout, data, noise)
         simulated = jnp.concatenate([run.outputs.reshape(-1) for run in runs])
-        error = y - joined_biases(u)[signal_numbers(layout, data)] - simulated
+        biases = jnp.stack([b for by_output in u.biases for b in by_output.values()])
+        error = y - biases[signal_numbers(layout, data)] - simulated
         # A missing sample says nothing: its row is zero, and so is its derivative. Left out it
         # would change the shapes, and with them the program, from record to record.
         rows = jnp.where(jnp.isfinite(y), error, 0.0) / sd

@@ -47,9 +47,7 @@ class SimulatedOutputs(NamedTuple):
     """Simulated outputs of the flights."""
 
     outputs: tuple[Float[Array, "p N"], ...]
-    """by flight, SI, as `Layout.outputs` orders them, without the bias"""
-    biases: Float[Array, " s"]
-    """flight after flight and output after output"""
+    """by flight, SI, as `Layout.outputs` orders them, with the bias"""
     state_rms: Float[Array, "f n"]
     """root mean square of each simulated state, by flight"""
 
@@ -199,15 +197,14 @@ def _with_lead(inputs: Any, samples: np.ndarray, late: Delays | None) -> Any:
     return jax.tree.unflatten(structure, leaves)
 
 
-def joined_biases(u: Unknowns) -> Array:
-    """The biases, flight after flight and output after output."""
-    return jnp.stack([b for bias in u.biases for b in bias.values()])
-
-
 def outputs_of(u: Unknowns, runs: tuple[Run, ...]) -> SimulatedOutputs:
     """Return the simulated outputs with their biases, as reports show them."""
     rms = [jnp.sqrt(jnp.mean(jnp.square(run.states), axis=1)) for run in runs]
-    return SimulatedOutputs(tuple(run.outputs for run in runs), joined_biases(u), jnp.stack(rms))
+    with_bias = [
+        run.outputs + jnp.stack(list(bias.values()))[:, None]
+        for run, bias in zip(runs, u.biases, strict=True)
+    ]
+    return SimulatedOutputs(tuple(with_bias), jnp.stack(rms))
 
 
 @jitted
@@ -217,13 +214,11 @@ def simulated_at(layout: Layout, data: Data, z: Float[Array, " q"]) -> Simulated
     return outputs_of(u, predict(layout, data, u))
 
 
-def with_biases(layout: Layout, simulated: SimulatedOutputs) -> tuple[dict[str, np.ndarray], ...]:
-    """By flight and output what is simulated, (N,), with the bias, SI."""
-    # In the order of `joined_biases`.
-    bias = iter(simulated.biases)
+def by_output(layout: Layout, simulated: SimulatedOutputs) -> tuple[dict[str, np.ndarray], ...]:
+    """Name the simulated outputs (N,) of each flight; `simulated` is fetched from the device."""
     return tuple(
-        {n: np.asarray(y + next(bias)) for n, y in zip(names, run, strict=True)}
-        for run, names in zip(simulated.outputs, layout.outputs, strict=True)
+        dict(zip(names, run, strict=True))
+        for names, run in zip(layout.outputs, simulated.outputs, strict=True)
     )
 
 
@@ -273,7 +268,7 @@ def measured_count(data: Data) -> int:
 
 
 def measured_counts(data: Data) -> np.ndarray:
-    """The same of each record, where all of `data` has leading axes of records."""
+    """Return the same of each record, where all of `data` has leading axes of records."""
     # In NumPy, outside of what is compiled: the optimiser's program does not depend on it.
     each = [
         np.isfinite(np.asarray(y)).sum(axis=-1)
