@@ -260,7 +260,11 @@ def begun(
 ) -> tuple[Drive, Estimate, Float[Array, "N p"], Float[Array, " p"]]:
     """Return the drive of a filter, its first estimate, the measurements and the variances of their
     noise; arguments as of `innovations`."""
-    options = _checked(options)
+    if options.dt is None:
+        raise TypeError("innovations: expected dt, the sample time in seconds, got None")
+    for name in _ONLY_SIMULATE:
+        if getattr(options, name) is not getattr(DEFAULT, name):
+            raise TypeError(f"innovations: expected no {name}, which only simulate has")
     model, inputs, linear = between_samples(model, inputs, inputs, options.hold)
     begin = options.initial_state
     x0 = model.initial_state(params) if begin is None else begin
@@ -289,15 +293,6 @@ def first_covariance(model: Model, params: Any, dtype: DTypeLike) -> Float[Array
     """
     sds = initial_sd_of(model, params, dtype)
     return correlation_of(model, params, dtype) * sds[:, None] * sds[None, :]
-
-
-def _checked(options: SimulationOptions) -> SimulationOptions:
-    if options.dt is None:
-        raise TypeError("innovations: expected dt, the sample time in seconds, got None")
-    for name in _ONLY_SIMULATE:
-        if getattr(options, name) is not getattr(DEFAULT, name):
-            raise TypeError(f"innovations: expected no {name}, which only simulate has")
-    return options
 
 
 class _Linear(NamedTuple):
