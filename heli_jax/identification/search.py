@@ -114,17 +114,17 @@ def search(
     name = "start" if len(optima) == 1 else "starts"
     runs = [Run(name, z, run) for z, run in zip(points, optima, strict=True)]
     chosen = min(runs, key=lambda run: rank(run.optimum))
-    state = SearchState(problem, over, guess, best, starts, seed)
+    state = SearchState(over, guess, best, starts, seed)
     for restart in RESTARTS:
         if not restart.when(state):
             continue
         report(f"the search begins again: {restart.name}")
         begun = state.best
-        for start in restart.points(state):
-            [run] = over.run(start.noise, start.z[None, :])
-            runs.append(Run(restart.name, start.z, run))
-            other = relax_noise_covariance(over, start.noise, run)
-            if is_better(problem, over, other, state.best):
+        for noise, z in restart.points(state):
+            [run] = over.run(noise, z[None, :])
+            runs.append(Run(restart.name, z, run))
+            other = relax_noise_covariance(over, noise, run)
+            if is_better(over, other, state.best):
                 state, chosen = state._replace(best=other), runs[-1]
         if state.best is begun:
             continue
@@ -138,9 +138,7 @@ _BETTER = 0.1
 """gain in log-posterior from which on an optimum is better"""
 
 
-def is_better(
-    problem: Problem, over: Search, optimum: RelaxedOptimum, other: RelaxedOptimum
-) -> bool:
+def is_better(over: Search, optimum: RelaxedOptimum, other: RelaxedOptimum) -> bool:
     """True if an optimum is to be chosen instead of another.
 
     One that converged wins, then one that is stable if the start was, then the higher
@@ -148,7 +146,7 @@ def is_better(
     """
 
     def passes(o: RelaxedOptimum) -> tuple[bool, bool]:
-        unstable = problem.model.linear and left_stability(problem, over, o)
+        unstable = over.layout.model.linear and left_stability(over, o)
         return bool(o.best.converged), not unstable
 
     if passes(optimum) != passes(other):

@@ -33,11 +33,7 @@ from heli_jax.identification.unknowns.layout import (
 
 
 def data_of(problem: Problem, flights: tuple[Flight, ...], layout: Layout | None = None) -> Data:
-    """The numbers of a problem over the given flights.
-
-    Args:
-        layout: of the problem over these flights, where it is at hand already.
-    """
+    """The numbers of a problem over the given flights, whose layout may be at hand already."""
     dtype = np.dtype(jnp.result_type(float))
     nuisance, frees = problem.nuisance, list(problem.free.values())
     bounds = [transforms.limits(f) for f in frees]

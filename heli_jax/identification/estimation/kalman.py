@@ -29,9 +29,6 @@ from heli_jax.simulation.hold import Segment, between_samples, delayed, delays_o
 from heli_jax.simulation.options import DEFAULT, SimulationOptions
 from heli_jax.simulation.stepping import held_columns
 
-# What a Kalman filter runs on: the drive of a record, and what a step needs of a model.
-
-
 # Params and Inputs are a model's own classes: they are annotated Any.
 
 type Estimate = tuple[Float[Array, " n"], Float[Array, "n n"]]
@@ -197,8 +194,6 @@ def _step(equations: _Equations, estimate: Estimate, part: Segment) -> Estimate:
     return x + step.shift[:n], product(product(Phi, P), Phi.T) + step.Q[:n, :n]
 
 
-# Params, Inputs and State are a model's own classes: they are annotated Any.
-
 SMALL = 8
 """States up to which the filter of a linear model is written out in rows"""
 _ONLY_SIMULATE = (
@@ -286,11 +281,7 @@ def by_name(names: Iterable[str], errors: Array, variances: Array) -> Innovation
 
 
 def first_covariance(model: Model, params: Any, dtype: DTypeLike) -> Float[Array, "n n"]:
-    """Covariance of the state at the first sample (P0).
-
-    Args:
-        params: the model's Params, SI.
-    """
+    """Covariance of the state at the first sample (P0)."""
     sds = initial_sd_of(model, params, dtype)
     return correlation_of(model, params, dtype) * sds[:, None] * sds[None, :]
 

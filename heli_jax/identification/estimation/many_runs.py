@@ -79,9 +79,6 @@ class FusedRuns:
     def __init__(self, layout: Layout, data: Data, noise: Noise, own: Own) -> None:
         """Translate and compile, or take what was compiled for the same.
 
-        Args:
-            own: what of the records each run has of its own.
-
         Raises:
             UnsupportedError: this has no such program.
         """
@@ -95,13 +92,9 @@ class FusedRuns:
         self._parts = _compiled(layout, structure, kinds, own)
 
     def __call__(self, data: Data, z: Array) -> tuple[Array, Array]:
-        """Rows (b, n) and Jacobians (b, n, q): of each run those of a triangle that stands for its
-        measurements, then those of the priors.
-
-        Args:
-            data: the numbers of the problem; all of it has a leading axis (b,).
-            z: the unknowns (b, q).
-        """
+        """Rows (b, n) and Jacobians (b, n, q) at unknowns (b, q): of each run those of a triangle
+        that stands for its measurements, then those of the priors. All of `data` has a leading axis
+        (b,)."""
         triangle = _triangles(self._sums(data, np.asarray(z)))
         r, J = _priors(self._layout, data, z)
         rows = jnp.concatenate([jnp.asarray(triangle[:, :, 0], z.dtype), r], axis=1)
@@ -344,7 +337,6 @@ def optimise_many(
     """Return the optima (k, ...) of many records, each searched from one optimum.
 
     Args:
-        reached: that optimum; its Jacobian gives the units of all runs.
         data: makes the numbers of one run out of its slice of `each`.
         each: what differs between the runs, a pytree of arrays (k, ...).
         say: called with a sentence where many runs are no programs of machine code.

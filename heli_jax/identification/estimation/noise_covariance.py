@@ -78,9 +78,6 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
     """Alternate between the optimum and the noise until one of them stays.
 
     Source: relaxation of the noise covariance, Jategaonkar (2006), section 4.4.
-
-    Args:
-        noise: that `best` was found with.
     """
     layout, objective = search.layout, search.layout.objective
     trace = [(int(best.steps), float(best.cost))]

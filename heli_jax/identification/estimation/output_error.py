@@ -27,11 +27,7 @@ class OutputError(Objective):
     """The simulation, driven by the logged inputs alone, against the measured outputs."""
 
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
-        """Signal after signal; with windows the defects between them follow.
-
-        Args:
-            u: the unknowns, in the units of the model.
-        """
+        """Signal after signal; with windows the defects between them follow."""
         # No measurement enters the simulation: that keeps the estimates free of a bias by output
         # noise, which equation error has, and is why gusts are taken for noise.
         runs = predict(layout, data, u)
@@ -45,12 +41,7 @@ class OutputError(Objective):
         return Residuals(jnp.concatenate([rows, *_defects(layout, data, u, runs)]), runs)
 
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
-        """The simulated flights: with no disturbance all runs are the same.
-
-        Args:
-            reached: where the fit ended.
-            runs: how many records; one simulation serves them all.
-        """
+        """The simulated flights: with no disturbance all runs are the same."""
         layout = reached.layout
         simulated = predict(layout, reached.data, u)
         return [

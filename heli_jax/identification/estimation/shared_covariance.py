@@ -219,11 +219,7 @@ def _riccati_jvp(primals: Any, tangents: Any) -> Any:
 
 @jax.custom_jvp
 def recurrence(F: Array, forcing: Array, x0: Array) -> tuple[Array, Array]:
-    """x[k+1] = F x[k] + forcing[k]: x after the last of K samples, and x (K, m, n) at all of them.
-
-    Args:
-        forcing: (K, m, n), of m records.
-    """
+    """x[k+1] = F x[k] + forcing[k]: x after the last of K samples, and x (K, m, n) at all."""
     return jax.lax.scan(lambda x, f: (x @ F.T + f, x), x0, forcing)
 
 

@@ -112,14 +112,7 @@ def _side_by_side(
     stacked = jax.tree.map(lambda *v: jnp.concatenate(v), *each)
 
     def window(inputs: Any, known: dict[str, Any], dt: Any, state: Any) -> tuple[Any, Any]:
-        """States and outputs of one window; vmap makes them of all.
-
-        Args:
-            inputs: the model's Inputs, arrays (m,).
-            known: by name what is known of this flight alone, SI.
-            dt: [s].
-            state: the model's State at its first sample; None for the model's own.
-        """
+        """States and outputs of one window; vmap makes them of all."""
         params = layout.model.Params(**{**data.base, **u.params, **u.noise, **known})
         # Any member's number will do: the inputs of all of them move alike between samples.
         late = delays_of(layout.model, params, u.shift, dt)
@@ -141,11 +134,7 @@ def _side_by_side(
         windows = slice(first, first + count)
 
         def joined(v: Array, windows: slice = windows, n: int = n) -> Array:
-            """One flight's windows end to end.
-
-            Args:
-                v: (signals, windows, samples) of all flights.
-            """
+            """One flight's windows end to end, of signals (signals, windows, samples)."""
             # The sample after these m is the next window's first; past n stand repetitions.
             return v[:, windows, :m].reshape(v.shape[0], -1)[:, :n]
 
@@ -180,11 +169,6 @@ def _with_lead(inputs: Any, samples: np.ndarray, late: Delays | None) -> Any:
 
     Where inputs are late each window has the sample before its first in front, which acts there
     until the first one does: (windows, m + 1).
-
-    Args:
-        inputs: arrays (N,).
-        samples: those of each window (windows, m).
-        late: None where no input is.
     """
     if late is None:
         return at(inputs, samples)
@@ -217,7 +201,7 @@ def simulated_at(layout: Layout, data: Data, z: Float[Array, " q"]) -> Simulated
 def by_output(layout: Layout, simulated: SimulatedOutputs) -> tuple[dict[str, np.ndarray], ...]:
     """Name the simulated outputs (N,) of each flight; `simulated` is fetched from the device."""
     return tuple(
-        dict(zip(names, run, strict=True))
+        {n: np.asarray(y) for n, y in zip(names, run, strict=True)}
         for names, run in zip(layout.outputs, simulated.outputs, strict=True)
     )
 
@@ -252,11 +236,7 @@ def measured_signals(layout: Layout, data: Data, noise: Noise) -> tuple[Array, A
 
 
 def measurement_sd(u: Unknowns, output: str, sd: Array) -> Array:
-    """The sd of an output's white measurement noise.
-
-    Args:
-        sd: the guess of it, or what is stated.
-    """
+    """The sd of an output's white measurement noise, from what is guessed or stated."""
     sd = sd * u.scales[output] if output in u.scales else sd
     through = u.noise.get(sensor_noise(output))
     return sd if through is None else jnp.hypot(sd, _BEHIND * through)
