@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from r50_record import NOISE, problem, record
 
 from heli_jax.identification.estimation.data import data_of, start_vector
-from heli_jax.identification.estimation.residual import differentiate
+from heli_jax.identification.estimation.residual import residual_and_jacobian
 from heli_jax.identification.unknowns.layout import Layout, Noise, layout_of
 
 jax.config.update("jax_enable_x64", True)
@@ -49,7 +49,7 @@ class Timed(NamedTuple):
 
 def timed(layout: Layout, arguments: tuple[Any, ...]) -> Timed:
     def likelihood(*arguments: Any) -> Any:
-        at = differentiate(layout, *arguments)
+        at = residual_and_jacobian(layout, *arguments)
         return at.r @ at.r, at.J.T @ at.r, at.J.T @ at.J
 
     cold, program = _seconds(lambda: jax.jit(likelihood).lower(*arguments).compile())

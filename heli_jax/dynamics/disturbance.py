@@ -21,11 +21,6 @@ def disturbable(model: Model) -> list[str]:
     return [axis.name for axis in axes_of(model)]
 
 
-def lacks_disturbance(model: Model) -> bool:
-    """True if filter error could be tried: the model has an axis to disturb, and no disturbance."""
-    return model.noise_intensity is None and bool(disturbable(model))
-
-
 @functools.cache
 def disturbable_states(model: Model) -> tuple[str, ...]:
     """The states whose derivative may be pushed: all but those of pure kinematics.

@@ -1,9 +1,13 @@
 """Measured and simulated signals of a fit, and how well they agree."""
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 import numpy as np
 
 from heli_jax.flights.flight import Flight, labels
 from heli_jax.identification.estimation.evaluation import Evaluation, directions
+from heli_jax.identification.estimation.kalman import Innovations
 from heli_jax.identification.result import Signals
 from heli_jax.identification.unknowns.layout import Layout
 from heli_jax.identification.validation.metrics import (
@@ -91,45 +95,25 @@ def whiteness_of(
     }
 
 
-def signals_of(e: Evaluation, flights: tuple[Flight, ...]) -> tuple[Signals, ...]:
-    """Measured and simulated signals; what is simulated carries the bias."""
-    errors = [
-        {n: np.asarray(error) for n, error in innovations.error.items()}
-        for innovations in e.innovations
-    ] or [None] * len(flights)
-    return tuple(
-        _signals(label, f, {n: np.asarray(v) for n, v in by_name.items()}, error)
-        for label, f, by_name, error in zip(
-            labels(flights), flights, e.simulated, errors, strict=True
-        )
-    )
-
-
-def free_runs(
-    flights: tuple[Flight, ...], runs: tuple[dict[str, np.ndarray], ...] | None
+def signals_of(
+    flights: tuple[Flight, ...],
+    simulated: Sequence[Mapping[str, Any]],
+    innovations: Sequence[Innovations] = (),
 ) -> tuple[Signals, ...]:
-    """The flights held out as simulated in one piece."""
+    """Measured and simulated signals; what is simulated carries the bias."""
+    each = zip(labels(flights), flights, simulated, strict=True)
     return tuple(
-        _signals(label, f, run)
-        for label, f, run in zip(labels(flights), flights, runs or (), strict=runs is not None)
-    )
-
-
-def _signals(
-    label: str,
-    flight: Flight,
-    simulated: dict[str, np.ndarray],
-    error: dict[str, np.ndarray] | None = None,
-) -> Signals:
-    return Signals(
-        label,
-        flight.hold_out,
-        flight.times,
-        dict(flight.inputs),
-        dict(flight.outputs),
-        simulated,
-        error,
-        None if flight.source is None else flight.window[0],
+        Signals(
+            label,
+            f.hold_out,
+            f.times,
+            dict(f.inputs),
+            dict(f.outputs),
+            {n: np.asarray(v) for n, v in run.items()},
+            {n: np.asarray(v) for n, v in innovations[i].error.items()} if innovations else None,
+            None if f.source is None else f.window[0],
+        )
+        for i, (label, f, run) in enumerate(each)
     )
 
 

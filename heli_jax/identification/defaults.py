@@ -25,11 +25,7 @@ docs/onboard.md"""
 
 
 def filtered_noise(low_passes: Sequence[LowPass], flights: Sequence[Flight]) -> tuple[LowPass, ...]:
-    """The low-passes above whose cut-off the flights have samples, where the samples show them.
-
-    Args:
-        low_passes: `Model.low_passes`.
-    """
+    """The low-passes above whose cut-off the flights have samples, where the samples show them."""
     return tuple(p for p in low_passes if any(_shows(p, f) for f in flights))
 
 
@@ -59,9 +55,6 @@ def offset_inputs(
 
     Throttle and collective have no centre, and where a free parameter is a constant term of the
     equations that parameter stands for the offsets already.
-
-    Args:
-        params: its parameters, SI; what is known of the flight replaces them.
     """
     centreless = ("x_throttle", "x_collective", "Omega")
     sticks = [n for n in naming.names(model.Inputs) if n not in centreless]

@@ -134,7 +134,7 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
     at = Solution(*guess[:4])
     ranking = rank_windows(problem, at, guess.e, length)
     c = Context(problem, at, guess.e, guess.e, verdict_of(problem, guess.layout, guess.e))
-    notes = (*ranking.notes, *gusts_guessed(c))
+    notes = tuple(gusts_guessed(c))
     # A record may be at rest for most of its time and still have a good window.
     asked = (rates_enough, nothing_follows, inputs_together)
     record = tuple(

@@ -12,7 +12,7 @@ from heli_jax.finding import Finding, found
 from heli_jax.identification.equation_error.start import StartValue, reasons_of
 from heli_jax.identification.fit import fit
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.result import Estimate, Status
+from heli_jax.identification.result import Status
 
 
 class FrequencyErrorStart(NamedTuple):
@@ -43,50 +43,35 @@ class FrequencyErrorStart(NamedTuple):
 
 
 def frequency_error_start(problem: Problem, *, max_steps: int = 200) -> FrequencyErrorStart:
-    """First guesses of the free parameters, by a fit of the same flights in frequency.
-
-    Gains and time shifts are not among them: a fit in time searches these by itself.
+    """Return start values of the free parameters, by a fit of the same flights in frequency.
 
     Args:
-        problem: of frequency error, without a disturbance, whose states a spectrum of the noise
-            stands for.
+        problem: of frequency error, without a disturbance.
 
     Raises:
         ValueError: frequency error cannot solve it; the sentence says why.
     """
     began = time.perf_counter()
-    # Flights held out are predicted by the fit that follows.
     first = fit(dataclasses.replace(problem, flights=problem.training), max_steps=max_steps)
     # Any of several solutions is as good a start as the only one would be.
     of_several = {n for other in first.verdict.second for n in other.changed}
-    values = {
-        name: _value(
-            estimate, first.status, problem.free[name].start, of_several=name in of_several
-        )
-        for name, estimate in first.estimates.items()
-    }
+    values = {}
+    for name, e in first.estimates.items():
+        if first.status == "not-converged":
+            reason = "frequency error did not converge"
+        elif e.sd is None and name not in of_several:
+            reason = "the spectra do not determine them"
+        else:
+            reason = "frequency error ended at their bounds" if e.at_bound else ""
+        values[name] = StartValue(e.value, e.sd, e.unit, "frequency error", "")
+        if reason:
+            stated = problem.free[name].start
+            values[name] = StartValue(stated, None, e.unit, "as stated", reason)
     return FrequencyErrorStart(values, first.status, time.perf_counter() - began, first.notes)
 
 
 def started(problem: Problem, guess: FrequencyErrorStart) -> Problem:
-    """The problem with the guess for its starts."""
-    free = {
-        n: f._replace(start=guess.values[n].value) if n in guess.values else f
-        for n, f in problem.free.items()
-    }
+    """Return the problem with the guess for its starts."""
+    free = dict(problem.free)
+    free |= {n: free[n]._replace(start=v.value) for n, v in guess.values.items() if n in free}
     return dataclasses.replace(problem, free=free, first_guess=guess)
-
-
-def _value(
-    estimate: Estimate, status: Status, stated: float, *, of_several: bool = False
-) -> StartValue:
-    reason = ""
-    if status == "not-converged":
-        reason = "frequency error did not converge"
-    elif estimate.sd is None and not of_several:
-        reason = "the spectra do not determine them"
-    elif estimate.at_bound:
-        reason = "frequency error ended at their bounds"
-    if reason:
-        return StartValue(stated, None, estimate.unit, "as stated", reason)
-    return StartValue(estimate.value, estimate.sd, estimate.unit, "frequency error", "")

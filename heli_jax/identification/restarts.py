@@ -13,11 +13,15 @@ from heli_jax.identification.equation_error.start import equation_error_start
 from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.disturbance_search import NO_DISTURBANCE, with_noise_guess
 from heli_jax.identification.estimation.evaluation import evaluate
-from heli_jax.identification.estimation.multistart import FirstGuess, Search, named_values
+from heli_jax.identification.estimation.multistart import (
+    FirstGuess,
+    Search,
+    named_values,
+    sum_of_squares,
+)
 from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
 from heli_jax.identification.estimation.starts import draw
 from heli_jax.identification.identifiability.equivalents import second_solutions
-from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Noise, Solution, layout_of
 from heli_jax.identification.validation.adequacy import is_unstable
@@ -26,8 +30,8 @@ from heli_jax.identification.validation.adequacy import is_unstable
 class SearchState(NamedTuple):
     """State of a search."""
 
-    problem: Problem
     search: Search
+    """with its problem, layout and data"""
     guess: FirstGuess
     best: RelaxedOptimum
     """the best optimum so far"""
@@ -37,11 +41,8 @@ class SearchState(NamedTuple):
     """of a draw of starts"""
 
 
-class StartPoint(NamedTuple):
-    """Start of a run of the optimiser."""
-
-    noise: Noise
-    z: Float[Array, " q"]
+type StartPoint = tuple[Noise, Float[Array, " q"]]
+"""of a run of the optimiser"""
 
 
 class Restart(NamedTuple):
@@ -70,7 +71,7 @@ _STEPS = 60
 
 def _diverges(at: SearchState) -> bool:
     """True if the search failed, the simulation diverges at its start and windows are possible."""
-    problem, guess = at.problem, at.guess
+    problem, guess = at.search.problem, at.guess
     possible = (
         problem.noise_model == "white" and problem.window is None and problem.nuisance.initial_state
     )
@@ -84,7 +85,7 @@ def _diverges(at: SearchState) -> bool:
 
 def _by_windows(at: SearchState) -> list[StartPoint]:
     """Return the start that a fit to short windows gives, without the windows' initial states."""
-    problem, guess = at.problem, at.guess
+    problem, guess = at.search.problem, at.guess
     dt = max(f.dt for f in problem.training)
     shortest = min(f.n_samples * f.dt for f in problem.training)
     # Short enough that nothing grows, long enough that a window's samples outnumber its unknowns.
@@ -103,7 +104,7 @@ def _by_windows(at: SearchState) -> list[StartPoint]:
     if not (np.isfinite(short.cost) and bool(jnp.all(jnp.isfinite(short.z)))):
         return []
     # The windows' initial states stay behind: they were free to take up what the parameters missed.
-    return [StartPoint(guess.noise, guess.z.at[:shared].set(short.z[:shared]))]
+    return [(guess.noise, guess.z.at[:shared].set(short.z[:shared]))]
 
 
 # Further starts: a mode far from where it is sought leaves no slope towards it. Relaxation, which
@@ -125,19 +126,18 @@ def _needs_further_starts(at: SearchState) -> bool:
         return False
     if layout.noise_model == "white":
         # By the noise of the first guess: with the relaxed one each output would leave as much.
-        e, noise = evaluate(layout, at.search.data, best.noise, best.best.z), at.guess.noise
-        left = sum(
-            float(np.nansum(np.square(r / np.asarray(sd[n]))))
-            for raw, sd in zip(e.raw, noise.sd, strict=True)
-            for n, r in raw.items()
-        )
-        explained = 1.0 - left / at.search.variation(noise)
+        data, noise = at.search.data, at.guess.noise
+        left = sum_of_squares(evaluate(layout, data, best.noise, best.best.z).raw, noise)
+        outputs = [{n: np.asarray(y) for n, y in f.outputs.items()} for f in data.flights]
+        moved = [{n: y - np.nanmean(y) for n, y in of.items()} for of in outputs]
+        explained = 1.0 - left / sum_of_squares(moved, noise)
         return not (bool(best.best.converged) and explained > _LITTLE)
-    return layout.noise_model == "spectrum" and left_stability(at.problem, at.search, best)
+    return layout.noise_model == "spectrum" and left_stability(at.search, best)
 
 
-def left_stability(problem: Problem, search: Search, optimum: RelaxedOptimum) -> bool:
+def left_stability(search: Search, optimum: RelaxedOptimum) -> bool:
     """True if the start values were stable and an optimum is not."""
+    problem = search.problem
     values = named_values(search.layout, search.data, optimum.best.z)
     return is_unstable(problem, problem.params_with(values)) and not is_unstable(
         problem, problem.start_params()
@@ -146,7 +146,7 @@ def left_stability(problem: Problem, search: Search, optimum: RelaxedOptimum) ->
 
 def _further_starts(at: SearchState) -> list[StartPoint]:
     """Return the estimate of equation error, if it has one, and values drawn about the start."""
-    problem, guess, layout = at.problem, at.guess, at.guess.layout
+    problem, guess, layout = at.search.problem, at.guess, at.guess.layout
     points = np.array(draw(layout, problem, guess.z, 1 + _DRAWN, at.seed))
     try:
         with np.errstate(all="ignore"):
@@ -158,12 +158,12 @@ def _further_starts(at: SearchState) -> list[StartPoint]:
     # Nothing can be regressed: no state was measured, say.
     except (ValueError, np.linalg.LinAlgError):
         points = points[1:]
-    return [StartPoint(guess.noise, jnp.asarray(z, guess.z.dtype)) for z in points]
+    return [(guess.noise, jnp.asarray(z, guess.z.dtype)) for z in points]
 
 
 def _with_values(at: SearchState, z: np.ndarray, values: dict[str, float]) -> np.ndarray:
     """The unknowns with values of the free parameters; what is out of bounds stays."""
-    for i, (name, free) in enumerate(at.problem.free.items()):
+    for i, (name, free) in enumerate(at.search.problem.free.items()):
         coordinate = transforms.coordinate(free, at.guess.layout.kinds[i], values[name])
         z[i] = z[i] if coordinate is None else coordinate
     return z
@@ -187,7 +187,7 @@ def _has_one_disturbance(at: SearchState) -> bool:
         and len(layout.sigmas) == 1
         # Where the record shows no disturbance nothing tells such values apart.
         and (best.ratio is None or best.ratio > NO_DISTURBANCE)
-        and at.problem.model.linear
+        and at.search.problem.model.linear
         and len(layout.free) <= _MOST_PARAMETERS
     )
 
@@ -196,7 +196,7 @@ def _same_responses(at: SearchState) -> list[StartPoint]:
     """Other values with the same responses to the inputs."""
     search, best, layout = at.search, at.best, at.search.layout
     here = Solution(layout, search.data, best.noise, best.best.z)
-    others = second_solutions(at.problem, here, evaluate(*here))
+    others = second_solutions(at.search.problem, here, evaluate(*here))
     points = []
     for other in others[:_OTHERS]:
         z = _with_values(at, np.array(best.best.z), other.values)
@@ -204,9 +204,7 @@ def _same_responses(at: SearchState) -> list[StartPoint]:
         z[layout.first_nuisance :] = 0.0
         z = with_noise_guess(search, best.noise, jnp.asarray(z, best.best.z.dtype))
         e = evaluate(layout, search.data, best.noise, z)
-        points.append(
-            StartPoint(layout.objective.noise_at_start(layout, search.data, e, best.noise), z)
-        )
+        points.append((layout.objective.noise_at_start(layout, search.data, e, best.noise), z))
     return points
 
 

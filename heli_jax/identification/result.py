@@ -1,13 +1,11 @@
 """Result of a fit, as plain data."""
 
-import warnings
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
 from heli_jax.analysis.response_agreement import ResponseAgreement
-from heli_jax.dynamics.disturbance import lacks_disturbance
 from heli_jax.finding import Distrust, Finding, distrusted, exit_code, sentences
 from heli_jax.identification.estimation.multistart import StartRow
 from heli_jax.identification.identifiability.verdict import Verdict
@@ -205,12 +203,6 @@ class Fit:
         return tuple(n for n, e in self.estimates.items() if e.sd is None)
 
     @property
-    def lost(self) -> tuple[str, ...]:
-        """Deprecated: the name that `not_identifiable` had."""
-        _warn_renamed("lost", "not_identifiable")
-        return self.not_identifiable
-
-    @property
     def adequate(self) -> bool:
         """True if no finding shows that the model does not explain the record."""
         return not any(f.denies for f in self.findings)
@@ -226,12 +218,6 @@ class Fit:
     def denials(self) -> tuple[str, ...]:
         """Reasons why the model is not adequate, each in a few words."""
         return tuple(dict.fromkeys(f.brief for f in self.findings if f.denies))
-
-    @property
-    def disturbable(self) -> bool:
-        """True if filter error is an option: the model has an axis to disturb and no disturbance
-        yet."""
-        return lacks_disturbance(self.reached.layout.model)
 
     # `unknowns` counts noise, disturbance and initial states too: models that differ in these are
     # compared by differences of the criteria, in which the constants of the likelihood cancel.
@@ -252,12 +238,6 @@ class Fit:
         it."""
         spectrum = objective_of(self.method).noise_model == "spectrum"
         return not self.white and not self.coloured and not spectrum
-
-    @property
-    def narrow(self) -> bool:
-        """Deprecated: the name that `overconfident` had."""
-        _warn_renamed("narrow", "overconfident")
-        return self.overconfident
 
     @property
     def interval(self) -> str:
@@ -295,7 +275,3 @@ class Fit:
         from heli_jax.exports import estimates_frame
 
         return estimates_frame({**self.estimates, **(self.nuisance if nuisance else {})})
-
-
-def _warn_renamed(old: str, new: str) -> None:
-    warnings.warn(f"Fit: {old} is deprecated, expected {new}", DeprecationWarning, stacklevel=3)

@@ -93,9 +93,8 @@ def search(
     """
     layout, data = guess.layout, guess.data
 
-    known: Any = (guess.e.r, guess.e.J)
     if starts is None:
-        points = delay_start(problem, layout, guess.begun, guess.noise, guess.z, known)[None]
+        points = delay_start(problem, layout, guess.begun, guess.noise, guess.z, guess.e.J)[None]
     else:
         points = draw(layout, problem, guess.z, starts, seed)
 
@@ -105,8 +104,9 @@ def search(
     over = Search(problem, layout, data, first_steps)
     # Residuals at the first start are those of the first guess.
     same = guess.begun is data and bool(np.array_equal(points[0], guess.z))
+    known: Any = (guess.e.r, guess.e.J) if same else None
     first = Search(problem, layout, guess.begun, first_steps)
-    optima = first.run(guess.noise, points, report, known=known if same else None)
+    optima = first.run(guess.noise, points, report, known=known)
     best = relax_noise_covariance(over, guess.noise, min(optima, key=rank))
     over.max_steps = max_steps
     if layout.sigmas:
@@ -114,17 +114,17 @@ def search(
     name = "start" if len(optima) == 1 else "starts"
     runs = [Run(name, z, run) for z, run in zip(points, optima, strict=True)]
     chosen = min(runs, key=lambda run: rank(run.optimum))
-    state = SearchState(problem, over, guess, best, starts, seed)
+    state = SearchState(over, guess, best, starts, seed)
     for restart in RESTARTS:
         if not restart.when(state):
             continue
         report(f"the search begins again: {restart.name}")
         begun = state.best
-        for start in restart.points(state):
-            [run] = over.run(start.noise, start.z[None, :])
-            runs.append(Run(restart.name, start.z, run))
-            other = relax_noise_covariance(over, start.noise, run)
-            if is_better(problem, over, other, state.best):
+        for noise, z in restart.points(state):
+            [run] = over.run(noise, z[None, :])
+            runs.append(Run(restart.name, z, run))
+            other = relax_noise_covariance(over, noise, run)
+            if is_better(over, other, state.best):
                 state, chosen = state._replace(best=other), runs[-1]
         if state.best is begun:
             continue
@@ -138,9 +138,7 @@ _BETTER = 0.1
 """gain in log-posterior from which on an optimum is better"""
 
 
-def is_better(
-    problem: Problem, over: Search, optimum: RelaxedOptimum, other: RelaxedOptimum
-) -> bool:
+def is_better(over: Search, optimum: RelaxedOptimum, other: RelaxedOptimum) -> bool:
     """True if an optimum is to be chosen instead of another.
 
     One that converged wins, then one that is stable if the start was, then the higher
@@ -148,7 +146,7 @@ def is_better(
     """
 
     def passes(o: RelaxedOptimum) -> tuple[bool, bool]:
-        unstable = problem.model.linear and left_stability(problem, over, o)
+        unstable = over.layout.model.linear and left_stability(over, o)
         return bool(o.best.converged), not unstable
 
     if passes(optimum) != passes(other):

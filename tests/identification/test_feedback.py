@@ -228,7 +228,6 @@ def told(problem, found, *, white=False, fitted=True):
                 white=white,
                 independent=white,
                 params=problem.start_params(),
-                stated_instruments=(),
             )
         )
     )

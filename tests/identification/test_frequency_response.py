@@ -8,7 +8,7 @@ import pytest
 from heli_jax import Flight, Free, Nuisance, Problem, fit, models
 from heli_jax import config as configuration
 from heli_jax.analysis.spectra import PairOptions, ResponseOptions
-from heli_jax.identification.estimation.residual import differentiate, rows_of
+from heli_jax.identification.estimation.residual import residual_and_jacobian, rows_of
 from heli_jax.identification.search import first_guess
 from tests.identification.bench import BENCH, record, vehicle
 from tests.test_log_responses import CONFIG
@@ -57,7 +57,7 @@ def test_rows_of_flights_of_several_lengths_and_their_slopes():
     )  # fmt: skip
     at = first_guess(problem)
     z = np.array(at.z)
-    made = differentiate(at.layout, at.data, at.noise, jnp.asarray(z))
+    made = residual_and_jacobian(at.layout, at.data, at.noise, jnp.asarray(z))
     rows = eqx.filter_jit(rows_of)
     for i in range(3):
         step = 1e-5 * np.eye(z.size)[i]

@@ -14,7 +14,7 @@ from heli_jax.identification.estimation import many_runs
 from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.filter_error import OBJECTIVE as FILTER_ERROR
 from heli_jax.identification.estimation.many_runs import FusedRuns, Own
-from heli_jax.identification.estimation.residual import differentiate
+from heli_jax.identification.estimation.residual import residual_and_jacobian
 from heli_jax.identification.uncertainty.bootstrap import bootstrap, refit
 from heli_jax.identification.uncertainty.comparison import intervals
 from heli_jax.identification.unknowns.layout import Noise, layout_of
@@ -96,7 +96,7 @@ def test_rows_and_jacobians_are_as_jax_makes_them(made):
     layout, data, noise, z = pieces(made())
     numbers = tiled(data, own)
     found = products(*FusedRuns(layout, data, noise, own)(numbers, jnp.asarray(z)))
-    each = jax.vmap(lambda d, z: differentiate(layout, d, noise, z))(numbers, z)
+    each = jax.vmap(lambda d, z: residual_and_jacobian(layout, d, noise, z))(numbers, z)
     expected = products(each.r, each.J)
     size = np.sqrt(np.diagonal(expected, axis1=1, axis2=2))
     unit = np.where(size > 0, size, 1.0)

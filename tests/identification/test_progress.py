@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from heli_jax import Free, Problem, fit, models, stages
-from heli_jax.identification.estimation import levenberg_marquardt
 from tests.identification.bench import BENCH, record, vehicle
 
 
@@ -28,9 +27,8 @@ def problem():
     return Problem(models.roll_on_stand, vehicle(BENCH), [flight], free)
 
 
-def test_numbers_are_the_same_to_the_last_bit(problem, monkeypatch):
+def test_numbers_are_the_same_to_the_last_bit(problem):
     silent = fit(problem, starts=2)
-    monkeypatch.setattr(levenberg_marquardt, "_SHOWN", 0.0)
     heard = Steps()
     with stages.observed_by(heard):
         told = fit(problem, starts=2)

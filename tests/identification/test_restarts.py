@@ -44,9 +44,9 @@ def test_where_little_is_explained_equation_error_gives_a_start():
 
 
 def test_convergence_then_stability_then_the_posterior_decide(monkeypatch):
-    monkeypatch.setattr(search, "left_stability", lambda problem, over, optimum: optimum.unstable)
+    monkeypatch.setattr(search, "left_stability", lambda over, optimum: optimum.unstable)
     monkeypatch.setattr(search, "log_posterior", lambda over, optimum: optimum.posterior)
-    problem = SimpleNamespace(model=SimpleNamespace(linear=True))
+    over = SimpleNamespace(layout=SimpleNamespace(model=SimpleNamespace(linear=True)))
 
     def optimum(converged, unstable, posterior):
         best = SimpleNamespace(converged=np.asarray(converged))
@@ -60,7 +60,7 @@ def test_convergence_then_stability_then_the_posterior_decide(monkeypatch):
     ]
     for i, better in enumerate(ranked):
         for worse in ranked[i + 1 :]:
-            assert search.is_better(problem, None, better, worse)
-            assert not search.is_better(problem, None, worse, better)
+            assert search.is_better(over, better, worse)
+            assert not search.is_better(over, worse, better)
     # No difference: what was found first stays.
-    assert not search.is_better(problem, None, optimum(True, False, 4.05), ranked[1])
+    assert not search.is_better(over, optimum(True, False, 4.05), ranked[1])

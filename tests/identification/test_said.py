@@ -131,10 +131,10 @@ def test_what_is_determined_in_a_wide_interval_is_so_only_roughly():
     sensitivity = np.diag([100.0, 1.0 / 0.8])
     verdict = analyse(sensitivity, unknowns("L", "B"))
     assert verdict.identifiable
-    assert verdict.roughly == ("B",)
+    assert tuple(verdict.factors) == ("B",)
     around = Around(reported=np.diag([0.64, 1e-4]))
     verdict = analyse(np.diag([2.5, 100.0]), unknowns("L", "B"), around=around)
-    assert verdict.roughly == ("L",)
+    assert tuple(verdict.factors) == ("L",)
     # Of either sign the interval is -0.57 to 2.57 times the value: no factor.
     first, second = unknowns("L", "B")
     verdict = analyse(sensitivity, (first, second._replace(symmetric=True)))
@@ -162,7 +162,7 @@ def test_a_time_shift_up_to_the_end_of_its_search_is_known_only_roughly():
         shift = Unknown("time_shift", 0.2, False, 1.0, 0.0, is_parameter=False, room=15.0)
         verdict = analyse(np.diag([100.0, 1.0 / sd]), (parameter, shift))
         assert verdict.identifiable
-        assert verdict.roughly == said
+        assert tuple(verdict.factors) == said
 
 
 def test_an_input_whose_unit_is_in_doubt_takes_the_intervals_that_it_scales():

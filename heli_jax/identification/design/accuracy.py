@@ -39,11 +39,7 @@ class Sensitivity(NamedTuple):
     """by initial states, biases and input offsets, in sds of their weak priors"""
 
     def part(self, rows: np.ndarray) -> "Sensitivity":
-        """Return some of the rows.
-
-        Args:
-            rows: their numbers, or True for each of them.
-        """
+        """Return some of the rows."""
         return self._replace(shared=self.shared[rows], own=self.own[rows])
 
 
@@ -100,11 +96,7 @@ _TOO_GOOD = 1e-3
 
 
 def too_good(sds: Sequence[float] | np.ndarray) -> Finding | None:
-    """Return a finding if expected sds are too small to be true.
-
-    Args:
-        sds: relative, where the noise was guessed.
-    """
+    """Return a finding if expected sds, relative ones, are too small to be true."""
     least = float(np.min(sds, initial=np.inf))
     if not least < _TOO_GOOD:
         return None

@@ -114,7 +114,7 @@ class Ranking:
     noise: Mapping[str, float]
     """sd by `flight/output`, SI"""
     notes: tuple[Finding, ...] = ()
-    """on how the windows were compared"""
+    """on sizes of gusts that nobody stated"""
     record: tuple[Finding, ...] = ()
     """what speaks against the whole record, as `check` says it: rates, and what inputs excite"""
 
@@ -161,9 +161,6 @@ def rank_windows(
     problem: Problem, at: Solution, e: Evaluation, length: float | None = None
 ) -> Ranking:
     """Rank the windows of the flights that are fitted, and take those that together say enough.
-
-    Args:
-        length: of a window [s].
 
     Raises:
         ValueError: the length fits no flight, the simulation diverges, or no window may be used.
@@ -281,9 +278,6 @@ def _chosen(
 ) -> tuple[tuple[Choice, ...], Float[np.ndarray, " q"]]:
     """The windows, the one that gains most first, until they say enough (Mehra, 1974), and the sds
     expected of all.
-
-    Args:
-        unknown: True where the whole record does not determine a parameter.
     """
     left, R, steps = list(usable), np.zeros_like(usable[0][1]), []
     while left:

@@ -63,20 +63,12 @@ MOOT: dict[str, tuple[str, ...]] = {
 
 
 def diagnose(c: Context) -> tuple[Finding, ...]:
-    """All findings at a point, the most severe first.
-
-    Args:
-        c: the start values, or where a search ended.
-    """
+    """All findings at a point, the most severe first."""
     findings = once(weighed((f for d in DIAGNOSTICS for f in d(c)), c.estimates))
     sure = {f.code for f in findings if f.bad}
-    kept = [f for f in findings if _counts(f) or not sure & set(MOOT.get(f.code, ()))]
+    # What changes the conclusion on a fit stays.
+    kept = [f for f in findings if f.denies or f.distrusts or not sure & set(MOOT.get(f.code, ()))]
     return tuple(sorted(kept, key=lambda f: _rank(f, c)))
-
-
-def _counts(f: Finding) -> bool:
-    """True if a finding changes what is concluded of a fit."""
-    return f.denies or bool(f.distrusts)
 
 
 def _rank(f: Finding, c: Context) -> int:

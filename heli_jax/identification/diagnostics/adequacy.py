@@ -17,7 +17,6 @@ from heli_jax.identification.validation.adequacy import (
     OutputAdequacy,
 )
 from heli_jax.identification.validation.excitation import LEVEL
-from heli_jax.identification.validation.held_out import HeldOutFlight
 from heli_jax.messages import sentence
 
 _DIVERGED = 10.0
@@ -216,7 +215,22 @@ def held_out_predicted(c: Context) -> Iterator[Finding]:
         for label in held.in_frequency.not_judged:
             yield found("held-out.not-judged", "note", label, flight=label)
         for flight in held.in_frequency.flights:
-            yield from _contradicted(flight)
+            label, furthest = flight.flight, flight.furthest
+            if flight.worse:
+                code = "held-out.worse-than-none"
+                numbers = {"flight": label, "names": flight.worse}
+                yield found(code, "doubt", label, *flight.worse, denies=True, **numbers)
+            if flight.differs and furthest is not None:
+                yield found(
+                    "held-out.other-estimates",
+                    "doubt",
+                    label,
+                    value=flight.estimates_p_value,
+                    shifts={furthest.parameter: furthest.own - furthest.fitted},
+                    limit=LEVEL,
+                    flight=label,
+                    **furthest._asdict(),
+                )
     # With gusts in the model, or no simulation in the fit, a simulation says little.
     elif c.at.layout.noise_model == "white":
         for name, m in pooled_metrics(held.signals).items():
@@ -224,23 +238,3 @@ def held_out_predicted(c: Context) -> Iterator[Finding]:
             if not m.vaf >= WORSE:
                 code = "held-out.worse-than-mean"
                 yield found(code, "doubt", name, value=m.vaf, denies=True, limit=WORSE)
-
-
-def _contradicted(flight: HeldOutFlight) -> Iterator[Finding]:
-    """Contradictions of a fit in frequency by a flight held out."""
-    label, furthest = flight.flight, flight.furthest
-    if flight.worse:
-        code = "held-out.worse-than-none"
-        numbers = {"flight": label, "names": flight.worse}
-        yield found(code, "doubt", label, *flight.worse, denies=True, **numbers)
-    if flight.differs and furthest is not None:
-        yield found(
-            "held-out.other-estimates",
-            "doubt",
-            label,
-            value=flight.estimates_p_value,
-            shifts={furthest.parameter: furthest.own - furthest.fitted},
-            limit=LEVEL,
-            flight=label,
-            **furthest._asdict(),
-        )

@@ -10,7 +10,6 @@ from heli_jax.analysis.response_agreement import ResponseAgreement
 from heli_jax.flights.flight import Flight, labels
 from heli_jax.identification.agreement import (
     correlated_residuals,
-    free_runs,
     pooled_metrics,
     signals_of,
     whiteness_of,
@@ -47,7 +46,7 @@ from heli_jax.identification.validation.adequacy import (
 from heli_jax.identification.validation.closed_loop_trust import (
     Loop,
     Moved,
-    held_upright,
+    held_poles,
     moved_by_feedback,
 )
 from heli_jax.identification.validation.excitation import (
@@ -75,11 +74,7 @@ from heli_jax.messages import sentence
 
 
 def no_disturbance(optimum: RelaxedOptimum) -> bool:
-    """True if a disturbance was searched for and is not significant.
-
-    Args:
-        optimum: where the optimiser ended.
-    """
+    """True if a disturbance was searched for and is not significant."""
     return optimum.ratio is not None and optimum.ratio < NO_DISTURBANCE
 
 
@@ -127,11 +122,6 @@ class Context:
         """True if the point is an optimum."""
         return self.optimum is not None and bool(self.optimum.best.converged)
 
-    @property
-    def finite(self) -> bool:
-        """True if the sensitivities are finite."""
-        return bool(np.all(np.isfinite(self.e.J)))
-
     @cached_property
     def flights(self) -> list[tuple[str, Flight]]:
         """The fitted flights, by what each is called."""
@@ -164,7 +154,7 @@ class Context:
     @cached_property
     def signals(self) -> tuple[Signals, ...]:
         """The fitted flights as measured and as simulated."""
-        return signals_of(self.e, self.problem.training)
+        return signals_of(self.problem.training, self.e.simulated, self.e.innovations)
 
     @cached_property
     def metrics(self) -> dict[str, Metrics]:
@@ -220,17 +210,12 @@ class Context:
         by_instrument = self.at.data.flights[0].by_instrument is not None
         return instruments_of(self.problem) if by_instrument else ()
 
-    @property
-    def stated_instruments(self) -> tuple[str, ...]:
-        """The inputs whose excitation is logged and named."""
-        return tuple(instruments_of(self.problem))
-
     @cached_property
     def loop(self) -> Loop:
         """Feedback, instruments, and whether somebody holds an unstable vehicle."""
         wrong = self.astray and not self.nearly
         asked = bool(self.moved) and not (self.unrelated or wrong)
-        held = asked and held_upright(self.at)
+        held = asked and any(pole > 0.0 for pole in held_poles(self.at))
         return Loop(self.feedback, self.instruments, held)
 
     # Whether the model explains the record.
@@ -330,19 +315,14 @@ class Context:
 
     @cached_property
     def _evidence(self) -> Evidence:
-        expected = self.expected_error
-        if self.ahead:
-            return self._predicted
-        records = tuple(
-            Record(s.flight, flight.dt, s.measured, s.simulated)
-            for s, (_, flight) in zip(self.signals, self.flights, strict=True)
-        )
-        unknowns = self.at.layout.determined
-        return Evidence(records, self.metrics, self.whiteness, expected, unknowns)
-
-    @property
-    def _predicted(self) -> Evidence:
-        """Predictions from the filter's states in place of a simulation."""
+        if not self.ahead:
+            records = tuple(
+                Record(s.flight, flight.dt, s.measured, s.simulated)
+                for s, (_, flight) in zip(self.signals, self.flights, strict=True)
+            )
+            expected, unknowns = self.expected_error, self.at.layout.determined
+            return Evidence(records, self.metrics, self.whiteness, expected, unknowns)
+        # Predictions from the filter's states in place of a simulation.
         records, error, expected = [], {}, {}
         for (label, flight), prediction in zip(
             self.flights, predictions_ahead(self.at), strict=True
@@ -378,8 +358,9 @@ class Context:
         return as_good_as_aliases(fast, valley) if self.arrived else fast
 
     @cached_property
-    def _by_likelihood(self) -> StandardErrors:
-        return standard_errors(
+    def errors(self) -> StandardErrors:
+        """Standard errors of the estimates; none where the model explains nothing."""
+        errors = standard_errors(
             self.problem,
             self.at,
             self.e,
@@ -389,11 +370,6 @@ class Context:
             second=second_solutions(self.problem, self.at, self.e) if self.arrived else (),
             optimum=self.arrived,
         )
-
-    @cached_property
-    def errors(self) -> StandardErrors:
-        """Standard errors of the estimates; none where the model explains nothing."""
-        errors = self._by_likelihood
         if not self.arrived:
             return errors
         verdict = inputs_explain_nothing(self.at, self.e, errors.verdict)
@@ -414,14 +390,9 @@ class Context:
         return self.errors.verdict if self.fitted else self.before
 
     @property
-    def undetermined(self) -> tuple[str, ...]:
-        """The parameters that the data do not determine."""
-        return (*self.verdict.undetermined, *self.verdict.without_effect)
-
-    @property
     def status(self) -> Status:
         """Status of the fit: convergence, then identifiability."""
-        if not self.arrived or not self.finite:
+        if not (self.arrived and np.isfinite(self.e.J).all()):
             return "not-converged"
         return "converged" if self.verdict.identifiable else "not-identifiable"
 
@@ -463,12 +434,13 @@ class Context:
         if not flights or not self.fitted:
             return HeldOut()
         checked = validate(problem, at.layout, at.z, at.noise, flights)
-        free_run = free_runs(flights, checked.free_run)
-        in_frequency = None
+        signals = signals_of(flights, checked.e.simulated, checked.e.innovations)
+        in_one_piece, in_frequency = checked.free_run, None
+        free_run = signals_of(flights, in_one_piece) if in_one_piece is not None else ()
         if self.arrived:
             feedback = (self.loop.held or self.follows) and not self.instruments
             in_frequency = validate_in_frequency(problem, at, self.e, flights, feedback=feedback)
-        return HeldOut(signals_of(checked.e, flights), free_run, checked.converged, in_frequency)
+        return HeldOut(signals, free_run, checked.converged, in_frequency)
 
     @cached_property
     def rounding(self) -> bool:

@@ -5,13 +5,12 @@ from collections.abc import Iterator, Sequence
 from heli_jax.dynamics.model import axes_of
 from heli_jax.finding import Finding, found
 from heli_jax.identification.diagnostics.context import Context
-from heli_jax.identification.estimation.frequency_instrument import STRONG
+from heli_jax.identification.estimation.frequency_instrument import STRONG, instruments_of
 from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.adequacy import is_unstable
 from heli_jax.identification.validation.closed_loop_trust import (
     MAY_BE,
-    knows_no_gusts,
     untrusted,
     weak_by_instrument,
 )
@@ -26,7 +25,7 @@ def inputs_follow_response(c: Context) -> Iterator[Finding]:
     """A closed loop, and what it does to estimates by this method."""
     present = [one for one in c.feedback if one.present]
     objective, names = objective_of(c.problem.method), tuple(c.estimates)
-    harmed = c.arrived and not c.independent and knows_no_gusts(c.problem)
+    harmed = c.arrived and not c.independent and objective.noise_model == "white"
     if not present:
         if harmed and is_unstable(c.problem, c.params, _HELD):
             yield found("loop.held", "doubt", distrusts=names)
@@ -42,7 +41,7 @@ def inputs_follow_response(c: Context) -> Iterator[Finding]:
     # Before a fit it is a doubt about the record; after one the residuals say whether it harms.
     severity = "note" if c.fitted and not harmed else "doubt"
     inputs = tuple(dict.fromkeys(one.input for one in present))
-    if objective.noise_model == "spectrum" and set(inputs) <= set(c.stated_instruments):
+    if objective.noise_model == "spectrum" and set(inputs) <= set(instruments_of(c.problem)):
         code, severity = "loop.excitation-logged", "ok"
     sure = min(present, key=lambda one: one.p_value)
     late = list(dict.fromkeys(one.input for one in present if not one.delay_known))
@@ -110,6 +109,6 @@ def moved_by_feedback(c: Context) -> Iterator[Finding]:
 
 def weak_instruments(c: Context) -> Iterator[Finding]:
     """Parameters of which the logged excitation tells too little."""
-    names = weak_by_instrument(c.problem, c.at, c.e.J) if c.arrived else ()
+    names = weak_by_instrument(c.problem, c.at) if c.arrived else ()
     if names:
         yield found("loop.weak-instrument", "doubt", *names, distrusts=names, limit=STRONG)

@@ -51,20 +51,14 @@ def disturbance_shows(c: Context) -> Iterator[Finding]:
     """Disturbances that were looked for and do not show, or are not determined."""
     if c.optimum is None:
         return
+    layout, ended = c.at.layout, c.at.layout.disturbance
     if no_disturbance(c.optimum):
         code = "noise.no-disturbance" if c.independent else "noise.other-disturbance"
         yield found(code, "note", value=c.optimum.ratio)
-    else:
-        yield from _at_ends(c)
-    names = [d.name for d in disturbances_of(c.at.layout.model) if d.sigma in c.optimum.absent]
-    if names:
-        yield found("noise.disturbances-absent", "note", *names, limit=NO_DISTURBANCE)
-
-
-def _at_ends(c: Context) -> Iterator[Finding]:
-    """The parameters of the disturbance that ran to the end of what a record can show."""
-    layout, limits = c.at.layout, disturbance_limits(c.at.layout, c.at.data)
-    for i, name in enumerate(layout.disturbance):
+        ended = ()
+    # Those that ran to the end of what a record can show.
+    limits = disturbance_limits(layout, c.at.data)
+    for i, name in enumerate(ended):
         at = float(c.at.z[len(layout.of_interest) + i])
         low, high = (float(v) for v in limits[name])
         if low < at < high or name in c.absent:
@@ -75,6 +69,9 @@ def _at_ends(c: Context) -> Iterator[Finding]:
         unit = naming.unit(layout.model.Params, name) or ""
         value = f"{np.exp(min(max(at, low), high)):.3g} {unit}".rstrip()
         yield found("noise.disturbance-open", "note", name, ran_to=value, like=meaning)
+    names = [d.name for d in disturbances_of(c.at.layout.model) if d.sigma in c.optimum.absent]
+    if names:
+        yield found("noise.disturbances-absent", "note", *names, limit=NO_DISTURBANCE)
 
 
 def noise_as_stated(c: Context) -> Iterator[Finding]:

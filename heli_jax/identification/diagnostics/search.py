@@ -33,8 +33,8 @@ def search_stopped(c: Context) -> Iterator[Finding]:
     windows = sum(count for count, _ in layout.windows) > len(layout.windows)
     code = "search.stopped-in-windows" if windows and layout.continuity is None else STOPPED
     yield found(code, "doubt", value=float(sum(s for s, _ in c.optimum.trace)))
-    either = [{*v.undetermined, *v.without_effect} for v in (c.before, c.verdict)]
-    names = [n for n in c.verdict.names if n in either[0] & either[1]]
+    open_ = c.before.not_identifiable & c.verdict.not_identifiable
+    names = [n for n in c.verdict.names if n in open_]
     if names and np.all(np.isfinite(c.e.J)):
         yield found("search.open-directions", "doubt", *names)
 

@@ -17,7 +17,6 @@ from heli_jax.identification.validation.logging_rate import (
 from heli_jax.identification.validation.shifts import (
     LEAD,
     SHIFT,
-    Shift,
     leads,
     other_hold,
     shift_in_time,
@@ -67,7 +66,7 @@ def signals_shifted(c: Context) -> Iterator[Finding]:
     shifts = [other_hold(c.problem, c.at, c.e)]
     if c.explains and not c.instruments and "time_shift" not in c.estimates:
         shifts.append(shift_in_time(c.problem, c.at, c.e, _outputs_in_doubt(c)))
-    one = max((s for s in shifts if s is not None), key=_gain, default=None)
+    one = max((s for s in shifts if s is not None), key=lambda s: s.gain, default=None)
     # A lag that is missing shows in the residual too, and more closely.
     lags = any(x.drive.kind == "input" for x in c.unmodelled[0])
     if one is None or (one.kind == "response" and lags):
@@ -87,10 +86,6 @@ def signals_shifted(c: Context) -> Iterator[Finding]:
         moves=[f"{n} by {100 * parts[n]:+.2g} %" for n in shown],
         limit=SHIFT.clear,
     )
-
-
-def _gain(shift: Shift) -> float:
-    return shift.gain
 
 
 def _outputs_in_doubt(c: Context) -> list[str]:

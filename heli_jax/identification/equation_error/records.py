@@ -40,8 +40,7 @@ _SEGMENTS = 20
 _RESOLVED = 4
 """samples to a half width of the kernel that are kept: what is smoothed moves no faster"""
 
-# The kernel and its first three derivatives vanish at its ends. Sums over samples are then close to
-# the integrals, and integration by parts leaves no terms at the ends.
+# With its first three derivatives it vanishes at the ends: integration by parts leaves no terms.
 _SHAPE = Polynomial([1.0, 0.0, -1.0]) ** 4
 _AREA = 2.0 * _SHAPE.integ()(1.0)
 _KERNEL = tuple(p / _AREA for p in (_SHAPE.integ(), *map(_SHAPE.deriv, range(ORDERS))))
@@ -49,55 +48,48 @@ _KERNEL = tuple(p / _AREA for p in (_SHAPE.integ(), *map(_SHAPE.deriv, range(ORD
 
 
 def margin(half: int) -> int:
-    """Samples at either end of a segment that smoothing takes away."""
+    """Return the samples at either end of a segment that smoothing takes away."""
     return half + 2  # two more: a delayed and held input reaches further back
 
 
 def shortest(half: int) -> int:
-    """Samples of the shortest segment that is worth smoothing."""
-    # Between the margins three widths of the kernel are left: a few values without common samples.
+    """Return the samples of the shortest segment that is worth smoothing: three widths of the
+    kernel are left between the margins."""
     return 2 * margin(half) + 6 * half
 
 
 def smoothed(
     y: Float[np.ndarray, " N"], dt: float, half: int, *, held: bool = False, late: float = 0.0
 ) -> Float[np.ndarray, "r n"]:
-    """Return a sampled signal smoothed, and its derivatives.
+    """Return a sampled signal smoothed, and its derivatives per second, (3, N - 2 `margin`).
 
     Args:
-        y: the samples (N,), all seen.
-        dt: time between them [s].
+        y: all seen.
         half: half width of the kernel [samples].
         held: True for an input that stays between samples; else a straight line joins them.
         late: how late it acts [s].
-
-    Returns:
-        (3, N - 2 `margin`) the smoothed signal and its derivatives per second.
     """
-    # Whole samples of the delay by index, the rest within the weights: a delay then changes the
-    # smoothed signal without steps. Before the record a signal is taken to be as at its beginning.
+    # Whole samples of the delay by index, the rest within the weights. Before the record a signal
+    # is as at its beginning.
     whole, rest = divmod(late / dt, 1.0)
     y = y[np.clip(np.arange(y.size) - int(whole), 0, y.size - 1)]
     j = np.arange(-margin(half), margin(half) + 1) - rest
     s = j / half
     scale = float(half) ** -np.arange(ORDERS)[:, None]
     if held:
-        # The kernel's integrals over each sample time: weights at the samples would put each jump
-        # into the middle of an interval, and the regression would take that for a delay.
+        # The kernel's integrals over each sample time: weights at the samples would delay a jump.
         weights = scale * np.stack(
             [_kernel(r, s) - _kernel(r, s - 1.0 / half) for r in range(ORDERS)]
         )
     else:
         weights = scale / half * np.stack([_kernel(r + 1, s) for r in range(ORDERS)])
-        # The sum over samples is not quite the integral. Corrected row by row, a constant stays one
-        # and has no derivatives, and a line and a parabola keep theirs.
+        # A sum is not quite the integral: a constant, a line and a parabola keep their derivatives.
         weights[0] /= weights[0].sum()
         weights[1] -= weights[1].sum() * weights[0]
         weights[1] /= -(weights[1] @ j)
         weights[2] -= weights[2].sum() * weights[0]
         weights[2] /= 0.5 * (weights[2] @ j**2)
     weights /= dt ** np.arange(ORDERS)[:, None]
-    # Only where the whole kernel lies within the samples: cut off it would not keep the equations.
     return np.stack([np.convolve(y, w, mode="valid") for w in weights])
 
 
@@ -106,15 +98,10 @@ def _kernel(which: int, s: np.ndarray) -> np.ndarray:
 
 
 def segments(outputs: Mapping[str, np.ndarray]) -> tuple[list[slice], dict[str, np.ndarray]]:
-    """Return where all outputs are seen, and the outputs with short gaps interpolated.
-
-    Args:
-        outputs: samples (N,) by name, NaN where one is missing.
-    """
+    """Return where all outputs are seen, and the outputs with short gaps interpolated."""
     bridged = {name: _bridged(y) for name, y in outputs.items()}
     seen = np.all([np.isfinite(y) for y in bridged.values()], axis=0)
-    edges = np.flatnonzero(np.diff(np.r_[False, seen, False].astype(int)))
-    return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)], bridged
+    return np.ma.clump_masked(np.ma.array(seen, mask=seen)), bridged
 
 
 def _bridged(y: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
@@ -123,8 +110,7 @@ def _bridged(y: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
         return y
     from scipy.interpolate import PchipInterpolator
 
-    # A slow sensor on a fast grid misses most samples. What is regressed is then no faster than the
-    # sensor, which is enough to begin with; the fit itself sees the samples alone.
+    # A slow sensor on a fast grid misses most samples.
     filled = PchipInterpolator(seen, y[seen], extrapolate=False)(np.arange(y.size))
     steps = np.diff(seen)
     long = steps > 1 + max(_BRIDGED, _LOST * float(np.median(steps)))
@@ -139,30 +125,23 @@ def kernel_width(flights: Sequence[Flight]) -> int:
     signals = []
     for flight in flights:
         parts, bridged = segments(flight.outputs)
-        longest = max(parts, key=lambda s: s.stop - s.start, default=slice(0, 0))
         if parts:
+            longest = max(parts, key=lambda s: s.stop - s.start)
             sd = {n: flight.sd.get(n) or noise_guess(y) for n, y in flight.outputs.items()}
             signals += [(y[longest], sd[n]) for n, y in bridged.items()]
 
-    # One kernel for all, since they are regressed together: the fastest motion decides.
+    # A short record would be left with little to regress by a wide kernel. A little of the motion
+    # may go as well as the noise: the two add as independent variances do.
     def passes(half: int) -> bool:
-        return all(_takes_noise_alone(y, sd, half) for y, sd in signals)
+        inner = slice(margin(half), -margin(half))
+        return all(
+            y.size >= 8 * half
+            and float(np.std(y[inner] - smoothed(y, 1.0, half)[0]))
+            <= np.hypot(sd, _MOST_LEFT_OUT * float(np.std(y)))
+            for y, sd in signals
+        )
 
     return max([_HALF_WIDTHS[0], *itertools.takewhile(passes, _HALF_WIDTHS)])
-
-
-def _takes_noise_alone(y: Float[np.ndarray, " N"], sd: float, half: int) -> bool:
-    # A wide kernel takes half a width away at either end of every segment: a short record would be
-    # left with little to regress.
-    if y.size < 8 * half:
-        return False
-    left = float(np.std(y[margin(half) : -margin(half)] - smoothed(y, 1.0, half)[0]))
-    # A little of the motion may go as well: the two add as independent variances do.
-    return left <= np.hypot(sd, _MOST_LEFT_OUT * float(np.std(y)))
-
-
-# Which states of a linear model the measured outputs show, and which equations to regress. Params
-# is a class of each model, hence Any.
 
 
 @eqx.filter_jit
@@ -179,11 +158,11 @@ def _stacked(model: Model, names: tuple[str, ...], base: dict[str, Any], values:
 def coefficients(
     model: Model, base: Mapping[str, float], names: Sequence[str], values: np.ndarray
 ) -> Float[np.ndarray, "r c 1+q"]:
-    """Return [A B; C D] of a linear model, and beside it its derivatives by the parameters.
+    """Return [A B; C D] of a linear model, and beside it its derivatives by the parameters `names`.
 
     Args:
         base: all parameters by name, SI.
-        values: theirs (q,), in place of those in `base`.
+        values: of `names` (q,), in place of those in `base`.
 
     Returns:
         (n + p, n + m, 1 + q): rows of states then outputs, columns of states then inputs.
@@ -195,7 +174,7 @@ def coefficients(
 
 
 def generic(count: int) -> Float[np.ndarray, " q"]:
-    """Numbers (count,) at which nothing cancels by chance."""
+    """Return numbers (count,) at which nothing cancels by chance."""
     return np.random.default_rng(11).uniform(0.5, 1.5, count)
 
 
@@ -206,7 +185,7 @@ class Structure(NamedTuple):
     signals: tuple[str, ...]
     """measured outputs, then inputs: the columns of `shown`"""
     shown: dict[int, Float[np.ndarray, "r z"]]
-    """by state: the coefficients of each derivative of each signal that make it"""
+    """coefficients of each derivative of each signal that make a state"""
     equations: tuple[str, ...]
     """the states and outputs of `rows`"""
     rows: tuple[int, ...]
@@ -216,11 +195,6 @@ class Structure(NamedTuple):
     def hidden(self) -> tuple[int, ...]:
         """The states that nothing measured shows."""
         return tuple(i for i in range(len(self.states)) if i not in self.shown)
-
-    @property
-    def hidden_names(self) -> tuple[str, ...]:
-        """Their names."""
-        return tuple(self.states[i] for i in self.hidden)
 
 
 def structure(model: Model, both: Float[np.ndarray, "r c q"], outputs: Sequence[str]) -> Structure:
@@ -236,8 +210,7 @@ def structure(model: Model, both: Float[np.ndarray, "r c q"], outputs: Sequence[
     states, inputs = naming.names(model.State), naming.names(model.Inputs)
     n, p, names = len(states), len(outputs), naming.names(model.Outputs)
     rows = [n + names.index(y) for y in outputs]
-    # y - D u = C x, with coefficients that are known. An output with a free parameter in its row
-    # shows no state: it becomes an equation to be regressed instead.
+    # y - D u = C x, with coefficients that are known; other outputs become equations to regress.
     known = [i for i, row in enumerate(rows) if not depends[row].any()]
     right = np.zeros((len(known), ORDERS, p + len(inputs)))
     for k, i in enumerate(known):
@@ -249,8 +222,8 @@ def structure(model: Model, both: Float[np.ndarray, "r c q"], outputs: Sequence[
     equations = [i for i in shown if not depends[i].any() and np.any(value[i, rest] != 0)]
     sides = []
     for i in equations:
-        # One order up, which is the time derivative of what shows the state. The highest order
-        # comes round to the front and is dropped: the outputs have left it empty.
+        # One order up: the time derivative. The highest order, which the outputs left empty, comes
+        # round to the front.
         side = np.roll(shown[i], 1, axis=0)
         side[0, :] = 0.0
         side -= sum(value[i, k] * shown[k] for k in shown)
@@ -274,8 +247,7 @@ def _solved(
     if not left.size:
         return {}
     inverse = np.linalg.pinv(left, rcond=1e-10)
-    # Where a row of A^+ A is that of the identity, this unknown is determined, whatever the others
-    # are: a record with few outputs shows some states and not the rest.
+    # Where a row of A^+ A is that of the identity this unknown is determined.
     alone = np.abs(inverse @ left - np.eye(left.shape[1])).max(axis=1) < _DETERMINED
     solution = np.tensordot(inverse, right, axes=1)
     return {int(i): solution[i] for i in np.flatnonzero(alone)}
@@ -284,14 +256,11 @@ def _solved(
 def hidden_constants(
     model: Model, base: Mapping[str, float], structures: Sequence[Structure]
 ) -> set[str]:
-    """Return the parameters that are delays, or time constants or frequencies of hidden states.
-
-    No regression finds them: hidden states that are integrated at a wrong eigenvalue make least
-    squares fit the rest to a wrong signal.
+    """Return the parameters that are delays, or time constants or frequencies of hidden states: at
+    a wrong eigenvalue least squares fits the rest to a wrong signal.
 
     Args:
-        base: all parameters by name; one that is not given (NaN) stays so, other values do not
-            matter.
+        base: all parameters by name; NaN of one that is not given, other values do not matter.
     """
     names = tuple(n for n in naming.names(model.Params) if not np.isnan(base[n]))
     both = coefficients(model, base, names, generic(len(names)))
@@ -329,19 +298,13 @@ class Record(NamedTuple):
 def record(
     model: Model, flight: Flight, structure: Structure, half: int, late: Mapping[str, float]
 ) -> Record:
-    """Return a flight smoothed.
-
-    Args:
-        flight: with outputs as `structure` has them.
-        half: half width of the kernel [samples].
-        late: by input, how late it acts [s].
-    """
+    """Return a flight smoothed by a kernel of half width `half` [samples], with inputs that act
+    `late` [s]."""
     flight = without_jumps(flight)
     parts, bridged = segments(flight.outputs)
     parts = [p for p in parts if p.stop - p.start >= shortest(half)]
     parts = sorted(parts, key=lambda p: p.start - p.stop)[:_SEGMENTS]
-    # Neighbours within a kernel are made of the same samples: leaving most of them out loses next
-    # to nothing, and hidden states are integrated in fewer steps.
+    # Neighbours within a kernel are made of the same samples: fewer of them lose next to nothing.
     every = max(1, half // _RESOLVED)
     inputs, shown, made = naming.names(model.Inputs), structure.shown, []
     for part in parts:
@@ -354,8 +317,6 @@ def record(
             whole = smoothed(u, flight.dt, half, held=held, late=late.get(name, 0.0))
             signals[name] = whole[:, length:]
         z = np.stack([signals[name] for name in structure.signals])[..., ::every]
-        # All signals were smoothed by one kernel, so that their sums are the states smoothed. A
-        # state of derivatives of highest order has no derivative: `structure` goes one order up.
         states = [np.einsum("rz,zrn->n", c, z) for c in shown.values()]
         left = [
             np.einsum("rz,zrn->n", shown[i][:-1], z[:, 1:])

@@ -6,7 +6,6 @@ samples when old data are forgotten. Functions follow the shape init, step -> (s
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -14,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from heli_jax import naming
@@ -49,7 +49,6 @@ class RLSState(NamedTuple):
 class RLSInfo(NamedTuple):
     """Results of a step."""
 
-    theta: Float[Array, " q"]
     error: Float[Array, ""]
     """y(k) - Phi(k)^T Theta(k-1), eq. 29"""
     largest: Float[Array, ""]
@@ -68,7 +67,7 @@ class RLSResult(NamedTuple):
 
 def rls_init(size: int, p0: float | Float[Array, ""] = 1e6) -> RLSState:
     """Theta(0) = 0 and P(0) = p0 I: a large p0 lets the first samples decide alone."""
-    scale = jnp.sqrt(jnp.asarray(p0, jnp.result_type(float)))
+    scale = jnp.sqrt(jnp.asarray(p0))
     return RLSState(jnp.zeros(size, scale.dtype), scale * jnp.eye(size, dtype=scale.dtype))
 
 
@@ -79,17 +78,11 @@ def rls_step(
     forgetting: Float[Array, ""],
     bound: Float[Array, ""],
 ) -> tuple[RLSState, RLSInfo]:
-    """One sample, eqs 29-33 with the gain of eq. 33 (which eq. 31 equals with the new P).
-
-    Args:
-        state: Theta (q,) and the square root of P (q, q).
-        phi: regressor (q,).
-        forgetting: in (0, 1]; a sample j steps ago weighs forgetting^j.
-    """
+    """One sample, eqs 29-33 with the gain of eq. 33 (which eq. 31 equals with the new P); a sample
+    j steps ago weighs forgetting^j."""
     theta, S = state
     f = jnp.sum(S * phi[:, None], axis=0)
-    power = jnp.sum(f * f)
-    alpha = forgetting + power
+    alpha = forgetting + jnp.sum(f * f)
     gain = jnp.sum(S * f[None, :], axis=1) / alpha
     error = y - jnp.sum(phi * theta)
     theta = theta + gain * error
@@ -98,17 +91,17 @@ def rls_step(
     S = (S - shrink * gain[:, None] * f[None, :]) / jnp.sqrt(forgetting)
     variances = jnp.sum(S * S, axis=1)
     largest = jnp.max(variances)
-    # Directions that the regressor does not excite are forgotten without being learnt again, so P
-    # grows there without end (wind-up): a variance beyond the bound is taken back to it, as a
-    # measurement without news would, which leaves Theta and the excited directions alone.
+    # Wind-up: directions that the regressor does not excite are forgotten without being learnt
+    # again, so that P would grow there without end.
     S = jax.lax.cond(largest > bound, _bounded, lambda S, *_: S, S, variances, bound)
-    return RLSState(theta, S), RLSInfo(theta, error, largest)
+    return RLSState(theta, S), RLSInfo(error, largest)
 
 
 def _bounded(
     S: Float[Array, "q q"], variances: Float[Array, " q"], bound: Float[Array, ""]
 ) -> Float[Array, "q q"]:
-    """The largest variance brought down to the bound by a pseudo-measurement of that parameter."""
+    """Bring the largest variance down to the bound, as a measurement of that parameter without news
+    does: Theta and the excited directions stay."""
     i = jnp.argmax(variances)
     f, p = S[i], variances[i]
     # A measurement of variance r leaves p r / (p + r), which is the bound for this r. Both branches
@@ -121,14 +114,9 @@ def _bounded(
 
 def regressors(u: Float[Array, " N"], y: Float[Array, " N"], order: int) -> Float[Array, "N q"]:
     """Return Phi(k) = [y(k-1) ... y(k-n), u(k) ... u(k-n)], eq. 25, (N, 2n + 1), with zeros before
-    the first sample.
-    """
-
-    def delayed(s: Array, j: int) -> Array:
-        return jnp.concatenate([jnp.zeros(j, s.dtype), s[: s.shape[0] - j]])
-
-    past = [delayed(y, j) for j in range(1, order + 1)]
-    return jnp.stack(past + [delayed(u, j) for j in range(order + 1)], axis=1)
+    the first sample."""
+    lags = [(y, j) for j in range(1, order + 1)] + [(u, j) for j in range(order + 1)]
+    return jnp.stack([jnp.pad(s, (j, 0))[: s.shape[0]] for s, j in lags], axis=1)
 
 
 # As arrays forgetting, p0 and bound share one compiled program; as numbers each value has its own.
@@ -148,8 +136,6 @@ def rls(
     zeros there.
 
     Args:
-        u: input.
-        y: output.
         order: n of Hd(z); the paper's is 4.
         forgetting: see `rls_regression`, as p0 and bound.
 
@@ -165,13 +151,10 @@ def rls(
             f"expected at least {2 * order + 1} samples for order {order}, got {u.shape[0]}"
         )
     phi = regressors(u, y, order)
-    # Zeros in place of an unrecorded past would be learnt as if the helicopter had rested.
-    run = rls_regression(phi[order:], y[order:], forgetting, p0, bound)
-
-    def padded(values: Array) -> Array:
-        return jnp.concatenate([jnp.zeros((order, *values.shape[1:]), values.dtype), values])
-
-    return RLSResult(run.theta, padded(run.history), padded(run.error), padded(run.largest))
+    theta, *run = rls_regression(phi[order:], y[order:], forgetting, p0, bound)
+    return RLSResult(
+        theta, *(jnp.zeros((u.size, *v.shape[1:]), v.dtype).at[order:].set(v) for v in run)
+    )
 
 
 def rls_regression(
@@ -187,30 +170,26 @@ def rls_regression(
         forgetting: in (0, 1].
         bound: largest variance that P may reach, against wind-up; 100 p0 unless given.
     """
-    dtype = phi.dtype
-    p0 = jnp.asarray(p0, dtype)
-    factor = jnp.asarray(forgetting, dtype)
-    # Far enough above p0 to leave estimates alone; without a bound P would overflow.
-    limit = jnp.asarray(100.0 * p0 if bound is None else bound, dtype)
-
-    def step(state: RLSState, sample: tuple[Array, Array]) -> tuple[RLSState, RLSInfo]:
-        return rls_step(state, *sample, factor, limit)
-
-    initial = rls_init(phi.shape[1], p0)
     # A scan keeps the types of what it carries: float32 records stay so beside a float64 p0.
-    initial = jax.tree.map(lambda v: v.astype(dtype), initial)
-    state, info = jax.lax.scan(step, initial, (phi, y))
-    return RLSResult(state.theta, info.theta, info.error, info.largest)
+    p0, factor = jnp.asarray(p0, phi.dtype), jnp.asarray(forgetting, phi.dtype)
+    # Far enough above p0 to leave estimates alone; without a bound P would overflow.
+    limit = jnp.asarray(100.0 * p0 if bound is None else bound, phi.dtype)
+
+    def step(state: RLSState, sample: tuple[Array, Array]) -> tuple[RLSState, tuple[Array, ...]]:
+        state, info = rls_step(state, *sample, factor, limit)
+        return state, (state.theta, *info)
+
+    state, run = jax.lax.scan(step, rls_init(phi.shape[1], p0), (phi, y))
+    return RLSResult(state.theta, *run)
 
 
-def transfer_function(
-    theta: Float[Array, " q"],
-) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
+def transfer_function(theta: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Return num and den (n + 1,) of Hd(z), highest power first, from Theta (2n + 1,), eqs 24 and
     26."""
-    n = (theta.shape[0] - 1) // 2
+    theta = np.asarray(theta)
+    n = theta.size // 2
     # Theta holds -a: eq. 25 has the past outputs on the side of the inputs.
-    return theta[n:], jnp.concatenate([jnp.ones(1, theta.dtype), -theta[:n]])
+    return theta[n:], np.r_[1.0, -theta[:n]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,12 +225,12 @@ class Baseline:
     @property
     def num(self) -> np.ndarray:
         """Numerator of Hd(z), highest power first."""
-        return self.theta[self.order :]
+        return transfer_function(self.theta)[0]
 
     @property
     def den(self) -> np.ndarray:
         """Denominator of Hd(z), highest power first."""
-        return np.r_[1.0, -self.theta[: self.order]]
+        return transfer_function(self.theta)[1]
 
     @property
     def poles(self) -> np.ndarray:
@@ -280,7 +259,6 @@ def baseline(
     """Return RLS of one flight: its first output (an angle before its rate) from its first input.
 
     Args:
-        model: names the signals, and shows whether physical parameters can be read off.
         params: the model's Params, for the vehicle's geometry and rotor speed.
         order: n of Hd(z); the paper's is 4.
         forgetting: in (0, 1]; a sample j steps ago weighs forgetting^j.
@@ -298,7 +276,6 @@ def baseline(
     u, y = flight.inputs[input_][part], flight.outputs[output][part]
     # To unit rms, so that P(0) means the same whatever the units; a silent signal is left as it is.
     u_scale, y_scale = (float(np.sqrt(np.mean(v**2))) or 1.0 for v in (u, y))
-    # Numbers as arrays: otherwise they would be constants of a program for each value.
     run = rls(
         jnp.asarray(u / u_scale),
         jnp.asarray(y / y_scale),
@@ -306,17 +283,21 @@ def baseline(
         forgetting=jnp.asarray(forgetting),
         p0=jnp.asarray(_P0),
     )
-    # Coefficients of past outputs have no unit, those of inputs that of y over u.
     back = np.r_[np.ones(order), np.full(order + 1, y_scale / u_scale)]
     history = np.asarray(run.history) * back
-    num, den = (np.asarray(v) for v in transfer_function(jnp.asarray(history[-1])))
-    simulated = _simulate(num, den, u, y)
+    num, den = transfer_function(history[-1])
+    from scipy.signal import lfilter, lfiltic
+
+    # Started from the first measured outputs, over the whole record: one step ahead any model
+    # predicts well where sampling is fast.
+    begun = lfiltic(num, den, y[order - 1 :: -1], u[order - 1 :: -1])
+    simulated = np.r_[y[:order], lfilter(num, den, u[order:], zi=begun)[0]]
     diverges = not np.abs(simulated).max() <= 1e6 * np.abs(y).max()
     agreement = NO_METRICS if diverges else metrics(y, simulated)
     if (size := float(np.max(np.abs(np.roots(den))))) >= 1.0:
         findings.append(found("rls.unstable", value=size))
-    continuous, not_exact = _continuous(num, den, flight.dt)
-    combinations, doubts = _combinations(model, params, flight, output, continuous[1], order)
+    (continuous_num, continuous_den), not_exact = _continuous(num, den, flight.dt)
+    combinations, doubts = _combinations(model, params, flight, output, continuous_den, order)
     errors = np.asarray(run.error)[order:] * y_scale
     return Baseline(
         flight=flight.name or "flight 1",
@@ -326,8 +307,8 @@ def baseline(
         forgetting=forgetting,
         dt=flight.dt,
         history=history,
-        continuous_num=continuous[0],
-        continuous_den=continuous[1],
+        continuous_num=continuous_num,
+        continuous_den=continuous_den,
         note=not_exact[0].sentence if not_exact else "",
         combinations=combinations,
         simulated=simulated,
@@ -337,16 +318,16 @@ def baseline(
 
 
 def _samples(model: Model, flight: Flight, least: int) -> tuple[str, slice, list[Finding]]:
-    """The first output with `least` samples in a row (else the first), its longest part without a
-    missing sample, and what is to be said of both."""
+    """Return the first output with `least` samples in a row (else the first), and its longest part
+    without a missing sample."""
     # An angle before its rate: eq. 23, which physical parameters are read from, is of an angle.
     names = [n for n in naming.names(model.Outputs) if n in flight.outputs]
     names = sorted(names, key=lambda n: naming.unit(model.Outputs, n) != "rad")
     parts = {}
     for name in names:
-        missing = np.r_[True, np.isnan(flight.outputs[name]), True]
-        edges = np.flatnonzero(np.diff(missing.astype(int))).reshape(-1, 2)
-        parts[name] = slice(*max(edges.tolist(), key=lambda e: e[1] - e[0], default=(0, 0)))
+        seen = ~np.isnan(flight.outputs[name])
+        clumps = np.ma.clump_masked(np.ma.array(seen, mask=seen))
+        parts[name] = max(clumps, key=lambda s: s.stop - s.start, default=slice(0, 0))
     output = next((n for n in names if parts[n].stop - parts[n].start >= least), names[0])
     part, missing = parts[output], int(np.isnan(flight.outputs[output]).sum())
     findings = []
@@ -360,29 +341,11 @@ def _samples(model: Model, flight: Flight, least: int) -> tuple[str, slice, list
     return output, part, findings
 
 
-def _simulate(
-    num: Float[np.ndarray, " n"],
-    den: Float[np.ndarray, " n"],
-    u: Float[np.ndarray, " N"],
-    y: Float[np.ndarray, " N"],
-) -> Float[np.ndarray, " N"]:
-    """Hd driven by the whole input, started from the first measured outputs."""
-    # The whole record and not one step ahead: where sampling is fast any model predicts the next
-    # output well, since the last one is nearly the same.
-    n, simulated = den.size - 1, y.copy()
-    with np.errstate(all="ignore"):  # an unstable Hd overflows
-        forced = np.convolve(u, num / den[0])
-        # A loop: importing scipy.signal takes longer than all of it.
-        for k in range(n, y.size):
-            simulated[k] = forced[k] - den[1:] @ simulated[k - n : k][::-1] / den[0]
-    return simulated
-
-
 type _Polynomials = tuple[np.ndarray | None, np.ndarray | None]
 
 
 def _continuous(num: np.ndarray, den: np.ndarray, dt: float) -> tuple[_Polynomials, list[Finding]]:
-    """H(s), and why it is not the inverse of the zero-order hold."""
+    """Return H(s), and why it is not the inverse of the zero-order hold."""
     try:
         return d2c(num, den, dt, "zoh"), []
     except ValueError as e:
@@ -397,9 +360,9 @@ def _continuous(num: np.ndarray, den: np.ndarray, dt: float) -> tuple[_Polynomia
 def _combinations(
     model: Model, params: Any, flight: Flight, output: str, den: np.ndarray | None, order: int
 ) -> tuple[dict[str, float], list[Finding]]:
-    """a/Ixx and a/If where the structure of eq. 23 allows to read them off, and doubts."""
-    angle = output in ("roll", "pitch")
-    if not (angle and of_helicopter(model.Params) and len(naming.names(model.State)) == 4):
+    """Return a/Ixx and a/If where eq. 23 has the model's structure, and doubts."""
+    fourth_order = len(naming.names(model.State)) == 4
+    if not (output in ("roll", "pitch") and of_helicopter(model.Params) and fourth_order):
         return {}, [found("rls.no-parameters", "doubt", output)]
     if order != 4:
         return {}, [found("rls.other-order", value=float(order))]
@@ -410,8 +373,7 @@ def _combinations(
     p = p if reads(model, p, "zeta") else naming.replace(p, zeta=0.0 * p.zeta)
     ratios = ratios_from_denominator(p, den, output)
     values, doubts = {n: float(v) for n, v in ratios.values.items()}, []
-    wrong = [n for n, v in values.items() if not (math.isfinite(v) and v > 0)]
-    if wrong:
+    if wrong := [n for n, v in values.items() if not (math.isfinite(v) and v > 0)]:
         shown = [f"{n} = {terse(values[n])}" for n in wrong]
         doubts.append(found("rls.impossible", "doubt", *wrong, values=shown))
     # The ratios do not use p2, so that it can contradict them.
@@ -423,24 +385,21 @@ def _combinations(
 
 def _bias(
     errors: Float[np.ndarray, " k"], y: Float[np.ndarray, " N"], agreement: Metrics
-) -> Iterator[Finding]:
-    """Yield findings on a bias of least squares by noise on past measured outputs."""
+) -> list[Finding]:
+    """Return findings on a bias of least squares by noise on past measured outputs."""
     # While P falls from its start the errors are those of no model.
     errors = errors[min(_STARTING, errors.size // 4) :]
     one_step = float(np.sqrt(np.mean(errors**2)))
     if one_step < 1e-8 * float(np.sqrt(np.mean(y**2))):
-        return  # no noise: the rest is rounding
+        return []  # no noise: the rest is rounding
+    findings = []
     if math.isnan(agreement.rmse):
-        yield found("rls.diverges")
+        findings.append(found("rls.diverges"))
     # Without a bias both errors are the same noise; past outputs in the regressor hide it from the
     # error of one step, not from the simulation.
     elif agreement.rmse > _WORSE * one_step:
-        yield found(
-            "rls.biased",
-            value=agreement.rmse / one_step,
-            limit=_WORSE,
-            ahead=one_step,
-            simulated=agreement.rmse,
+        ratio, simulated = agreement.rmse / one_step, agreement.rmse
+        findings.append(
+            found("rls.biased", value=ratio, limit=_WORSE, ahead=one_step, simulated=simulated)
         )
-    if not whiteness(errors).white:
-        yield found("rls.not-white")
+    return findings if whiteness(errors).white else [*findings, found("rls.not-white")]

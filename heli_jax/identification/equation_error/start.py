@@ -1,13 +1,11 @@
 """Start values of a linear model's parameters from the records themselves, without a vehicle.
 
-Equation error: each state's derivative is regressed on states and inputs. It needs no start, but
-measurement noise on the regressors biases it, gusts do (states follow them), and hidden time
-constants are beyond it: a start for a fit, never a result.
+Equation error: each state's derivative is regressed on states and inputs. Measurement noise on the
+regressors and gusts bias it: a start for a fit, never a result.
 
-States that nothing measured shows are integrated by their own equations, from what is measured.
-Their initial values, and a constant in each equation and flight (trim, bias), are projected out.
-Where parameters multiply each other, or enter otherwise than linearly, Levenberg-Marquardt finds
-the least squares; else its first step is the regression.
+Hidden states are integrated by their own equations, from what is measured. Their initial values,
+and a constant in each equation and flight (trim, bias), are projected out. Levenberg-Marquardt
+finds the least squares; where parameters enter linearly its first step is the regression.
 """
 
 import functools
@@ -39,7 +37,7 @@ from heli_jax.identification.problem import Free, Sign
 from heli_jax.vehicle import of_helicopter
 
 _APART = 1_000_000
-"""instants between segments and flights: longer than any lag over which residuals are correlated"""
+"""instants between segments and flights, longer than any lag"""
 _EVALUATIONS = 40
 """of the residuals in one search, at most"""
 _SMALL = 1e-6
@@ -83,25 +81,19 @@ class Regression(NamedTuple):
         return tuple(dict.fromkeys(e for r in self.records for e in r.structure.equations))
 
     def rows(self, values: Float[np.ndarray, " q"], weights: Mapping[str, float]) -> Rows | None:
-        """Return residuals and their derivatives; None where they are not finite, as at a parameter
-        of zero that something is divided by.
-
-        Args:
-            values: of the parameters `names` (q,), SI.
-        """
-        with np.errstate(all="ignore"):
-            try:
-                rows = self._rows(values, weights)
-            except (ValueError, np.linalg.LinAlgError):  # an infinite matrix or signal
-                return None
-        return rows if np.isfinite(rows.cost) and np.isfinite(rows.J).all() else None
-
-    def _rows(self, values: np.ndarray, weights: Mapping[str, float]) -> Rows:
+        """Return residuals and their derivatives at values (q,), SI; None where they are not
+        finite, as at a parameter of zero that something is divided by."""
         parts, begin, order = [], 0, self.equations
         for one in self.records:
-            both = coefficients(self.model, {**self.base, **one.known}, self.names, values)
             names = one.structure.equations
-            x = _of_flight(one, both, np.array([weights[n] for n in names])[:, None, None])
+            weight = np.array([weights[n] for n in names])[:, None, None]
+            known = {**self.base, **one.known}
+            try:
+                with np.errstate(all="ignore"):
+                    both = coefficients(self.model, known, self.names, values)
+                    x = _of_flight(one, both, weight)
+            except (ValueError, np.linalg.LinAlgError):  # an infinite matrix or signal
+                return None
             instants = []
             for segment in one.segments:
                 instants.append(begin + np.arange(segment.left.shape[1]))
@@ -109,19 +101,20 @@ class Regression(NamedTuple):
             times = np.tile(np.concatenate(instants), len(names))
             equation = np.repeat([order.index(n) for n in names], x.shape[0] // len(names))
             parts.append(Rows(x[:, 0], x[:, 1:], times, equation))
-        return Rows(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        rows = Rows(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        with np.errstate(all="ignore"):
+            return rows if np.isfinite(rows.cost) and np.isfinite(rows.J).all() else None
 
 
 def _of_flight(
     one: Record, both: Float[np.ndarray, "r c 1+q"], weight: Float[np.ndarray, "e 1 1"]
 ) -> Float[np.ndarray, "en 1+q"]:
-    """The weighted residuals of a flight, and their derivatives, equation by equation."""
+    """Return the weighted residuals of a flight, and their derivatives, equation by equation."""
     pairs = [_residual(segment, one.structure, both) for segment in one.segments]
     residual = np.concatenate([r for r, _ in pairs], axis=1)
     e, n, c = residual.shape
-    # Initial values of each segment and constants enter linearly, so that their best values are
-    # known at any parameters. J leaves out that the responses to initial values move with the
-    # parameters; a step is taken only where the sum of squares falls.
+    # Initial values and constants enter linearly: their best values are known at any parameters. J
+    # leaves out that the responses to initial values move with the parameters.
     initial = [scipy.linalg.block_diag(*(free[i] for _, free in pairs)) for i in range(e)]
     constants = np.broadcast_to(np.eye(e)[:, None, :], (e, n, e))
     nuisances = weight * np.concatenate([np.array(initial), constants], axis=-1)
@@ -163,10 +156,9 @@ def _residual(
 
 
 def _first_order_hold(A: Float[np.ndarray, "h h"], step: float) -> tuple[np.ndarray, ...]:
-    """x(k+1) = phi x(k) + first f(k) + second f(k+1) for x' = A x + f, f straight between."""
+    """Return phi, first and second of x(k+1) = phi x(k) + first f(k) + second f(k+1), for
+    x' = A x + f with f straight between samples, by one exponential (Van Loan, 1978)."""
     h = A.shape[0]
-    # One exponential of a block matrix gives the transition and both integrals (Van Loan, 1978),
-    # without the inverse of A, which an integrator has none of.
     block = np.zeros((3 * h, 3 * h))
     block[:h, :h], block[:h, h : 2 * h] = A * step, np.eye(h) * step
     block[h : 2 * h, 2 * h :] = np.eye(h)
@@ -192,13 +184,9 @@ def search(
     start: Float[np.ndarray, " q"],
     keep_sign: np.ndarray,
     weights: Mapping[str, float],
-) -> tuple[np.ndarray, Rows] | None:
-    """Levenberg-Marquardt on the equation error; None where that is not finite at the start.
-
-    Args:
-        start: values to begin with (q,), SI.
-        keep_sign: True where a parameter keeps its start's sign (q,): searched in its logarithm.
-    """
+) -> "_Optimum | None":
+    """Minimise the equation error from values `start` (q,), SI, those with `keep_sign` (q,) in
+    their logarithms; None where it is not finite at the start."""
     from scipy.optimize import least_squares
 
     first = regression.rows(start, weights)
@@ -233,47 +221,33 @@ def search(
         xtol=_SMALL,
         max_nfev=_EVALUATIONS,
     ).x
-    return values(end), at(tuple(end)) or first
+    return _Optimum(values(end), at(tuple(end)) or first, weights)
 
-
-# Standard errors of a regression whose residuals are autocorrelated.
-#
-# Smoothed residuals are alike over many samples, and so are gusts: ordinary formulas would take
-# each sample for news. The products of regressor and residual are summed over neighbouring instants
-# with Bartlett's weights (W. K. Newey and K. D. West, Econometrica 55, 1987); V. Klein and E. A.
-# Morelli, Aircraft System Identification (2006), 5.2.3, correct for the same.
 
 _LAGS = 2.0
 """times the root of the number of instants: how far neighbours are allowed for"""
 
 
 def covariance(rows: Rows) -> Float[np.ndarray, "q q"]:
-    """Return the covariance of the estimates (q, q), by the residuals where the search ended."""
-    # The sandwich: curvature on both sides, between them the variance of the gradient as the
-    # residuals have it. Where these are white it becomes the ordinary formula.
-    bread = np.linalg.pinv(rows.J.T @ rows.J, hermitian=True)
-    return bread @ _long_run(rows.J * rows.r[:, None], rows.times) @ bread
+    """Return the covariance of the estimates (q, q), by the residuals where the search ended.
 
-
-def _long_run(scores: Float[np.ndarray, "n k"], times: np.ndarray) -> Float[np.ndarray, "k k"]:
-    """The variance of the scores' sum: their products over all lags, weighted by Bartlett."""
-    instants, number = np.unique(times, return_inverse=True)
+    Smoothed residuals and gusts are alike over many samples: the products of regressor and residual
+    are summed over neighbouring instants with Bartlett's weights (Newey and West, Econometrica 55,
+    1987; Klein and Morelli, Aircraft System Identification, 2006, 5.2.3).
+    """
+    instants, number = np.unique(rows.times, return_inverse=True)
     lags = int(_LAGS * instants.size**0.5)
     # Sums over the rows of each instant, with gaps of zeros that no lag reaches across.
     place = np.r_[0, np.cumsum(np.minimum(np.diff(instants), lags + 1))]
-    sums = np.zeros((int(place[-1]) + 1, scores.shape[1]))
-    np.add.at(sums, place[number], scores)
+    sums = np.zeros((int(place[-1]) + 1, rows.J.shape[1]))
+    np.add.at(sums, place[number], rows.J * rows.r[:, None])
     total = sums.T @ sums
     for lag in range(1, min(lags, len(sums) - 1) + 1):
         product = sums[lag:].T @ sums[:-lag]
-        # Falling weights keep the sum positive semi-definite; cut off at a lag, it could give a
-        # negative variance (Newey and West).
+        # Falling weights keep the variance from becoming negative.
         total += (1.0 - lag / (lags + 1.0)) * (product + product.T)
-    return total
-
-
-# Stepwise selection of terms by partial F-ratios, as SIDPAC's `swr` does: V. Klein and E. A.
-# Morelli (2006), 5.4; N. R. Draper and H. Smith, Applied Regression Analysis.
+    bread = np.linalg.pinv(rows.J.T @ rows.J, hermitian=True)
+    return bread @ total @ bread
 
 
 class Step(NamedTuple):
@@ -303,19 +277,18 @@ def select(
     forced: Sequence[str],
     limits: tuple[float, float],
 ) -> Selection:
-    """Remove terms and enter them again, until no F-ratio is beyond its limit.
+    """Remove terms and enter them again, until no partial F-ratio is beyond its limit, as SIDPAC's
+    `swr` does (Klein and Morelli, 2006, 5.4; Draper and Smith, Applied Regression Analysis).
 
     All terms are in at first, where `swr` begins with none: with half of a response missing, what
     is left over is so autocorrelated that no term by itself would pass.
-    Products of parameters are taken as they are linear about the point where all terms are in.
 
     Args:
-        values: of the parameters there (q,).
-        forced: those that stay in: of a known sign, they cannot be zero.
+        values: of the parameters where all terms are in (q,).
+        forced: those that stay in: they cannot be zero.
         limits: F to enter and F to remove; the second is at most the first.
     """
-    # About the point where all terms are in r = y - X v, so X = -J: the nonlinear problem as the
-    # linear regression that F-ratios are defined for.
+    # Linear about the point where all terms are in: r = y - X v, so X = -J.
     X, y = -rows.J, rows.r - rows.J @ values
 
     def regressed(terms: list[int]) -> tuple[np.ndarray, float]:
@@ -328,14 +301,12 @@ def select(
 
     inside, steps = list(range(len(names))), []
     leaving, entering = {}, {}
-    # At most each term out and in a few times: rounding must not turn in a circle.
+    # Not for ever: rounding must not turn in a circle.
     for _ in range(4 * len(names)):
         ratios = dict(zip(inside, regressed(inside)[0], strict=True))
         leaving = {j: float(f) for j, f in ratios.items() if names[j] not in forced}
         outside = [j for j in range(len(names)) if j not in inside]
         entering = {j: float(regressed([*inside, j])[0][-1]) for j in outside}
-        # Out before in: the limit to remove is at most that to enter, so a term that has just come
-        # in is not thrown out by the same number.
         worst = min(leaving, key=leaving.__getitem__, default=None)
         best = max(entering, key=entering.__getitem__, default=None)
         if worst is not None and leaving[worst] < limits[1]:
@@ -349,9 +320,6 @@ def select(
     final = {**entering, **leaving}
     selected = tuple(n for j, n in enumerate(names) if j in inside)
     return Selection(selected, tuple(steps), {names[j]: final[j] for j in sorted(final)})
-
-
-# Start values by this regression.
 
 
 F_ENTER = 20.0
@@ -401,17 +369,13 @@ class EquationErrorStart(NamedTuple):
     @property
     def findings(self) -> list[Finding]:
         """The origin of each value."""
-        out = [
-            found(
-                "start.equation-error",
-                "note",
-                names=[n for n, v in self.values.items() if v.origin == "equation error"]
-                or ["nothing"],
-                equations=[e.name for e in self.equations],
-                explained=[e.r_squared for e in self.equations],
-                half_width=self.half_width,
-            )
-        ]
+        names = [n for n, v in self.values.items() if v.origin == "equation error"]
+        explained = {
+            "equations": [e.name for e in self.equations],
+            "explained": [e.r_squared for e in self.equations],
+            "half_width": self.half_width,
+        }
+        out = [found("start.equation-error", "note", names=names or ["nothing"], **explained)]
         if self.hidden:
             out.append(found("start.hidden-states", "note", names=self.hidden))
         return out + reasons_of(self.values)
@@ -463,8 +427,7 @@ def equation_error_start(
     regression, half, reasons = _regression(model, vehicle, flights, free)
     keep = {n for n in regression.names if _keeps_sign(model, n, free[n].sign, regression.base[n])}
     optimum = _optimum(regression, keep)
-    # One parameter at a time is left out, and the rest regressed again: of two that are
-    # exchangeable only one has to go, and the other is determined as soon as the first is held.
+    # One at a time: of two exchangeable parameters the other is determined once one is held.
     while (out := _undetermined(regression, optimum.rows)) is not None:
         name, reasons[name] = out
         _require_value(regression.base, name, reasons[name])
@@ -476,18 +439,22 @@ def equation_error_start(
     if stepwise is not None:
         forced = _forced(regression, keep, optimum)
         selection = select(optimum.rows, optimum.values, regression.names, forced, stepwise)
-        # Terms that are out are zero from here on, and the others are regressed again: where
-        # regressors are correlated the values of those that stay move.
+        # Without those that are out the values of correlated regressors move.
         out = dict.fromkeys(set(regression.names) - set(selection.selected), 0.0)
         regression = regression._replace(names=selection.selected, base={**regression.base, **out})
         optimum = _optimum(regression, keep) if selection.selected else optimum
-    sd = np.sqrt(np.maximum(np.diag(covariance(optimum.rows)), 0.0))
+    structures, rows = [one.structure for one in regression.records], optimum.rows
+    equations = []
+    for i, (name, size) in enumerate(_sizes(regression).items()):
+        left = float(np.mean((rows.r[rows.equation == i] / optimum.weights[name]) ** 2))
+        equations.append(Equation(name, 1.0 - left / size**2))
+    sd = np.sqrt(np.maximum(np.diag(covariance(rows)), 0.0))
     estimates = dict(zip(regression.names, zip(optimum.values, sd, strict=False), strict=False))
     return EquationErrorStart(
         {n: _value(regression, n, free[n], estimates.get(n), reasons.get(n)) for n in free},
-        _explained(regression, optimum),
+        tuple(equations),
         half * flights[0].dt,
-        tuple(dict.fromkeys(n for one in regression.records for n in one.structure.hidden_names)),
+        tuple(dict.fromkeys(s.states[i] for s in structures for i in s.hidden)),
         selection,
     )
 
@@ -495,8 +462,8 @@ def equation_error_start(
 def _regression(
     model: Model, vehicle: Any, flights: Sequence[Flight], free: Mapping[str, Free]
 ) -> tuple[Regression, int, dict[str, str]]:
-    """The flights smoothed, the kernel's half width [samples], and by parameter that no regression
-    finds the reason."""
+    """Return the flights smoothed, the kernel's half width [samples], and by parameter that no
+    regression finds the reason."""
     if not model.linear:
         raise ValueError(
             f"start: equation-error is for linear models, and {model.name} is none: expected a "
@@ -504,8 +471,7 @@ def _regression(
         )
     stated = {n: f.start for n, f in free.items() if math.isfinite(f.start)}
     base = {n: float(np.asarray(v)) for n, v in naming.asdict(vehicle).items()} | stated
-    # What is free has generic numbers: NaN is left only where a constant is missing that somebody
-    # has to give, and only where a parameter stands is asked.
+    # With generic numbers of what is free, NaN is left only where a constant is missing.
     some = base | dict(zip(free, generic(len(free)), strict=True))
     structures = []
     for flight in flights:
@@ -558,11 +524,11 @@ def _require_value(base: Mapping[str, float], name: str, why: str) -> None:
 class _Optimum(NamedTuple):
     values: np.ndarray
     rows: Rows
-    weights: dict[str, float]
+    weights: Mapping[str, float]
 
 
 def _keeps_sign(model: Model, name: str, sign: Sign | None, at_hand: float) -> bool:
-    """True for a parameter of a known sign."""
+    """True if a parameter has a known sign to keep."""
     positive = name in model.positive
     known = positive or (math.isfinite(at_hand) and at_hand != 0)
     by_default = positive or of_helicopter(model.Params)
@@ -570,30 +536,30 @@ def _keeps_sign(model: Model, name: str, sign: Sign | None, at_hand: float) -> b
 
 
 def _optimum(regression: Regression, keep_sign: set[str]) -> _Optimum:
-    """The regression with the equations weighted by their own residuals."""
+    """Regress with the equations weighted by their own residuals."""
     keep = np.array([n in keep_sign for n in regression.names], bool)
-    # Equations differ in unit and noise, and share parameters. Before there are residuals each is
-    # weighted by the size of its left-hand side; then by its own residuals, which least squares of
-    # several equations asks for.
+    # Equations differ in unit and noise, and share parameters. The first weights are the sizes of
+    # their left-hand sides.
     weights = {n: 1.0 / size for n, size in _sizes(regression).items()}
-    values, rows = _first_search(regression, keep, weights)
+    optimum = _first_search(regression, keep, weights)
     for _ in range(_ROUNDS - 1):
+        rows = optimum.rows
         weights = {
             # The floor keeps an equation that is met exactly from drowning all others.
             name: w / max(float(np.sqrt(np.mean(rows.r[rows.equation == i] ** 2))), 1e-9)
             for i, (name, w) in enumerate(weights.items())
         }
-        again = search(regression, values, keep, weights)
+        again = search(regression, optimum.values, keep, weights)
         if again is None:
             break
-        values, rows = again
-    return _Optimum(values, rows, weights)
+        optimum = again
+    return optimum
 
 
 def _first_search(
     regression: Regression, keep: np.ndarray, weights: Mapping[str, float]
-) -> tuple[np.ndarray, Rows]:
-    """The best of searches from several values."""
+) -> _Optimum:
+    """Return the best of searches from several values."""
     at_hand = np.array([regression.base[n] for n in regression.names])
     known = np.isfinite(at_hand) & (at_hand != 0)
     # From nothing, and from the values at hand: products of parameters may have two optima.
@@ -602,7 +568,7 @@ def _first_search(
         starts.append(np.where(known, at_hand, starts[0]))
     runs = [search(regression, x, keep, weights) for x in starts]
     if None in runs:
-        # Something is divided by one of them: begun with any size, and either sign.
+        # Something is divided by one of them: any size and either sign are tried.
         tries = [np.where(keep, np.where(known, at_hand, abs(x)), x) for x in _TRIED]
         runs += [search(regression, x, keep, weights) for x in tries]
     finite = [run for run in runs if run is not None]
@@ -612,11 +578,11 @@ def _first_search(
             f"{', '.join(regression.names)} (zero, the vehicle's, {_TRIED[0]:g} and others): "
             "expected a start of each free parameter"
         )
-    return min(finite, key=lambda run: run[1].cost)
+    return min(finite, key=lambda run: run.rows.cost)
 
 
 def _sizes(regression: Regression) -> dict[str, float]:
-    """The standard deviation of each equation's left-hand side."""
+    """Return the standard deviation of each equation's left-hand side."""
     left = {name: [] for name in regression.equations}
     for one in regression.records:
         for k, name in enumerate(one.structure.equations):
@@ -624,16 +590,8 @@ def _sizes(regression: Regression) -> dict[str, float]:
     return {n: max(float(np.std(np.concatenate(v))), 1e-300) for n, v in left.items()}
 
 
-def _explained(regression: Regression, optimum: _Optimum) -> tuple[Equation, ...]:
-    equations = []
-    for i, (name, size) in enumerate(_sizes(regression).items()):
-        r = optimum.rows.r[optimum.rows.equation == i] / optimum.weights[name]
-        equations.append(Equation(name, 1.0 - float(np.mean(r**2)) / size**2))
-    return tuple(equations)
-
-
 def _undetermined(regression: Regression, rows: Rows) -> tuple[str, str] | None:
-    """A parameter that the regression does not determine, and why."""
+    """Return a parameter that the regression does not determine, and why."""
     norms, names = np.linalg.norm(rows.J, axis=0), regression.names
     if not norms.all():
         return names[int(np.argmin(norms))], "no measured state or output moves with it"
@@ -643,21 +601,21 @@ def _undetermined(regression: Regression, rows: Rows) -> tuple[str, str] | None:
         return None
     part = np.abs(directions[-1])
     involved = [i for i in np.argsort(-part) if part[i] > 0.1]
-    # One of them has to stay where it is; one with a value at hand can.
+    # One with a value at hand can stay where it is.
     first = ([i for i in involved if math.isfinite(regression.base[names[i]])] or involved)[-1]
     others = ", ".join(names[i] for i in involved if i != first)
     return names[first], f"the equations do not tell it from {others}"
 
 
 def _forced(regression: Regression, keep_sign: set[str], optimum: _Optimum) -> list[str]:
-    """The parameters that cannot be zero: of a known sign, or something is divided by them."""
-    forced = []
-    for i, name in enumerate(regression.names):
-        values = optimum.values.copy()
-        values[i] = 0.0
-        if name in keep_sign or regression.rows(values, optimum.weights) is None:
-            forced.append(name)
-    return forced
+    """Return the parameters that cannot be zero: something is divided by them, or they keep their
+    sign."""
+    without = optimum.values * ~np.eye(len(optimum.values), dtype=bool)
+    return [
+        name
+        for name, values in zip(regression.names, without, strict=True)
+        if name in keep_sign or regression.rows(values, optimum.weights) is None
+    ]
 
 
 def _value(
@@ -681,11 +639,10 @@ def _value(
 
 
 def _inside(free: Free, value: float) -> float:
-    """The value, or where it lies outside the bounds the nearest one a little inside."""
+    """Return the value, or where it lies outside the bounds the nearest one a little inside."""
     low = -math.inf if free.lower is None else free.lower
     high = math.inf if free.upper is None else free.upper
-    # Strictly inside: in the coordinates of a bounded parameter its bounds are at infinity, and so
-    # is zero in those of a logarithm.
+    # Strictly inside: a bound lies at infinity in the coordinates of a bounded parameter.
     if low < value < high:
         return value
     span = high - low if math.isfinite(high - low) else max(abs(low if value <= low else high), 1.0)

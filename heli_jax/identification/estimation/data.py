@@ -13,11 +13,11 @@ from heli_jax.analysis.trim import is_full_nonlinear, trim
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
+from heli_jax.identification.estimation.residual import residual_and_jacobian
 from heli_jax.identification.estimation.simulated_flights import (
     SimulatedOutputs,
+    by_output,
     simulated_at,
-    with_biases,
 )
 from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Problem
@@ -33,11 +33,7 @@ from heli_jax.identification.unknowns.layout import (
 
 
 def data_of(problem: Problem, flights: tuple[Flight, ...], layout: Layout | None = None) -> Data:
-    """The numbers of a problem over the given flights.
-
-    Args:
-        layout: of the problem over these flights, where it is at hand already.
-    """
+    """The numbers of a problem over the given flights, whose layout may be at hand already."""
     dtype = np.dtype(jnp.result_type(float))
     nuisance, frees = problem.nuisance, list(problem.free.values())
     bounds = [transforms.limits(f) for f in frees]
@@ -163,7 +159,7 @@ def _before_it_grows(
     simulate = _simulated
     for _ in range(_HALVINGS):
         runs = jax.device_get(simulate(layout, data, z))
-        simulated = with_biases(layout, runs)
+        simulated = by_output(layout, runs)
         windows = [count for count, _ in layout.windows]
         far = any(
             runs_away(v, np.asarray(f.outputs[n]))

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax.identification.estimation.kalman import Innovations
-from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
-from heli_jax.identification.estimation.simulated_flights import simulated_at, with_biases
+from heli_jax.identification.estimation.residual import residual_and_jacobian
+from heli_jax.identification.estimation.simulated_flights import by_output, simulated_at
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
 from heli_jax.numerics.jitted import jitted
 
@@ -51,7 +51,7 @@ def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) ->
     outputs, innovations, r, J, values, slopes = jax.device_get(
         (outputs, at.innovations, at.r, at.J, *named(layout, data, z))
     )
-    simulated = with_biases(layout, outputs)
+    simulated = by_output(layout, outputs)
     raw = tuple(
         {n: np.asarray(flight.outputs[n]) - v for n, v in run.items()}
         for flight, run in zip(data.flights, simulated, strict=True)
@@ -64,7 +64,7 @@ def simulated_outputs(
     layout: Layout, data: Data, z: Float[Array, " q"]
 ) -> tuple[dict[str, np.ndarray], ...]:
     """By flight and output the simulation (N,) with the bias, SI."""
-    return with_biases(layout, jax.device_get(simulated_at(layout, data, z)))
+    return by_output(layout, jax.device_get(simulated_at(layout, data, z)))
 
 
 @jitted

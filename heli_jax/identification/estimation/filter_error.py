@@ -5,7 +5,7 @@ intensity and correlation time are estimated beside the parameters, the scale of
 noise is concentrated out of the likelihood unless it is given.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -44,7 +44,6 @@ from heli_jax.identification.estimation.objective import Objective, RowTags
 from heli_jax.identification.estimation.residual import Residuals
 from heli_jax.identification.estimation.shared_covariance import innovations_together
 from heli_jax.identification.estimation.simulated_flights import (
-    Drive,
     driven,
     measured_count,
     measured_signals,
@@ -82,23 +81,25 @@ _BATCH = 8
 
 
 def disturbed_records(reached: Solution, u: Unknowns, i: int, keys: Array) -> dict[str, Array]:
-    """By name the outputs (runs, N) with a disturbance drawn for each key.
-
-    Args:
-        reached: where the fit ended.
-    """
+    """By name the outputs (runs, N) with a disturbance drawn for each key."""
     layout, drive = reached.layout, driven(reached.layout, reached.data, u, i)
-    drawn_state = _random_first_state(layout, drive, reached.z.dtype)
+    model, params, dtype = layout.model, drive.params, reached.z.dtype
+    first = drive.state if drive.state is not None else model.initial_state(params)
+    names, sds = naming.names(model.State), initial_sd_of(model, params, dtype)
+    # Factored without the sds, which may be zero.
+    factor = sds[:, None] * jnp.linalg.cholesky(correlation_of(model, params, dtype))
 
     @jax.jit
     def run(key: Array) -> Any:
         of_first, of_noise = jax.random.split(key)
+        drawn = jnp.sum(factor * jax.random.normal(of_first, (1, len(names)), dtype), axis=1)
+        begin = {n: getattr(first, n) + drawn[names.index(n)] for n in model.random_states}
         return simulate(
-            layout.model,
-            drive.params,
+            model,
+            params,
             drive.inputs,
             dt=drive.dt,
-            initial_state=drawn_state(of_first),
+            initial_state=naming.replace(first, **begin),
             solver=layout.solver,
             substeps=layout.substeps,
             key=of_noise,
@@ -106,23 +107,6 @@ def disturbed_records(reached: Solution, u: Unknowns, i: int, keys: Array) -> di
         ).outputs
 
     return naming.asdict(jax.lax.map(run, keys, batch_size=_BATCH))
-
-
-def _random_first_state(layout: Layout, drive: Drive, dtype: np.dtype) -> Callable[[Array], Any]:
-    """Return a function of a key that draws the State at the first sample."""
-    model, params = layout.model, drive.params
-    first = drive.state if drive.state is not None else model.initial_state(params)
-    names = naming.names(model.State)
-    sds = initial_sd_of(model, params, dtype)
-    # Factored without the sds, which may be zero.
-    factor = sds[:, None] * jnp.linalg.cholesky(correlation_of(model, params, dtype))
-
-    def draw(key: Array) -> Any:
-        drawn = jnp.sum(factor * jax.random.normal(key, (1, len(names)), dtype), axis=1)
-        values = {n: getattr(first, n) + drawn[names.index(n)] for n in model.random_states}
-        return naming.replace(first, **values)
-
-    return draw
 
 
 _FLOOR = 1e-3
@@ -259,7 +243,8 @@ class FilterError(Objective):
         largest: dict[str, float] = {}
         for f in data.flights:
             for n, y in f.outputs.items():
-                largest[n] = max(largest.get(n, 0.0), _BLIND * _root_mean_square(y))
+                size = float(np.sqrt(np.nanmean(np.square(np.asarray(y)))))
+                largest[n] = max(largest.get(n, _BLIND * 1e-300), _BLIND * size)
         # The same in all flights, as the noise is, so that they share their covariances here too.
         blinding = tuple(
             {n: np.asarray(largest[n], np.asarray(s).dtype) for n, s in sd.items()}
@@ -335,35 +320,25 @@ def _is_far(before: Noise, after: Noise) -> bool:
 def filtered_flights(
     layout: Layout, data: Data, noise: Noise, u: Unknowns
 ) -> tuple[Innovations, ...]:
-    """The innovations of every flight.
-
-    Args:
-        u: the unknowns, in the units of the model.
-    """
+    """The innovations of every flight."""
     together: dict[int, Innovations] = {}
     small = len(naming.names(layout.model.State)) <= SMALL
     for group in layout.one_covariance:
         # One record of a small model (5 states): written out in rows the exact filter takes four
         # fifths of the time for a fit, with its compilation (4.9 s for 6.0) or without.
         if not (small and len(group) == 1):
-            innovations = innovations_together(layout, data, noise, u, group)
-            together |= dict(zip(group, innovations, strict=True))
-    return tuple(
-        together[i] if i in together else _filtered(layout, data, noise, u, i)
-        for i in range(len(data.flights))
-    )
+            theirs = innovations_together(layout, data, noise, u, group)
+            together |= dict(zip(group, theirs, strict=True))
+    for i in set(range(len(data.flights))) - set(together):
+        positional, options = _filter_arguments(layout, data, noise, u, i)
+        together[i] = innovations(*positional, options)
+    return tuple(together[i] for i in range(len(data.flights)))
 
 
-def _filtered(layout: Layout, data: Data, noise: Noise, u: Unknowns, i: int) -> Innovations:
-    positional, options = filter_arguments(layout, data, noise, u, i)
-    return innovations(*positional, options)
-
-
-def filter_arguments(
+def _filter_arguments(
     layout: Layout, data: Data, noise: Noise, u: Unknowns, i: int
 ) -> tuple[tuple[Model, Any, Any, dict[str, Array], dict[str, Any]], SimulationOptions]:
-    """Return the arguments of `kalman.innovations` for the i-th flight; arguments as of
-    `filtered_flights`."""
+    """Return the arguments of `kalman.innovations` for the i-th flight."""
     drive = driven(layout, data, u, i)
     measured = {n: y - u.biases[i][n] for n, y in data.flights[i].outputs.items()}
     sd = {n: measurement_sd(u, n, s) for n, s in noise.sd[i].items()}
@@ -428,12 +403,6 @@ def innovation_sums(e: Evaluation, noise: Noise) -> tuple[float, float]:
     return squares, logs
 
 
-def _root_mean_square(y: Array | np.ndarray) -> float:
-    """Return the root mean square of a measured signal (N,), never zero."""
-    y = np.asarray(y)
-    return max(float(np.sqrt(np.nanmean(np.square(y)))), 1e-300)
-
-
 OBJECTIVE = FilterError()
 
 
@@ -457,21 +426,18 @@ class Ahead(NamedTuple):
 
 
 def predictions_ahead(at: Solution) -> tuple[Ahead, ...]:
-    """By flight what is predicted in windows from the filter's state at the begin of each.
-
-    Args:
-        at: where a fit by filter error ended.
-    """
-    layout, data, noise, z = at
+    """By flight what is predicted in windows from the filter's state at the begin of each, where a
+    fit by filter error ended."""
     # Outside of what is compiled: how many samples that are decides where windows begin.
-    samples = tuple(max(1, round(SECONDS / float(flight.dt))) for flight in data.flights)
-    errors = jax.device_get(_errors(layout, data, noise, z, samples))
+    samples = tuple(max(1, round(SECONDS / float(flight.dt))) for flight in at.data.flights)
     return tuple(
         Ahead(
             {n: np.asarray(f.outputs[n]) - e for n, e in innovations.error.items()},
             innovations.variance,
         )
-        for f, innovations in zip(data.flights, errors, strict=True)
+        for f, innovations in zip(
+            at.data.flights, jax.device_get(_errors(*at, samples)), strict=True
+        )
     )
 
 
@@ -481,7 +447,7 @@ def _errors(
 ) -> tuple[Innovations, ...]:
     u = unpack(layout, data, z)
     return tuple(
-        errors_ahead(*filter_arguments(layout, data, noise, u, i), every)
+        errors_ahead(*_filter_arguments(layout, data, noise, u, i), every)
         for i, every in enumerate(samples)
     )
 

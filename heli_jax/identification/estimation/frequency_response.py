@@ -61,10 +61,10 @@ from heli_jax.identification.estimation.response_weights import (
     weighed,
 )
 from heli_jax.identification.estimation.simulated_flights import (
+    by_output,
     least_noise,
     signals,
     simulated_at,
-    with_biases,
 )
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
@@ -419,7 +419,7 @@ class FrequencyResponse(Objective):
 def _sd(layout: Layout, data: Data, weights: ResponseWeights, z: Array) -> tuple[dict, ...]:
     """By flight and output the residual's in time, or where no simulation stands that of the noise
     in the band."""
-    runs = with_biases(layout, jax.device_get(simulated_at(layout, data, z)))
+    runs = by_output(layout, jax.device_get(simulated_at(layout, data, z)))
     w, sd = weights.windows, [dict[str, Any]() for _ in data.flights]
     in_band = np.mean(np.real(np.einsum("kpp->kp", weights.density)), axis=0)
     in_band = np.sqrt(in_band * max(float(np.ptp(w.hz)), 1.0 / w.seconds))

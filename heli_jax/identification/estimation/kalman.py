@@ -29,9 +29,6 @@ from heli_jax.simulation.hold import Segment, between_samples, delayed, delays_o
 from heli_jax.simulation.options import DEFAULT, SimulationOptions
 from heli_jax.simulation.stepping import held_columns
 
-# What a Kalman filter runs on: the drive of a record, and what a step needs of a model.
-
-
 # Params and Inputs are a model's own classes: they are annotated Any.
 
 type Estimate = tuple[Float[Array, " n"], Float[Array, "n n"]]
@@ -70,16 +67,12 @@ class Filter(NamedTuple):
 # for a twentieth of the arithmetic; a mode that is fast against the step would make it diverge.
 
 
-type _Moments = tuple[Float[Array, " n"], Float[Array, "n n"]]
-"""a state and its covariance"""
-
-
-def moments_after(
+def _moments_after(
     rates: Callable[[Array, Any], Array],
     intensity: Float[Array, " n"],
-    moments: _Moments,
+    moments: Estimate,
     part: Segment,
-) -> _Moments:
+) -> Estimate:
     """The moments after one step: x' = f(x, u), P' = A P + P A' + diag(g^2), A = df/dx at x.
 
     Args:
@@ -92,7 +85,7 @@ def moments_after(
     """
     spread, h = jnp.diag(jnp.square(intensity)), part.length
 
-    def slopes(moments: _Moments, share: float) -> _Moments:
+    def slopes(moments: Estimate, share: float) -> Estimate:
         (x, P), u = moments, part.inputs
         if part.slope is not None:
             u = jax.tree.map(lambda v, slope: v + slope * (share * h), u, part.slope)
@@ -102,7 +95,7 @@ def moments_after(
         AP = jax.vmap(along, in_axes=1, out_axes=1)(P)
         return f, AP + AP.T + spread
 
-    def moved(by: _Moments, share: float) -> _Moments:
+    def moved(by: Estimate, share: float) -> Estimate:
         return jax.tree.map(lambda v, slope: v + slope * (share * h), moments, by)
 
     first = slopes(moments, 0.0)
@@ -118,146 +111,88 @@ def moments_after(
 # The extended filter: a model linearised anew at every estimate (Ozaki's local linearisation).
 
 
-# Inputs are a model's own class: they are annotated Any.
-
-
 class _Equations(NamedTuple):
     """A model's equations over vectors, to be linearised anew at every estimate."""
 
     rates: Callable[[Array, Any], Array]
     """(state (n,), Inputs) -> (n,), per second"""
-    outputs: Callable[[Array, Any], Array]
-    """(state (n,), Inputs) -> what is measured (p,)"""
     intensity: Float[Array, " n"]
     """of the process noise, see `Model.noise_intensity`"""
     explicit: bool
     """see `Model.explicit`"""
 
 
-def _equations(drive: Drive) -> _Equations:
-    model, params = drive.model, drive.params
-    dtype = jax.tree.leaves(drive.inputs)[0].dtype
-    intensity = (
-        jnp.zeros(len(naming.names(model.State)), dtype)
-        if model.noise_intensity is None
-        else naming.ravel(model.noise_intensity(params), dtype)
-    )
+def _local(drive: Drive) -> Filter:
+    """The extended filter: the model linearised at every estimate (Ozaki, 1985)."""
+    model, params, inputs, options, linear, measured = drive
+    k = jnp.arange(jax.tree.leaves(inputs)[0].shape[0])
+    dtype = jax.tree.leaves(inputs)[0].dtype
+    dt = jnp.asarray(options.dt, dtype)
+    delays = delays_of(model, params, options.delay, dt)
+    # What is measured is measured with the inputs that act at the samples themselves.
+    acting = inputs if delays is None else delayed(inputs, delays, k, linear)
+    # A late sample arrives within an interval: before it the one before it still acts. The lengths
+    # of the parts are the same in all intervals, so they are no part of a sample.
+    lengths, held, slopes = zip(*segments(inputs, dt, delays, k, linear), strict=True)
 
     def rates(x: Array, u: Any) -> Array:
         return naming.ravel(model.vector_field(params, naming.unravel(model.State, x), u), dtype)
 
     def outputs(x: Array, u: Any) -> Array:
         y = naming.ravel(model.output(params, naming.unravel(model.State, x), u), dtype)
-        return y[drive.rows]
+        return y[measured]
 
-    return _Equations(rates, outputs, intensity, model.explicit)
-
-
-class _Intervals(NamedTuple):
-    """The sample intervals, in parts within which every input stays or follows a straight line."""
-
-    lengths: tuple[Any, ...]
-    """of each part [s]; the same in all intervals, so no part of a sample"""
-    inputs: tuple[Any, ...]
-    """at the begin of each part, the model's Inputs with arrays (N,)"""
-    slopes: tuple[Any, ...] | None
-    """of the inputs in each part, per second; None where all of them stay"""
-    acting: Any
-    """the Inputs (N,) at the samples themselves, when what is measured is measured"""
-
-
-def _intervals(drive: Drive) -> _Intervals:
-    inputs, linear = drive.inputs, drive.linear
-    # The linear filter has its drive from `held_columns`; here steps need the inputs themselves.
-    first = jax.tree.leaves(inputs)[0]
-    k, dt = jnp.arange(first.shape[0]), jnp.asarray(drive.options.dt, first.dtype)
-    delays = delays_of(drive.model, drive.params, drive.options.delay, dt)
-    acting = inputs if delays is None else delayed(inputs, delays, k, linear)
-    # A late sample arrives within an interval: before it the one before it still acts.
-    lengths, held, slopes = zip(*segments(inputs, dt, delays, k, linear), strict=True)
-    return _Intervals(lengths, held, slopes if linear else None, acting)
-
-
-def local_filter(drive: Drive) -> Filter:
-    """The extended filter: the model linearised at every estimate (Ozaki, 1985)."""
-    equations, intervals = _equations(drive), _intervals(drive)
+    noise = model.noise_intensity
+    none = jnp.zeros(len(naming.names(model.State)), dtype)
+    intensity = none if noise is None else naming.ravel(noise(params), dtype)
+    equations = _Equations(rates, intensity, model.explicit)
 
     def measure(x: Array, sample: Any) -> tuple[Array, Array]:
-        # With the inputs that act at the sample, which no part of an interval begins with when they
-        # are late.
         u = sample[1]
-        C = jax.jacfwd(equations.outputs)(x, u)
-        return C, equations.outputs(x, u) - jnp.sum(C * x[None, :], axis=1)
+        C = jax.jacfwd(outputs)(x, u)
+        return C, outputs(x, u) - jnp.sum(C * x[None, :], axis=1)
 
     def move(x: Array, P: Array, sample: Any) -> Estimate:
-        """The state and its covariance a sample on, along the linearised model.
-
-        Args:
-            x: (n,), corrected.
-            P: (n, n).
-        """
         held, _, slopes = sample
         estimate = (x, P)
-        slopes = (None,) * len(held) if slopes is None else slopes
-        for part in zip(intervals.lengths, held, slopes, strict=True):
-            estimate = _along(equations, estimate, Segment(*part), drive.options.substeps)
+        for part in zip(lengths, held, slopes, strict=True):
+            estimate = _along(equations, estimate, Segment(*part), options.substeps)
         return estimate
 
-    samples = (intervals.inputs, intervals.acting, intervals.slopes)
-    return Filter(samples, measure, move)
+    return Filter((held, acting, slopes if linear else (None,) * len(held)), measure, move)
 
 
 def _along(equations: _Equations, estimate: Estimate, part: Segment, substeps: int) -> Estimate:
     """The estimate after a part of an interval, linearised anew in each of its substeps."""
-    # With no slope nothing in the loop depends on time, and it needs no counter.
     h = part.length / substeps
-    if part.slope is None:
-        return jax.lax.scan(
-            lambda estimate, _: (_held_step(equations, estimate, h, part.inputs), None),
-            estimate,
-            None,
-            length=substeps,
-        )[0]
 
     def step(estimate: Estimate, j: Array) -> tuple[Estimate, None]:
-        now = jax.tree.map(lambda u, slope: u + slope * (j * h), part.inputs, part.slope)
-        return _ramped_step(equations, estimate, part._replace(length=h, inputs=now)), None
+        now = part.inputs
+        if part.slope is not None:
+            now = jax.tree.map(lambda u, slope: u + slope * (j * h), now, part.slope)
+        return _step(equations, estimate, Segment(h, now, part.slope)), None
 
     return jax.lax.scan(step, estimate, jnp.arange(substeps, dtype=estimate[0].dtype))[0]
 
 
-def _held_step(equations: _Equations, estimate: Estimate, h: Array, u: Any) -> Estimate:
-    (x, P), rates = estimate, equations.rates
-    if equations.explicit:
-        return moments_after(rates, equations.intensity, estimate, Segment(h, u, None))
-    # With J and f at x itself: shift is the whole step of the linearised equation from there.
-    step = van_loan(jax.jacfwd(rates)(x, u), rates(x, u), equations.intensity, h)
-    return x + step.shift, product(product(step.Phi, P), step.Phi.T) + step.Q
-
-
-def _ramped_step(equations: _Equations, estimate: Estimate, part: Segment) -> Estimate:
-    """`_held_step` where the inputs move."""
-    (x, P), rates = estimate, equations.rates
-    if equations.explicit:
-        return moments_after(rates, equations.intensity, estimate, part)
-    n, dtype = x.shape[0], x.dtype
-    # Time is a state more, whose rate is 1: the column of derivatives by time then makes the step
-    # of a linear model exact (local linearisation of an equation that depends on time).
-    _, by_time = jax.jvp(lambda u: rates(x, u), (part.inputs,), (part.slope,))
-    unit, zero = jnp.ones(1, dtype), jnp.zeros(1, dtype)
-    A = jnp.zeros((n + 1, n + 1), dtype).at[:n, :n].set(jax.jacfwd(rates)(x, part.inputs))
-    step = van_loan(
-        A.at[:n, n].set(by_time),
-        jnp.concatenate([rates(x, part.inputs), unit]),
-        # Time itself is certain: no noise acts on it.
-        jnp.concatenate([equations.intensity, zero]),
-        part.length,
-    )
+def _step(equations: _Equations, estimate: Estimate, part: Segment) -> Estimate:
+    """The estimate one step on, along the model linearised at its begin."""
+    (x, P), (rates, intensity, explicit) = estimate, equations
+    if explicit:
+        return _moments_after(rates, intensity, estimate, part)
+    n, A, f = x.shape[0], jax.jacfwd(rates)(x, part.inputs), rates(x, part.inputs)
+    if part.slope is not None:
+        # Time is a state more, whose rate is 1 and which is certain: the column of derivatives by
+        # time then makes the step of a linear model exact (local linearisation of an equation that
+        # depends on time).
+        _, by_time = jax.jvp(lambda u: rates(x, u), (part.inputs,), (part.slope,))
+        A = jnp.pad(A, (0, 1)).at[:n, n].set(by_time)
+        f, intensity = jnp.pad(f, (0, 1), constant_values=1.0), jnp.pad(intensity, (0, 1))
+    # With A and f at x itself: shift is the whole step of the linearised equation from there.
+    step = van_loan(A, f, intensity, part.length)
     Phi = step.Phi[:n, :n]
     return x + step.shift[:n], product(product(Phi, P), Phi.T) + step.Q[:n, :n]
 
-
-# Params, Inputs and State are a model's own classes: they are annotated Any.
 
 SMALL = 8
 """States up to which the filter of a linear model is written out in rows"""
@@ -305,12 +240,8 @@ def innovations(
     Ozaki (1985).
     """
     drive, (x, P), y, R = begun(model, params, inputs, measured, sd, options.changed(keywords))
-    if not model.linear:
-        e, s = _run(local_filter(drive), x, P, y, R)
-    elif x.shape[0] <= SMALL:
-        e, s = _by_rows(_linear(drive), x, P, y, R)
-    else:
-        e, s = _run(_exact(_linear(drive)), x, P, y, R)
+    small = model.linear and x.shape[0] <= SMALL
+    e, s = _by_rows(_linear(drive), x, P, y, R) if small else _run(filter_of(drive), x, P, y, R)
     return by_name(measured, e, s)
 
 
@@ -324,7 +255,11 @@ def begun(
 ) -> tuple[Drive, Estimate, Float[Array, "N p"], Float[Array, " p"]]:
     """Return the drive of a filter, its first estimate, the measurements and the variances of their
     noise; arguments as of `innovations`."""
-    options = _checked(options)
+    if options.dt is None:
+        raise TypeError("innovations: expected dt, the sample time in seconds, got None")
+    for name in _ONLY_SIMULATE:
+        if getattr(options, name) is not getattr(DEFAULT, name):
+            raise TypeError(f"innovations: expected no {name}, which only simulate has")
     model, inputs, linear = between_samples(model, inputs, inputs, options.hold)
     begin = options.initial_state
     x0 = model.initial_state(params) if begin is None else begin
@@ -346,22 +281,9 @@ def by_name(names: Iterable[str], errors: Array, variances: Array) -> Innovation
 
 
 def first_covariance(model: Model, params: Any, dtype: DTypeLike) -> Float[Array, "n n"]:
-    """Covariance of the state at the first sample (P0).
-
-    Args:
-        params: the model's Params, SI.
-    """
+    """Covariance of the state at the first sample (P0)."""
     sds = initial_sd_of(model, params, dtype)
     return correlation_of(model, params, dtype) * sds[:, None] * sds[None, :]
-
-
-def _checked(options: SimulationOptions) -> SimulationOptions:
-    if options.dt is None:
-        raise TypeError("innovations: expected dt, the sample time in seconds, got None")
-    for name in _ONLY_SIMULATE:
-        if getattr(options, name) is not getattr(DEFAULT, name):
-            raise TypeError(f"innovations: expected no {name}, which only simulate has")
-    return options
 
 
 class _Linear(NamedTuple):
@@ -436,19 +358,12 @@ def _sum(terms: Iterable[Any]) -> Any:
 
 def filter_of(drive: Drive) -> Filter:
     """The exact filter of a linear model, else the extended one."""
-    return _exact(_linear(drive)) if drive.model.linear else local_filter(drive)
+    if not drive.model.linear:
+        return _local(drive)
+    system = _linear(drive)
 
-
-def _exact(system: _Linear) -> Filter:
     # Rows written out one by one are a program whose length grows with the square of the states.
     def move(x: Array, P: Array, now: tuple[Array, Array]) -> Estimate:
-        """The state and its covariance a sample on.
-
-        Args:
-            x: (n,), corrected.
-            P: (n, n).
-            now: what drives this step (n,), and what feeds through.
-        """
         # A sum of products: the derivative of the matrix product Ad @ x costs ten times as much.
         x = jnp.sum(system.Ad * x[None, :], axis=1) + now[0]
         return x, product(product(system.Ad, P), system.Ad.T) + system.Q

@@ -6,8 +6,6 @@ region with a radius, and a test of convergence in standard deviations of the es
 (`experiments/benchmarks/optimiser.py` compares with the plain solver).
 """
 
-import functools
-import time
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
@@ -20,10 +18,9 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from heli_jax import stages
-from heli_jax.identification.estimation.residual import ResidualAndJacobian, differentiate
+from heli_jax.identification.estimation.residual import residual_and_jacobian
 from heli_jax.identification.estimation.simulated_flights import measured_count
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise
-from heli_jax.numerics.jitted import jitted
 
 # Units in which Levenberg-Marquardt sees the unknowns, and which unknowns may move at all.
 
@@ -68,11 +65,6 @@ def without_size(layout: Layout) -> np.ndarray:
     return np.array(linear + [False] * (layout.size - len(linear)), bool)
 
 
-def nothing_trusted(layout: Layout) -> np.ndarray:
-    """(q,) of False."""
-    return np.zeros(layout.size, bool)
-
-
 def trusted_columns(
     layout: Layout,
     evaluate: Callable[[Array], tuple[Array, Array]],
@@ -82,14 +74,10 @@ def trusted_columns(
 ) -> np.ndarray:
     """(q,) the unknowns without a size of their own whose columns are small beside the largest, and
     yet say what the residuals do.
-
-    Args:
-        layout: what stands where in z.
-        z: where.
     """
     # Of parameters of 1e6 and 1e-8 the columns differ by 1e14 for their units alone. Rounding may
     # leave as little of a column that is zero; it does not predict what the residuals do.
-    trusted = nothing_trusted(layout)
+    trusted = np.zeros(layout.size, bool)
     norms = np.linalg.norm(np.asarray(J), axis=0)
     small = (norms > 0) & (norms <= _SMALL * np.max(norms, initial=0.0)) & without_size(layout)
     for i in np.flatnonzero(small):
@@ -100,19 +88,6 @@ def trusted_columns(
             missed = np.linalg.norm(change - predicted)
         trusted[i] = bool(missed < 0.5 * np.linalg.norm(predicted))
     return trusted
-
-
-def awakened(unit: np.ndarray, J: np.ndarray, trusted: np.ndarray) -> np.ndarray:
-    """(q,) the unknowns that stayed put in a run and have an effect where it ended.
-
-    Args:
-        unit: (q,) of the run, 0 for what stayed put.
-        J: (n, q) the Jacobian at its end.
-        trusted: (q,) whose column there counts however small it is.
-    """
-    norms = np.linalg.norm(J, axis=0)
-    usable = (norms > _SMALL * np.max(norms, initial=0.0)) | trusted
-    return (unit == 0) & usable & np.isfinite(norms)
 
 
 # optimistix's Levenberg-Marquardt, with a radius for refused steps and an end of its own.
@@ -357,8 +332,15 @@ class Optimum(NamedTuple):
     """squared distance from the start in joint standard deviations; inf of several runs"""
 
 
-_SHOWN = 0.3
-"""s between two words of how far a run is: what that costs is then a few thousandths of it"""
+class _Run(NamedTuple):
+    """A run that ended, or several side by side."""
+
+    optimum: Optimum
+    unit: Array
+    """of the unknowns, 0 for one that stayed put"""
+    r: Array
+    """the residuals at the last point that was tried"""
+    J: Array
 
 
 def descend(
@@ -368,7 +350,7 @@ def descend(
     count: np.ndarray | int,
     max_steps: int,
     compiled: Compiled,
-) -> "_Run":
+) -> _Run:
     """Step until converged, from `first`, residuals and Jacobian at the start.
 
     The residuals are evaluated by the one program that evaluates them for everything else: it
@@ -390,161 +372,6 @@ def descend(
     z = compiled.point(constants, state.xi)
     optimum = _optimum(constants.scaling.residual_norm, state, z, count)
     return _Run(optimum, constants.scaling.unit, r, J)
-
-
-class _Run(NamedTuple):
-    """A run that ended, or several side by side."""
-
-    optimum: Optimum
-    unit: Array
-    """of the unknowns, 0 for one that stayed put"""
-    r: Array
-    """the residuals at the last point that was tried"""
-    J: Array
-
-
-class _Standing(NamedTuple):
-    """State of a run that evaluates its residuals itself, and from which it continues."""
-
-    k: Array
-    """steps done; of none the rest means nothing"""
-    scaling: Scaling
-    state: State
-
-
-class _Loop(NamedTuple):
-    """Such a run while it goes on."""
-
-    standing: _Standing
-    last: ResidualAndJacobian
-    """of the last point that was tried"""
-
-
-class _End(NamedTuple):
-    """End of a run, or of a part of it."""
-
-    z: Float[Array, " q"]
-    standing: _Standing
-    last: ResidualAndJacobian
-
-
-@jitted
-def _optimise_in_one_program(
-    layout: Layout,
-    data: Data,
-    noise: Noise,
-    z0: Float[Array, " q"],
-    begun: _Standing,
-    until: np.ndarray,
-    trusted: np.ndarray,
-) -> _End:
-    """`descend` from one start as one program, up to `until` steps in all; with none it evaluates
-    z0 and nothing else."""
-
-    def more(now: _Loop) -> Array:
-        return (now.standing.k < jnp.maximum(until, 1)) & ~now.standing.state.done
-
-    def step(now: _Loop) -> _Loop:
-        k, units, state = now.standing
-        tried = point(Constants(z0, units, ties_of(layout)), state.solver.y_eval)
-        e = differentiate(layout, data, noise, tried)
-        units = jax.tree.map(
-            lambda new, old: jnp.where(k == 0, new, old), scaling(e.r, e.J, trusted), units
-        )
-
-        def advanced() -> State:
-            constants = Constants(z0, units, ties_of(layout))
-            return advance(constants, state, compressed(constants, e.r, e.J))
-
-        # Where nobody steps the triangle of J, which takes longer than J, is not needed.
-        state = jax.lax.cond(until > 0, advanced, lambda: state)
-        return _Loop(_Standing(k + 1, units, state), e)
-
-    end = jax.lax.while_loop(more, step, _before_the_loop(layout, data, noise, z0, begun))
-    constants = Constants(z0, end.standing.scaling, ties_of(layout))
-    return _End(point(constants, end.standing.state.xi), end.standing, end.last)
-
-
-def _before_the_loop(
-    layout: Layout, data: Data, noise: Noise, z0: Array, begun: _Standing
-) -> _Loop:
-    # The first point is z0: until its Jacobian is known, a unit of zero goes nowhere. Evaluated
-    # before the loop it would be compiled twice, the residuals being most of the program.
-    units = Scaling(jnp.zeros_like(z0), jnp.ones((), z0.dtype))
-    fresh = _Standing(jnp.asarray(0), units, begin(Constants(z0, units, ties_of(layout))))
-    standing = jax.tree.map(lambda new, old: jnp.where(begun.k == 0, new, old), fresh, begun)
-    shapes = jax.eval_shape(lambda: differentiate(layout, data, noise, z0))
-    last = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), shapes)
-    return _Loop(standing, last)
-
-
-@functools.cache
-def _not_begun(q: int, dtype: np.dtype) -> _Standing:
-    """Return the state of a run of q unknowns before its first step, with the shapes of later ones.
-
-    An argument like any other, so that going on takes the program that began.
-    """
-
-    def shapes() -> _Standing:
-        zeros = jnp.zeros(q, dtype)
-        units = Scaling(zeros, jnp.ones((), dtype))
-        return _Standing(jnp.asarray(0), units, begin(Constants(zeros, units, zeros)))
-
-    # Of NumPy: nothing is compiled for it.
-    return jax.tree.map(lambda v: np.zeros(v.shape, v.dtype), jax.eval_shape(shapes))
-
-
-def _in_blocks(
-    problem: tuple[Layout, Data, Noise],
-    z0: Float[Array, " q"],
-    max_steps: int,
-    trusted: np.ndarray,
-    count: np.ndarray | int,
-) -> _End:
-    """A run by `_optimise_in_one_program`; where somebody looks, interrupted now and then to say
-    how far it is.
-
-    The same program with the same numbers goes on, so that the end is the same to the last bit.
-    """
-    standing, steps = _not_begun(z0.shape[0], z0.dtype), 1
-    if not stages.watched():
-        return _optimise_in_one_program(*problem, z0, standing, np.asarray(max_steps), trusted)
-    done, over = 0, False
-    while True:
-        began = time.perf_counter()
-        until = min(done + steps, max_steps)
-        end = _optimise_in_one_program(*problem, z0, standing, np.asarray(until), trusted)
-        standing, before = end.standing, done
-        done, over = int(standing.k), bool(standing.state.done)
-        cost = _optimum(standing.scaling.residual_norm, standing.state, end.z, count).cost
-        stages.advance(done - before, f"cost {float(cost):.4g}")
-        if over or done >= max_steps:
-            return end
-        # As many as take that long: the first one may have been compiled, and says nothing.
-        spent = time.perf_counter() - began
-        steps = max(1, int(_SHOWN * (done - before) / spent))
-
-
-def _in_one_program(layout: Layout) -> bool:
-    """True if a whole run is compiled as one program: worth it where the rows take no longer to
-    evaluate than a step takes to be called for, as the short recurrence of a linear model."""
-    return layout.noise_model == "white" and layout.model.linear
-
-
-def residual_and_jacobian(
-    layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
-) -> ResidualAndJacobian:
-    """`differentiate` by the program that the optimiser compiles as well.
-
-    Args:
-        layout: what stands where in z.
-    """
-    if _in_one_program(layout):
-        # An array and not a number, which would be compiled in: without steps the program of a
-        # whole run would then be another.
-        begun, none = _not_begun(z.shape[0], z.dtype), nothing_trusted(layout)
-        return _optimise_in_one_program(layout, data, noise, z, begun, np.asarray(0), none).last
-    return differentiate(layout, data, noise, z)
 
 
 @jax.jit
@@ -569,24 +396,27 @@ def optimise(
     """The least-squares optimum from z0.
 
     Args:
-        layout: what stands where in z.
-        z0: where to begin.
         held: (q,) whether an unknown stays at its start; none unless given.
         known: residuals and Jacobian at z0, where they are at hand.
     """
-    free = np.ones(layout.size, bool) if held is None else ~held
 
     def evaluate(z: Array) -> tuple[Array, Array]:
-        e = (differentiate if held is not None else residual_and_jacobian)(layout, data, noise, z)
-        return e.r, e.J
+        return residual_and_jacobian(layout, data, noise, z)[:2]
 
-    at: Any = z0  # of NumPy or JAX, which what is compiled takes alike
-    trusted, steps, stayed = nothing_trusted(layout), 0, layout.size + 1
+    free = np.ones(layout.size, bool) if held is None else ~held
+    count, ties = measured_count(data), ties_of(layout)
+    z = jnp.asarray(z0)
+    trusted, steps, stayed = np.zeros(layout.size, bool), 0, layout.size + 1
     while True:
-        limits = _Limits(max_steps - steps, trusted, held)
-        run = _run(layout, data, noise, at, limits, known)
-        known = None
-        steps, at = steps + int(run.optimum.steps), run.optimum.z
+        first = known or evaluate(z)
+        known, (r, J) = None, first
+        # A column of zeros has no unit, and what has none stays.
+        units = scaling(r, jnp.where(free[None, :], J, 0.0), trusted)
+        # Initial states alone, from far off: shortened steps end in the next valley (as of a
+        # pendulum near the top of its swing).
+        constants = Constants(z, units, ties, jnp.asarray(held is None))
+        run = descend(evaluate, constants, first, count, max_steps - steps, SINGLE)
+        steps, z = steps + int(run.optimum.steps), run.optimum.z
         stay = (np.asarray(run.unit) == 0) & free
         # Each further run has to move an unknown more, so that there are few of them.
         if not (0 < stay.sum() < stayed and steps < max_steps and bool(run.optimum.converged)):
@@ -594,58 +424,11 @@ def optimise(
         # An unknown without effect at the start may have one here, such as the time constant
         # behind a gain that began at zero; the units of a run are those of its start.
         stayed = int(stay.sum())
-        trusted = trusted | trusted_columns(layout, evaluate, at, run.r, run.J)
-        if not (awakened(np.asarray(run.unit), np.asarray(run.J), trusted) & free).any():
+        trusted = trusted | trusted_columns(layout, evaluate, z, run.r, run.J)
+        norms = np.linalg.norm(np.asarray(run.J), axis=0)
+        usable = (norms > _SMALL * np.max(norms, initial=0.0)) | trusted
+        if not (stay & usable & np.isfinite(norms)).any():
             break
     with np.errstate(all="ignore"):  # a run that diverged moved by no number
-        moved = np.sum((np.asarray(run.J) @ (np.asarray(at) - np.asarray(z0))) ** 2)
+        moved = np.sum((np.asarray(run.J) @ (np.asarray(z) - np.asarray(z0))) ** 2)
     return run.optimum._replace(steps=np.asarray(steps), moved=moved)
-
-
-class _Limits(NamedTuple):
-    """Limits of one run."""
-
-    steps: int
-    """that are left"""
-    trusted: np.ndarray
-    """(q,) the unknowns that may move however small their column is"""
-    held: np.ndarray | None
-    """(q,) those that stay"""
-
-
-def _run(
-    layout: Layout,
-    data: Data,
-    noise: Noise,
-    z0: Float[Array, " q"],
-    limits: _Limits,
-    known: tuple[Array, Array] | None = None,
-) -> _Run:
-    """One run, in the units of its start.
-
-    Args:
-        layout: what stands where in z.
-        z0: where to begin.
-        known: residuals and Jacobian at z0, where they are at hand.
-    """
-    (max_steps, trusted, held), count = limits, measured_count(data)
-    if _in_one_program(layout) and held is None:
-        end = _in_blocks((layout, data, noise), z0, max_steps, trusted, count)
-        _, units, state = end.standing
-        optimum = _optimum(units.residual_norm, state, end.z, count)
-        return _Run(optimum, units.unit, end.last.r, end.last.J)
-
-    def evaluate(z: Array) -> tuple[Array, Array]:
-        e = differentiate(layout, data, noise, z)
-        return e.r, e.J
-
-    first = known or evaluate(z0)
-    r0, J0 = first
-    if held is not None:
-        # A column of zeros has no unit, and what has none stays.
-        J0 = jnp.where(held[None, :], jnp.zeros_like(J0), J0)
-    constants = Constants(jnp.asarray(z0), scaling(r0, J0, trusted), ties_of(layout))
-    # Initial states alone, from far off: shortened steps end in the next valley (as of a pendulum
-    # near the top of its swing).
-    constants = constants._replace(with_radius=jnp.asarray(held is None))
-    return descend(evaluate, constants, first, count, max_steps, SINGLE)

@@ -19,15 +19,13 @@ from heli_jax.identification.estimation.levenberg_marquardt import (
     BATCHED,
     Constants,
     Optimum,
-    Scaling,
     descend,
-    residual_and_jacobian,
     scaling,
     ties_of,
     trusted_columns,
 )
 from heli_jax.identification.estimation.output_error import OutputError
-from heli_jax.identification.estimation.residual import differentiate, prior_rows, weak_rows
+from heli_jax.identification.estimation.residual import prior_rows, residual_and_jacobian, weak_rows
 from heli_jax.identification.estimation.simulated_flights import driven, measured_counts
 from heli_jax.identification.unknowns.layout import (
     Data,
@@ -81,9 +79,6 @@ class FusedRuns:
     def __init__(self, layout: Layout, data: Data, noise: Noise, own: Own) -> None:
         """Translate and compile, or take what was compiled for the same.
 
-        Args:
-            own: what of the records each run has of its own.
-
         Raises:
             UnsupportedError: this has no such program.
         """
@@ -97,13 +92,9 @@ class FusedRuns:
         self._parts = _compiled(layout, structure, kinds, own)
 
     def __call__(self, data: Data, z: Array) -> tuple[Array, Array]:
-        """Rows (b, n) and Jacobians (b, n, q): of each run those of a triangle that stands for its
-        measurements, then those of the priors.
-
-        Args:
-            data: the numbers of the problem; all of it has a leading axis (b,).
-            z: the unknowns (b, q).
-        """
+        """Rows (b, n) and Jacobians (b, n, q) at unknowns (b, q): of each run those of a triangle
+        that stands for its measurements, then those of the priors. All of `data` has a leading axis
+        (b,)."""
         triangle = _triangles(self._sums(data, np.asarray(z)))
         r, J = _priors(self._layout, data, z)
         rows = jnp.concatenate([jnp.asarray(triangle[:, :, 0], z.dtype), r], axis=1)
@@ -332,12 +323,8 @@ def _batch(
     layout: Layout, data: Data, noise: Noise, z: Float[Array, "b q"]
 ) -> tuple[Float[Array, "b n"], Float[Array, "b n q"]]:
     """Residuals and Jacobians of a batch; all of `data` has a leading axis too."""
-
-    def single(data: Data, z: Array) -> tuple[Array, Array]:
-        e = differentiate(layout, data, noise, z)
-        return e.r, e.J
-
-    return jax.vmap(single)(data, z)
+    each = jax.vmap(lambda data, z: residual_and_jacobian(layout, data, noise, z)[:2])
+    return each(data, z)
 
 
 def optimise_many(
@@ -350,13 +337,17 @@ def optimise_many(
     """Return the optima (k, ...) of many records, each searched from one optimum.
 
     Args:
-        reached: that optimum; its Jacobian gives the units of all runs.
         data: makes the numbers of one run out of its slice of `each`.
         each: what differs between the runs, a pytree of arrays (k, ...).
         say: called with a sentence where many runs are no programs of machine code.
     """
     layout, noise = reached.layout, reached.noise
-    units = _units_at(reached)
+    r, J = residual_and_jacobian(*reached)[:2]
+
+    def at(z: Array) -> tuple[Array, Array]:
+        return residual_and_jacobian(layout, reached.data, noise, z)[:2]
+
+    units = scaling(r, J, trusted_columns(layout, at, reached.z, r, J))
     fused = _fused(reached, data, each, say) if k >= _MANY else None
     batch, optima = min(_BATCH if fused is None else _SIDE_BY_SIDE, k), []
     z0 = jnp.tile(reached.z[None, :], (batch, 1))
@@ -401,15 +392,3 @@ def _fused(
             f"there is no translation of {e}"
         )
         return None
-
-
-def _units_at(reached: Solution) -> Scaling:
-    """The units of runs that begin near an optimum."""
-    layout, data, noise, z = reached
-
-    def evaluate(z: Array) -> tuple[Array, Array]:
-        e = residual_and_jacobian(layout, data, noise, z)
-        return e.r, e.J
-
-    r, J = evaluate(z)
-    return scaling(r, J, trusted_columns(layout, evaluate, z, r, J))

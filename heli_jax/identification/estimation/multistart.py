@@ -1,6 +1,6 @@
 """Runs of the optimiser from one or several starts, within bounds."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -76,49 +76,41 @@ class Search:
             progress: called with a sentence after each of several starts.
             known: residuals and Jacobian at the first start, where they are at hand.
         """
-        points = np.asarray(points)
-        runs = self._run(self.layout, noise, points, progress, known)
-        # An optimiser can converge where the model explains nothing: its gradient is zero there.
-        runs = [self._better_than_nothing(run, noise) for run in runs]
-        runs = [run._replace(z=jnp.asarray(run.z)) for run in runs]
-        if self.bounded.kinds == self.layout.kinds:
-            return runs
-        # A run that left its bounds starts again in coordinates that cannot leave them.
-        left = [i for i, run in enumerate(runs) if not self._inside(run.z)]
-        if left:
-            starts = np.stack([self._convert(points[i], self.layout, self.bounded) for i in left])
-            again = self._run(self.bounded, noise, starts, progress)
-            for i, run in zip(left, again, strict=True):
-                runs[i] = run._replace(z=self._convert(run.z, self.bounded, self.layout))
-        return runs
-
-    def _run(
-        self,
-        layout: Layout,
-        noise: Noise,
-        points: np.ndarray,
-        progress: Progress | None,
-        known: tuple[Array, Array] | None = None,
-    ) -> list[Optimum]:
         # One after another: on two cores a vmap over the starts, which goes on until the slowest
         # has converged, took four times as long as this, and had to be compiled besides.
         runs = []
-        for i in range(points.shape[0]):
-            optimum = optimise(
-                layout,
-                self.data,
-                noise,
-                points[i],
-                self.max_steps,
-                held=self._held,
-                known=known if i == 0 else None,
+        for i, z in enumerate(np.asarray(points)):
+            runs.append(self._run(noise, z, known if i == 0 else None))
+            if progress is not None and len(points) > 1:
+                progress(f"{i + 1} of {len(points)} starts done")
+        return runs
+
+    def _run(self, noise: Noise, start: np.ndarray, known: tuple[Array, Array] | None) -> Optimum:
+        def optimum(layout: Layout, z: Array | np.ndarray) -> Optimum:
+            first = known if layout is self.layout else None
+            end = optimise(
+                layout, self.data, noise, z, self.max_steps, held=self._held, known=first
             )
             # z stays on the device, from where the next program takes it.
-            run = jax.device_get(optimum)._replace(z=optimum.z)
-            runs.append(run)
-            if progress is not None and points.shape[0] > 1:
-                progress(f"{i + 1} of {points.shape[0]} starts done")
-        return runs
+            return jax.device_get(end)._replace(z=jnp.asarray(end.z))
+
+        run = optimum(self.layout, start)
+        # An optimiser can converge where the model explains nothing: its gradient is zero there.
+        # The cost is a mean over the measured numbers, as that of no model is.
+        if not run.cost <= _GOOD:
+            nothing = self.misfit_of_nothing(noise) / measured_count(self.data)
+            run = run._replace(converged=run.converged & (run.cost <= 1.5 * nothing + _GOOD))
+        values = named_values(self.layout, self.data, run.z)
+        left = [
+            n
+            for n, f in self.problem.free.items()
+            if np.isfinite(values[n]) and not coordinates.inside(f, values[n])
+        ]
+        if not left or self.bounded.kinds == self.layout.kinds:
+            return run
+        # A run that left its bounds starts again in coordinates that cannot leave them.
+        run = optimum(self.bounded, self._convert(start, self.layout, self.bounded))
+        return run._replace(z=self._convert(run.z, self.bounded, self.layout))
 
     @property
     def _held(self) -> np.ndarray | None:
@@ -130,44 +122,16 @@ class Search:
             return None
         return np.arange(layout.size) >= layout.first_nuisance
 
-    def _better_than_nothing(self, run: Optimum, noise: Noise) -> Optimum:
-        """Mark a run that ends worse than no model at all as not converged."""
-        if run.cost <= _GOOD:
-            return run
-        # The cost is a mean over the measured numbers, so this is one too.
-        nothing = self.misfit_of_nothing(noise) / measured_count(self.data)
-        return run._replace(converged=run.converged & (run.cost <= 1.5 * nothing + _GOOD))
-
     def misfit_of_nothing(self, noise: Noise) -> float:
         """Return the sum of squares of a model without any response."""
-        power = [
-            float(np.nansum(np.square(np.asarray(y) / np.asarray(s[n]))))
-            for flight, s in zip(self.data.flights, noise.sd, strict=True)
-            for n, y in flight.outputs.items()
-        ]
-        return sum(power)
-
-    def variation(self, noise: Noise) -> float:
-        """Return the sum of squares about the outputs' means."""
-        return sum(
-            float(np.nansum(np.square((y - np.nanmean(y)) / np.asarray(s[n]))))
-            for flight, s in zip(self.data.flights, noise.sd, strict=True)
-            for n, y in ((n, np.asarray(y)) for n, y in flight.outputs.items())
-        )
-
-    def _inside(self, z: Array) -> bool:
-        values = named_values(self.layout, self.data, z)
-        return all(
-            not np.isfinite(v) or coordinates.inside(f, float(v))
-            for f, v in zip(self.problem.free.values(), values.values(), strict=True)
-        )
+        return sum_of_squares([f.outputs for f in self.data.flights], noise)
 
     def _convert(self, z: Array | np.ndarray, old: Layout, new: Layout) -> Array:
         """The same point in another layout's coordinates; a value at a bound is moved inside."""
         z = jnp.asarray(z)
-        for i, (free, value) in enumerate(
-            zip(self.problem.free.values(), named_values(old, self.data, z).values(), strict=True)
-        ):
+        values = named_values(old, self.data, z)
+        for i, (name, free) in enumerate(self.problem.free.items()):
+            value = values[name]
             low, high = (float(b) for b in coordinates.limits(free))
             if np.isfinite(low) and np.isfinite(high):
                 # At a bound itself the bounded coordinate is infinite.
@@ -177,6 +141,16 @@ class Search:
             x = jnp.asarray(value, z.dtype)
             z = z.at[i].set(coordinates.to_coordinate(new.kinds[i], x, *limits))
         return z
+
+
+def sum_of_squares(signals: Sequence[Mapping[str, Array | np.ndarray]], noise: Noise) -> float:
+    """Return the sum of squares of signals (N,) by flight and output, over the sd of their noise;
+    NaN is missing."""
+    return sum(
+        float(np.nansum(np.square(np.asarray(y) / np.asarray(sd[n]))))
+        for by_output, sd in zip(signals, noise.sd, strict=True)
+        for n, y in by_output.items()
+    )
 
 
 def named_values(

@@ -1,6 +1,6 @@
 """Measurement noise: a first guess, then relaxation with the optimum."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -78,9 +78,6 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
     """Alternate between the optimum and the noise until one of them stays.
 
     Source: relaxation of the noise covariance, Jategaonkar (2006), section 4.4.
-
-    Args:
-        noise: that `best` was found with.
     """
     layout, objective = search.layout, search.layout.objective
     trace = [(int(best.steps), float(best.cost))]
@@ -99,7 +96,12 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
         # A search that failed with one noise is not repeated with another.
         if change < _UNCHANGED or moved < _SETTLED or not (moves and bool(best.converged)):
             break
-        [best] = search.run(noise, _without_nuisances(layout, best.z)[None])
+        begin = np.array(best.z)
+        # Nuisances have no part in the rows of a spectrum: their weak priors alone would be a
+        # misfit. A model that is not linear is linearised where they put it.
+        if layout.noise_model == "spectrum" and layout.model.linear:
+            begin[layout.first_nuisance :] = 0.0
+        [best] = search.run(noise, begin[None])
         trace.append((int(best.steps), float(best.cost)))
         moved = float(best.moved) ** 0.5
     else:
@@ -116,16 +118,6 @@ def _changed(noise: Noise, new: Noise) -> float:
         for n in before
     )
     return change + slopes_changed(noise, new) + float(own_changed(noise, new))
-
-
-def _without_nuisances(layout: Layout, z: Float[Array, " q"]) -> Float[np.ndarray, " q"]:
-    """z where a search goes by rows that nuisances have no part in, in which their weak priors
-    alone would be a misfit."""
-    # A model that is not linear is linearised where they put it.
-    without = np.array(z)
-    if layout.noise_model == "spectrum" and layout.model.linear:
-        without[layout.first_nuisance :] = 0.0
-    return without
 
 
 def relaxed_from(search: Search, noise: Noise, z: Float[Array, " q"]) -> RelaxedOptimum:
@@ -156,7 +148,7 @@ def gain_left(
     r: Float[np.ndarray, " n"],
     J: Float[np.ndarray, "n q"],
     parameters: int,
-    at_bound: Collection[int] = (),
+    at_bound: Sequence[int] = (),
 ) -> float | None:
     """The share of the sum of squares that a modest step would take away, where that is so much
     that no optimiser can have converged; None where it is not.

@@ -29,11 +29,7 @@ def free_scales(model_scales: tuple[str, ...], free: Container[str]) -> tuple[st
 
 
 def not_attenuating(layout: Layout, noise: Noise, u: Unknowns) -> Array | float:
-    """Return the derivative of the sum of log s by the scale errors, which is taken off.
-
-    Args:
-        noise: with the derivatives of the last relaxation; none yet: zero.
-    """
+    """Return what of the sum of log s comes by the scale errors, which is taken off."""
     names = free_scales(layout.model.input_scales, u.params)
     if not names or not len(noise.scale_slopes):
         return 0.0
@@ -41,12 +37,8 @@ def not_attenuating(layout: Layout, noise: Noise, u: Unknowns) -> Array | float:
 
 
 def slopes_at(layout: Layout, noise: Noise, e: Evaluation, last: int) -> Any:
-    """The derivatives of the sum of log s by the scale errors (k,), () where there are none.
-
-    Args:
-        noise: that `e` was evaluated with.
-        last: which row it is whose square is that sum, but for a constant and what is taken off.
-    """
+    """The derivatives of the sum of log s by the scale errors (k,), () where there are none. The
+    square of row `last` is that sum, but for a constant and what is taken off."""
     names = free_scales(layout.model.input_scales, layout.of_interest)
     if not names or not len(noise.scale_slopes):
         return noise.scale_slopes
@@ -131,11 +123,7 @@ def own_at(
     layout: Layout, data: Data, noise: Noise, e: Evaluation, z: Float[Array, " q"], measured: int
 ) -> dict[str, np.ndarray] | tuple[()]:
     """By parameter of the own process noise the derivative of log det J'J by its logarithm, and
-    that logarithm; () where there is none.
-
-    Args:
-        noise: that `e` was evaluated with.
-    """
+    that logarithm; () where there is none."""
     if not noise.own:
         return noise.own
     here, slopes = _log_det(layout, noise, e.J, measured), {}

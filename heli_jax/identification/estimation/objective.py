@@ -87,12 +87,8 @@ class Objective(abc.ABC):
 
     @abc.abstractmethod
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
-        """Return the whitened rows of the measurements; traced, and differentiated forwards.
-
-        Args:
-            noise: the rows are divided by it.
-            u: the unknowns, in the units of the model.
-        """
+        """Return the rows of the measurements, divided by the noise; traced, and differentiated
+        forwards."""
 
     def tags(self, layout: Layout, data: Data, count: int) -> RowTags:
         """Return what the first `count` rows are: all that `residuals` returns."""
@@ -110,12 +106,8 @@ class Objective(abc.ABC):
     # Its noise.
 
     def first_noise(self, problem: Problem, noise: Noise, flights: Sequence[Flight]) -> Noise:
-        """Return the first guess of the noise as the method needs it.
-
-        Args:
-            noise: standard deviations by flight and output.
-            flights: those fitted, or those held out.
-        """
+        """Return the first guess of the noise as the method needs it, from standard deviations by
+        flight and output; of flights that are fitted or held out."""
         return noise
 
     def noise_at_start(self, layout: Layout, data: Data, e: Evaluation, noise: Noise) -> Noise:
@@ -194,14 +186,8 @@ class Objective(abc.ABC):
 
     @abc.abstractmethod
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
-        """Return by flight and output the signals without bias and noise: (N,), or (runs, N) where
-        a disturbance is drawn.
-
-        Args:
-            u: the unknowns at `reached`.
-            runs: how many records are drawn.
-            seed: of the draw.
-        """
+        """Return by flight and output the signals without bias and noise at `reached`, where the
+        unknowns are u: (N,), or (runs, N) where a disturbance is drawn."""
 
     def expected_error(
         self, layout: Layout, data: Data, noise: Noise, e: Evaluation, z: Array
@@ -211,11 +197,8 @@ class Objective(abc.ABC):
         return None
 
     def ill_conditioned(self, problem: Problem, e: Evaluation, sd: dict[str, float]) -> bool:
-        """Return True if the numbers at the optimum are rounding.
-
-        Args:
-            sd: of the measurement noise, SI, by 'flight/output'.
-        """
+        """Return True if the numbers at the optimum are rounding; sd of the measurement noise, SI,
+        by 'flight/output'."""
         return False
 
     def response_agreement(
@@ -227,12 +210,8 @@ class Objective(abc.ABC):
     def findings(
         self, at: Solution, e: Evaluation, names: Sequence[str], ill: bool
     ) -> list[Finding]:
-        """Return what a reader should know of the method's own assumptions.
-
-        Args:
-            names: of the flights.
-            ill: True if the numbers are rounding.
-        """
+        """Return what a reader should know of the method's own assumptions; `ill` if the numbers
+        are rounding."""
         return []
 
 

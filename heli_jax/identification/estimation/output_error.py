@@ -15,7 +15,6 @@ from heli_jax.identification.estimation.objective import Objective
 from heli_jax.identification.estimation.residual import Residuals
 from heli_jax.identification.estimation.simulated_flights import (
     Run,
-    joined_biases,
     measured_signals,
     predict,
     signal_numbers,
@@ -28,29 +27,21 @@ class OutputError(Objective):
     """The simulation, driven by the logged inputs alone, against the measured outputs."""
 
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
-        """Signal after signal; with windows the defects between them follow.
-
-        Args:
-            u: the unknowns, in the units of the model.
-        """
+        """Signal after signal; with windows the defects between them follow."""
         # No measurement enters the simulation: that keeps the estimates free of a bias by output
         # noise, which equation error has, and is why gusts are taken for noise.
         runs = predict(layout, data, u)
         y, sd = measured_signals(layout, data, noise)
         simulated = jnp.concatenate([run.outputs.reshape(-1) for run in runs])
-        error = y - joined_biases(u)[signal_numbers(layout, data)] - simulated
+        biases = jnp.stack([b for by_output in u.biases for b in by_output.values()])
+        error = y - biases[signal_numbers(layout, data)] - simulated
         # A missing sample says nothing: its row is zero, and so is its derivative. Left out it
         # would change the shapes, and with them the program, from record to record.
         rows = jnp.where(jnp.isfinite(y), error, 0.0) / sd
         return Residuals(jnp.concatenate([rows, *_defects(layout, data, u, runs)]), runs)
 
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
-        """The simulated flights: with no disturbance all runs are the same.
-
-        Args:
-            reached: where the fit ended.
-            runs: how many records; one simulation serves them all.
-        """
+        """The simulated flights: with no disturbance all runs are the same."""
         layout = reached.layout
         simulated = predict(layout, reached.data, u)
         return [

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from heli_jax.identification.estimation.kalman import Innovations
 from heli_jax.identification.estimation.simulated_flights import Run, SimulatedOutputs, outputs_of
@@ -34,112 +34,77 @@ class Residuals(NamedTuple):
 # the rows that each can reach.
 
 
-class _Columns(NamedTuple):
-    """Direction of each unknown, and where it has an effect (-1 everywhere)."""
-
-    colour: np.ndarray
-    window: np.ndarray
-    bias: np.ndarray
-    flight: np.ndarray
-    """of an input's offset its flight, else -1"""
+_NONE = -2
+"""no group of unknowns, beside the number of a window, a signal or a flight"""
 
 
-def seeded(layout: Layout) -> np.ndarray | None:
-    """Return directions of differentiation (q, colours); None if each unknown has its own."""
+def _colours(layout: Layout) -> tuple[Int[np.ndarray, " q"], Int[np.ndarray, " q"]] | None:
+    """Return the direction of each unknown, and the group of rows in which it has an effect (-1 for
+    all rows); None if each unknown has its own direction.
+
+    Groups are the windows, then the signals, then the flights.
+    """
     # One window has no neighbour to share directions with. All rows of a filter hang on every
     # unknown, through the scale that is concentrated out.
-    if layout.noise_model != "white" or sum(count for count, _ in layout.windows) < 2:
+    windows = sum(count for count, _ in layout.windows)
+    if layout.noise_model != "white" or windows < 2:
         return None
-    colour = _columns(layout).colour
-    seeds = np.zeros((layout.size, int(colour.max()) + 1))
-    seeds[np.arange(layout.size), colour] = 1.0
-    return seeds
-
-
-def _columns(layout: Layout) -> _Columns:
     states, shared = len(layout.states), layout.first_nuisance
     outputs = sorted({n for names in layout.outputs for n in names})
     # Parameters have an effect in every row: each has its own direction.
-    colour = np.arange(layout.size)
-    window, bias, flight = np.full((3, layout.size), -1)
-    number, first_bias = 0, 0
+    colour, group = np.arange(layout.size), np.full(layout.size, -1)
+    window, signal = 0, windows
     each = zip(flight_places(layout), layout.outputs, strict=True)
-    for f, (places, names) in enumerate(each):
+    for f, (places, names) in enumerate(each, windows + sum(map(len, layout.outputs))):
         k = np.arange(len(places.states))[:, None]
         # A defect hangs on the window before it and the one after: two sets of directions.
         side = k % 2 if layout.continuity is not None else 0
         colour[places.states] = shared + side * states + np.arange(states)
-        window[places.states] = number + k
+        group[places.states] = window + k
         # Windows and outputs of other flights share these directions: no row hangs on both.
         if layout.bias:
-            colour[places.biases] = (
-                shared + 2 * states + np.array([outputs.index(n) for n in names])
-            )
-            bias[places.biases] = first_bias + np.arange(len(names))
+            at = np.array([outputs.index(n) for n in names])
+            colour[places.biases] = shared + 2 * states + at
+            group[places.biases] = signal + np.arange(len(names))
         colour[places.offsets] = shared + 2 * states + len(outputs) + np.arange(len(layout.offsets))
-        flight[places.offsets] = f
-        number, first_bias = number + len(k), first_bias + len(names)
-    _, packed = np.unique(colour, return_inverse=True)
-    return _Columns(packed, window, bias, flight)
+        group[places.offsets] = f
+        window, signal = window + len(k), signal + len(names)
+    return np.unique(colour, return_inverse=True)[1], group
 
 
-class _Reach(NamedTuple):
-    """Window, signal and flight of each row of the measurements (-2 for none)."""
-
-    window: np.ndarray
-    next_window: np.ndarray
-    """the window after a defect, else -2"""
-    signal: np.ndarray
-    flight: np.ndarray
-
-
-def _reach(layout: Layout, data: Data) -> _Reach:
-    """Return them in the order of `OutputError.residuals`: signal after signal, then defects."""
-    window, signals, flights = [], [], []
-    first, signal = 0, 0
+def _groups_of_rows(layout: Layout, data: Data) -> Int[np.ndarray, "4 n"]:
+    """Return the groups that each row of the measurements belongs to: its window, for a defect the
+    window after it, its signal and its flight; in the order of `OutputError.residuals`."""
+    rows, defects = [], []
+    window, signal = 0, sum(count for count, _ in layout.windows)
     each = zip(data.flights, layout.windows, layout.outputs, strict=True)
-    for f, (flight, (count, m), names) in enumerate(each):
+    for f, (flight, (count, m), names) in enumerate(each, signal + sum(map(len, layout.outputs))):
         for name in names:
-            n = flight.outputs[name].shape[0]
-            flights.append(np.full(n, f))
-            window.append(first + np.arange(n) // m)
-            signals.append(np.full(n, signal))
+            own = window + np.arange(flight.outputs[name].shape[0]) // m
+            rows.append(np.stack(np.broadcast_arrays(own, _NONE, signal, f)))
             signal += 1
-        first += count
-    following = [np.full(w.size, -2) for w in window]
-    first = 0
-    for f, (count, _) in enumerate(layout.windows):
-        if layout.continuity is not None and count > 1:
-            defects = np.repeat(first + np.arange(count - 1), len(layout.states))
-            window.append(defects)
-            following.append(defects + 1)
+        if layout.continuity is not None:
             # No bias has an effect on a defect of the states.
-            signals.append(np.full(defects.size, -2))
-            flights.append(np.full(defects.size, f))
-        first += count
-    return _Reach(*(np.concatenate(v) for v in (window, following, signals, flights)))
+            own = np.repeat(window + np.arange(count - 1), len(layout.states))
+            defects.append(np.stack(np.broadcast_arrays(own, own + 1, _NONE, f)))
+        window += count
+    return np.concatenate([*rows, *defects], axis=1)
 
 
-def spread_out(layout: Layout, data: Data, along: Float[Array, "n c"]) -> Float[Array, "n q"]:
+def _spread_out(
+    layout: Layout, data: Data, along: Float[Array, "n c"], colour: np.ndarray, group: np.ndarray
+) -> Float[Array, "n q"]:
     """Return the whole Jacobian from the derivatives along the colours."""
     # A derivative along a direction is the sum over its unknowns, of which each row hangs on one.
-    columns, reach = _columns(layout), _reach(layout, data)
-    shared = (columns.window < 0) & (columns.bias < 0) & (columns.flight < 0)
-    # Numbers below zero never meet: rows have -2 where unknowns have -1.
-    felt = (
-        jnp.asarray(shared)[None, :]
-        | (jnp.asarray(reach.window)[:, None] == jnp.asarray(columns.window)[None, :])
-        | (jnp.asarray(reach.next_window)[:, None] == jnp.asarray(columns.window)[None, :])
-        | (jnp.asarray(reach.signal)[:, None] == jnp.asarray(columns.bias)[None, :])
-        | (jnp.asarray(reach.flight)[:, None] == jnp.asarray(columns.flight)[None, :])
-    )
+    shared = jnp.asarray(group < 0)
+    felt = shared[None, :]
+    for own in _groups_of_rows(layout, data):
+        felt = felt | (jnp.asarray(own)[:, None] == jnp.asarray(group)[None, :])
     # Priors are of the parameters; each weak prior is of its own unknown.
-    nuisances = jnp.arange(layout.size - layout.first_nuisance)[:, None] + layout.first_nuisance
-    of_itself = nuisances == jnp.arange(layout.size)[None, :]
-    prior = jnp.broadcast_to(jnp.asarray(shared)[None, :], (len(layout.free), layout.size))
-    kept = jnp.concatenate([felt, prior, of_itself])
+    prior = jnp.broadcast_to(shared[None, :], (len(layout.free), layout.size))
+    kept = jnp.concatenate([felt, prior, jnp.eye(layout.size, dtype=bool)[layout.first_nuisance :]])
     assert kept.shape[0] == along.shape[0], (kept.shape, along.shape)
-    return jnp.where(kept, along[:, jnp.asarray(columns.colour)], 0.0)
+    return jnp.where(kept, along[:, jnp.asarray(colour)], 0.0)
 
 
 def prior_rows(layout: Layout, data: Data, z: Float[Array, " q"]) -> Float[Array, " r"]:
@@ -181,7 +146,7 @@ class ResidualAndJacobian(NamedTuple):
 
 
 @jitted
-def differentiate(
+def residual_and_jacobian(
     layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
 ) -> ResidualAndJacobian:
     """Residuals and their Jacobian in forward mode, in one pass."""
@@ -192,18 +157,17 @@ def differentiate(
         r, residuals = _all_rows(layout, data, noise, z)
         return r, (r, residuals.runs, residuals.innovations)
 
-    seeds = seeded(layout)
-    if seeds is None:
-        J, (r, runs, innovations) = jax.jacfwd(rows, has_aux=True)(z)
-    else:
+    def along(v: Array) -> Any:
+        return jax.jvp(rows, (z,), (v,), has_aux=True)
 
-        def along(v: Array) -> Any:
-            return jax.jvp(rows, (z,), (v,), has_aux=True)
-
-        # Several unknowns a direction, each felt by rows of its own: see jacobian_coloring.
-        directions = jnp.asarray(seeds.T, z.dtype)
-        # The residuals are the same for all directions: with None vmap computes them once.
-        r, J, (_, runs, innovations) = jax.vmap(along, out_axes=(None, -1, None))(directions)
-        J = spread_out(layout, data, J)
+    directions, colours = jnp.eye(layout.size, dtype=z.dtype), _colours(layout)
+    if colours is not None:
+        # Several unknowns a direction, each felt by rows of its own.
+        directions = jnp.zeros_like(directions).at[colours[0], np.arange(layout.size)].set(1.0)
+        directions = directions[: colours[0].max() + 1]
+    # The residuals are the same for all directions: with None vmap computes them once.
+    r, J, (_, runs, innovations) = jax.vmap(along, out_axes=(None, -1, None))(directions)
+    if colours is not None:
+        J = _spread_out(layout, data, J, *colours)
     simulated = None if runs is None else outputs_of(unpack(layout, data, z), runs)
     return ResidualAndJacobian(r, J, innovations, simulated)

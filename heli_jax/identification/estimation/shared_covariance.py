@@ -219,11 +219,7 @@ def _riccati_jvp(primals: Any, tangents: Any) -> Any:
 
 @jax.custom_jvp
 def recurrence(F: Array, forcing: Array, x0: Array) -> tuple[Array, Array]:
-    """x[k+1] = F x[k] + forcing[k]: x after the last of K samples, and x (K, m, n) at all of them.
-
-    Args:
-        forcing: (K, m, n), of m records.
-    """
+    """x[k+1] = F x[k] + forcing[k]: x after the last of K samples, and x (K, m, n) at all."""
     return jax.lax.scan(lambda x, f: (x @ F.T + f, x), x0, forcing)
 
 
@@ -246,7 +242,8 @@ def innovations_together(
     system, U, acting = _system(layout, drives, noise, u, group)
     dtype = U.dtype
     y = jnp.stack([_columns([by_name[n] for by_name in measured]) for n in names], axis=2)
-    x0 = jnp.stack([_first_state(layout, drive, dtype) for drive in drives])
+    starts = [layout.model.initial_state(d.params) if d.state is None else d.state for d in drives]
+    x0 = jnp.stack([naming.ravel(start, dtype) for start in starts])
     error, variance = filtered_records(system, Records(U, acting, y, x0))
     # Shorter records were filled up behind their end. A filter only looks back, so nothing of that
     # reaches the samples before it.
@@ -281,25 +278,13 @@ def _system(
     _, _, C, D = jacobians(model, params)
     rows = np.asarray([naming.names(model.Outputs).index(n) for n in names])
     Q = process_noise(model, params, dt)
-    # The scales are unknowns of the fit and common to all flights, so they may stand in R.
-    R = jnp.square(_shared_sd(noise, u, names, group))
-    P0 = first_covariance(model, params, Ad.dtype)
-    return Gaussian(Ad, B, C[rows], D[rows], Q, R, P0), U, acting
-
-
-def _shared_sd(
-    noise: Noise, u: Unknowns, names: tuple[str, ...], group: tuple[int, ...]
-) -> Float[Array, " p"]:
-    """The sd of the measurement noise; NaN if it is not the same in all flights of the group."""
     by_flight = jnp.stack([jnp.stack([noise.sd[i][n] for n in names]) for i in group])
     # No number at all is better than one of another flight's noise.
     sd = jnp.where(jnp.all(by_flight == by_flight[:1]), by_flight[0], jnp.nan)
-    return jnp.stack([measurement_sd(u, n, s) for n, s in zip(names, sd, strict=True)])
-
-
-def _first_state(layout: Layout, drive: Drive, dtype: Any) -> Float[Array, " n"]:
-    state = layout.model.initial_state(drive.params) if drive.state is None else drive.state
-    return naming.ravel(state, dtype)
+    # The scales are unknowns of the fit and common to all flights, so they may stand in R.
+    R = jnp.square(jnp.stack([measurement_sd(u, n, s) for n, s in zip(names, sd, strict=True)]))
+    P0 = first_covariance(model, params, Ad.dtype)
+    return Gaussian(Ad, B, C[rows], D[rows], Q, R, P0), U, acting
 
 
 def _columns(records: Any) -> Float[Array, "N m"]:

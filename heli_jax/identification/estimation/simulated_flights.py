@@ -47,9 +47,7 @@ class SimulatedOutputs(NamedTuple):
     """Simulated outputs of the flights."""
 
     outputs: tuple[Float[Array, "p N"], ...]
-    """by flight, SI, as `Layout.outputs` orders them, without the bias"""
-    biases: Float[Array, " s"]
-    """flight after flight and output after output"""
+    """by flight, SI, as `Layout.outputs` orders them, with the bias"""
     state_rms: Float[Array, "f n"]
     """root mean square of each simulated state, by flight"""
 
@@ -114,14 +112,7 @@ def _side_by_side(
     stacked = jax.tree.map(lambda *v: jnp.concatenate(v), *each)
 
     def window(inputs: Any, known: dict[str, Any], dt: Any, state: Any) -> tuple[Any, Any]:
-        """States and outputs of one window; vmap makes them of all.
-
-        Args:
-            inputs: the model's Inputs, arrays (m,).
-            known: by name what is known of this flight alone, SI.
-            dt: [s].
-            state: the model's State at its first sample; None for the model's own.
-        """
+        """States and outputs of one window; vmap makes them of all."""
         params = layout.model.Params(**{**data.base, **u.params, **u.noise, **known})
         # Any member's number will do: the inputs of all of them move alike between samples.
         late = delays_of(layout.model, params, u.shift, dt)
@@ -143,11 +134,7 @@ def _side_by_side(
         windows = slice(first, first + count)
 
         def joined(v: Array, windows: slice = windows, n: int = n) -> Array:
-            """One flight's windows end to end.
-
-            Args:
-                v: (signals, windows, samples) of all flights.
-            """
+            """One flight's windows end to end, of signals (signals, windows, samples)."""
             # The sample after these m is the next window's first; past n stand repetitions.
             return v[:, windows, :m].reshape(v.shape[0], -1)[:, :n]
 
@@ -182,11 +169,6 @@ def _with_lead(inputs: Any, samples: np.ndarray, late: Delays | None) -> Any:
 
     Where inputs are late each window has the sample before its first in front, which acts there
     until the first one does: (windows, m + 1).
-
-    Args:
-        inputs: arrays (N,).
-        samples: those of each window (windows, m).
-        late: None where no input is.
     """
     if late is None:
         return at(inputs, samples)
@@ -199,15 +181,14 @@ def _with_lead(inputs: Any, samples: np.ndarray, late: Delays | None) -> Any:
     return jax.tree.unflatten(structure, leaves)
 
 
-def joined_biases(u: Unknowns) -> Array:
-    """The biases, flight after flight and output after output."""
-    return jnp.stack([b for bias in u.biases for b in bias.values()])
-
-
 def outputs_of(u: Unknowns, runs: tuple[Run, ...]) -> SimulatedOutputs:
     """Return the simulated outputs with their biases, as reports show them."""
     rms = [jnp.sqrt(jnp.mean(jnp.square(run.states), axis=1)) for run in runs]
-    return SimulatedOutputs(tuple(run.outputs for run in runs), joined_biases(u), jnp.stack(rms))
+    with_bias = [
+        run.outputs + jnp.stack(list(bias.values()))[:, None]
+        for run, bias in zip(runs, u.biases, strict=True)
+    ]
+    return SimulatedOutputs(tuple(with_bias), jnp.stack(rms))
 
 
 @jitted
@@ -217,13 +198,11 @@ def simulated_at(layout: Layout, data: Data, z: Float[Array, " q"]) -> Simulated
     return outputs_of(u, predict(layout, data, u))
 
 
-def with_biases(layout: Layout, simulated: SimulatedOutputs) -> tuple[dict[str, np.ndarray], ...]:
-    """By flight and output what is simulated, (N,), with the bias, SI."""
-    # In the order of `joined_biases`.
-    bias = iter(simulated.biases)
+def by_output(layout: Layout, simulated: SimulatedOutputs) -> tuple[dict[str, np.ndarray], ...]:
+    """Name the simulated outputs (N,) of each flight; `simulated` is fetched from the device."""
     return tuple(
-        {n: np.asarray(y + next(bias)) for n, y in zip(names, run, strict=True)}
-        for run, names in zip(simulated.outputs, layout.outputs, strict=True)
+        {n: np.asarray(y) for n, y in zip(names, run, strict=True)}
+        for names, run in zip(layout.outputs, simulated.outputs, strict=True)
     )
 
 
@@ -257,11 +236,7 @@ def measured_signals(layout: Layout, data: Data, noise: Noise) -> tuple[Array, A
 
 
 def measurement_sd(u: Unknowns, output: str, sd: Array) -> Array:
-    """The sd of an output's white measurement noise.
-
-    Args:
-        sd: the guess of it, or what is stated.
-    """
+    """The sd of an output's white measurement noise, from what is guessed or stated."""
     sd = sd * u.scales[output] if output in u.scales else sd
     through = u.noise.get(sensor_noise(output))
     return sd if through is None else jnp.hypot(sd, _BEHIND * through)
@@ -273,7 +248,7 @@ def measured_count(data: Data) -> int:
 
 
 def measured_counts(data: Data) -> np.ndarray:
-    """The same of each record, where all of `data` has leading axes of records."""
+    """Return the same of each record, where all of `data` has leading axes of records."""
     # In NumPy, outside of what is compiled: the optimiser's program does not depend on it.
     each = [
         np.isfinite(np.asarray(y)).sum(axis=-1)

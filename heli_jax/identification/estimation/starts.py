@@ -1,7 +1,6 @@
 """Points to start a search from: coarse searches of disturbances and delays, and draws."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,11 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax.dynamics.disturbance import disturbances_of
-from heli_jax.identification.estimation.levenberg_marquardt import (
-    residual_and_jacobian,
-    without_size,
-)
-from heli_jax.identification.estimation.residual import rows_of
+from heli_jax.identification.estimation.levenberg_marquardt import without_size
+from heli_jax.identification.estimation.residual import residual_and_jacobian, rows_of
 from heli_jax.identification.estimation.simulated_flights import predict, signal_numbers
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Free, Problem
 from heli_jax.identification.unknowns import transforms
@@ -213,16 +209,13 @@ def _draw_values(free: Free, size: int, rng: np.random.Generator) -> np.ndarray:
     # keeps its sign.
     values = free.start * np.exp(width * rng.standard_normal(size))
     if transforms.changes_sign(free):
-        values = _either_sign(free, width, rng.standard_normal((2, size)))
+        # Of the start's size; about the prior's mean where there is one, which knows more.
+        drawn = rng.standard_normal((2, size))
+        values = transforms.scale(free) * np.exp(width * drawn[0]) * np.sign(drawn[1])
+        if free.prior is not None:
+            values = free.prior.mean + 2.0 * free.prior.sd * drawn[0]
     # A single bound does not shape the draw: what lies beyond it begins at the start value instead.
     return np.where([transforms.inside(free, float(v)) for v in values], values, free.start)
-
-
-def _either_sign(free: Free, width: float, drawn: np.ndarray) -> np.ndarray:
-    """Values of the start's size; about the prior's mean where there is one, which knows more."""
-    if free.prior is not None:
-        return free.prior.mean + 2.0 * free.prior.sd * drawn[0]
-    return transforms.scale(free) * np.exp(width * drawn[0]) * np.sign(drawn[1])
 
 
 # The start where a delay is free: a misfit has a valley for each period of the motion by which a
@@ -252,11 +245,8 @@ _PARTS = (1.0, 0.25, 0.06)
 """of the step, of which the first that leads down is taken"""
 
 
-class _Tried(NamedTuple):
-    """A point with its sum of squares."""
-
-    cost: float
-    z: np.ndarray
+type _Tried = tuple[float, np.ndarray]
+"""sum of squares at a point, and the point"""
 
 
 def delay_start(
@@ -265,20 +255,20 @@ def delay_start(
     data: Data,
     noise: Noise,
     z0: Float[Array, " q"],
-    known: tuple[Any, Any],
+    J: Float[np.ndarray, "n q"],
 ) -> Float[Array, " q"]:
-    """z0, or where a delay or the time shift is free the deepest valley of the misfit over it."""
+    """z0, or where a delay or the time shift is free the deepest valley of the misfit over it; J is
+    the Jacobian at z0."""
 
     def evaluate(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         at = residual_and_jacobian(layout, data, noise, jnp.asarray(z, z0.dtype))
         return np.asarray(at.r, np.float64), np.asarray(at.J, np.float64)
 
-    best = _Tried(np.inf, np.asarray(z0, np.float64))
-    for i, values in _grids(problem, layout, data, np.asarray(known[1])).items():
-        base = best.z
-        tried = [_solved(layout, evaluate, base, i, value) for value in values]
-        best = min([best, *tried], key=lambda t: t.cost)
-    return jnp.asarray(best.z, z0.dtype)
+    best = (np.inf, np.asarray(z0, np.float64))
+    for i, values in _grids(problem, layout, data, J).items():
+        tried = [_solved(layout, evaluate, best[1], i, value) for value in values]
+        best = min([best, *tried], key=lambda t: t[0])
+    return jnp.asarray(best[1], z0.dtype)
 
 
 def _grids(problem: Problem, layout: Layout, data: Data, J: np.ndarray) -> dict[int, np.ndarray]:
@@ -335,8 +325,8 @@ def _solved(
     z[i] = value
     r, J = evaluate(z)
     if not (np.isfinite(r).all() and np.isfinite(J).all()):
-        return _Tried(np.inf, z)
-    begun = _Tried(float(r @ r), z)
+        return np.inf, z
+    cost = float(r @ r)
     J = J * (np.arange(z.size) != i)
     norms = np.linalg.norm(J, axis=0)
     norms = np.where(norms > 0, norms, 1.0)
@@ -346,6 +336,6 @@ def _solved(
     step = np.where(logarithm, np.clip(step, -_FACTOR, _FACTOR), step)
     for part in _PARTS:
         r, _ = evaluate(z + part * step)
-        if np.isfinite(r).all() and r @ r < begun.cost:
-            return _Tried(float(r @ r), z + part * step)
-    return begun
+        if np.isfinite(r).all() and r @ r < cost:
+            return float(r @ r), z + part * step
+    return cost, z

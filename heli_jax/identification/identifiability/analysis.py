@@ -45,7 +45,7 @@ from heli_jax.identification.identifiability.verdict import (
 )
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.unknowns import transforms
-from heli_jax.identification.unknowns.layout import FlightUnknown, Layout, flight_unknowns
+from heli_jax.identification.unknowns.layout import Layout, flight_unknowns
 
 # From the residual's Jacobian to relative coordinates.
 
@@ -194,7 +194,15 @@ def verdict_of(
     held = np.vstack([N, rows.weak])
     shown = np.linalg.norm(held, axis=0) > _NO_EFFECT
     sensitivity = projected(np.vstack([S, np.zeros((len(rows.weak), q))]), held[:, shown])
+    # Without them. Their sds are the units of these columns, so the solution is in sds.
+    seen = np.linalg.norm(N, axis=0) > _NO_EFFECT
+    compensation = np.zeros((N.shape[1], q))
+    compensation[seen] = -np.linalg.lstsq(N[:, seen], S, rcond=NULL)[0]
     named = flight_unknowns(layout, labels(problem.training))
+    # Before those named stand the parameters of the disturbance and the noise's factors.
+    without_weak = WithoutWeakPriors(
+        projected(S, N[:, seen], NULL), compensation[N.shape[1] - len(named) :], named
+    )
     to_relative = np.asarray(e.slopes, np.float64) * [u.sign / u.reference for u in unknowns]
     if around.reported is not None:
         reported = around.reported * np.outer(to_relative, to_relative)
@@ -213,25 +221,10 @@ def verdict_of(
     return analyse(
         sensitivity,
         unknowns,
-        without_weak=_without_weak_priors(named, S, N),
+        without_weak=without_weak,
         around=around,
         remedies=remedies | dict.fromkeys(around.aliased, _WITHOUT_ALIASES),
         switches=kinds,
-    )
-
-
-def _without_weak_priors(
-    named: tuple[FlightUnknown, ...], S: np.ndarray, N: np.ndarray
-) -> WithoutWeakPriors:
-    """Return what the data (S by the unknowns, N by the nuisances) say without the weak priors of
-    the last columns of N, which are `named`."""
-    seen = np.linalg.norm(N, axis=0) > _NO_EFFECT
-    # The weak priors' sds are the units of these columns, so the solution is in sds.
-    compensation = np.zeros((N.shape[1], S.shape[1]))
-    compensation[seen] = -np.linalg.lstsq(N[:, seen], S, rcond=NULL)[0]
-    # Before those named stand the parameters of the disturbance and the noise's factors.
-    return WithoutWeakPriors(
-        projected(S, N[:, seen], NULL), compensation[N.shape[1] - len(named) :], named
     )
 
 
@@ -291,7 +284,12 @@ def analyse(
     ]
     singular, names = total.singular, [u.name for u in unknowns]
     condition = float(singular[0] / singular[-1]) if singular[-1] > 0 else math.inf
-    correlation = _correlation(covariance)
+    # One that takes part in no determined direction has no correlation.
+    sizes = np.sqrt(np.diag(covariance))
+    sizes = np.where(sizes > 0, sizes, 1.0)
+    correlation = covariance / np.outer(sizes, sizes)
+    np.fill_diagonal(correlation, 1.0)
+    correlation = np.clip(correlation, -1.0, 1.0)
     hardly = condition > ILL_CONDITIONED and not (null or resting or around.second)
     shares = _shares(covariance, total.covariance, bare, own)
     explained, by_own, by_weak = (dict(zip(names, s.tolist(), strict=True)) for s in shares)
@@ -330,12 +328,8 @@ def analyse(
 def _further(
     bare: np.ndarray, covariance: np.ndarray, unknowns: tuple[Unknown, ...], around: Around
 ) -> list[np.ndarray]:
-    """Return directions that are not determined although their intervals are short.
-
-    Args:
-        bare: covariance (q, q) without the weak priors.
-        covariance: (q, q) with them.
-    """
+    """Return directions that are not determined although their intervals are short, by covariances
+    (q, q) without the weak priors (`bare`) and with them."""
     # Those of one sign have the factor of ten. Of what may be zero weak priors alone hold one whose
     # sd without them is beyond its scale and ten times the one with them.
     weakly = [
@@ -371,11 +365,7 @@ def _groups(
     dead: tuple[str, ...] = (),
 ) -> tuple[Group, ...]:
     """Return the parameters in null directions, those apart that no direction ties together.
-
-    Args:
-        of_rows: the sensitivity with the weak priors and without them.
-        dead: parameters without effect, which have a sentence of their own, and no combination.
-    """
+    Those without effect (`dead`) have a sentence of their own, and no combination."""
     alive = np.array([u.name not in dead for u in unknowns])
     null = [v for v in null if np.abs(v[alive]).max(initial=0.0) > TAKES_PART]
     if not null:
@@ -396,15 +386,6 @@ def _groups(
         names = tuple(unknowns[i].name for i in sorted(members))
         groups.append(Group(names, len(mine), tied, tuple(dict.fromkeys(exchanged))))
     return tuple(groups)
-
-
-def _correlation(covariance: np.ndarray) -> np.ndarray:
-    """Return (q, q); one that takes part in no determined direction has none."""
-    sd = np.sqrt(np.diag(covariance))
-    safe = np.where(sd > 0, sd, 1.0)
-    correlation = covariance / np.outer(safe, safe)
-    np.fill_diagonal(correlation, 1.0)
-    return np.clip(correlation, -1.0, 1.0)
 
 
 def _pairs(

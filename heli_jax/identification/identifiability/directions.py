@@ -104,12 +104,8 @@ def without_effect(sensitivity: np.ndarray, unknowns: tuple[Unknown, ...]) -> tu
 def with_too_wide(
     null: list[np.ndarray], covariance: np.ndarray, unknowns: tuple[Unknown, ...]
 ) -> list[np.ndarray]:
-    """Return the null directions, and those along which a 95 % interval spans more than the factor.
-
-    Args:
-        null: unit directions (q,) that are not determined anyhow.
-        covariance: (q, q) of the unknowns in relative coordinates.
-    """
+    """Return the null directions, and those along which a 95 % interval by the covariance (q, q)
+    spans more than the factor."""
     # Values between bounds of both signs have no factor to go by.
     far = [
         i
@@ -153,11 +149,7 @@ class WithoutWeakPriors(NamedTuple):
 
     def exchanged(self, v: np.ndarray, sensitivity: np.ndarray) -> tuple[FlightUnknown, ...]:
         """Return the nuisances that a direction v (q,) of the unknowns is exchanged with; none
-        where weak priors do not hold it.
-
-        Args:
-            sensitivity: (any, q) with the weak priors.
-        """
+        where weak priors, which the given sensitivity (any, q) has, do not hold it."""
         held, free = (np.linalg.norm(rows @ v) for rows in (sensitivity, self.sensitivity))
         # Sharp by the weak priors and by nothing else: then what moves is what they hold.
         least = NULL * np.linalg.norm(sensitivity)
@@ -191,12 +183,8 @@ def combinations(
     unknowns: tuple[Unknown, ...],
     units: Mapping[str, str | None] | None = None,
 ) -> tuple[Combination, ...]:
-    """Return the products of powers that do not change along the null directions; with `units` the
-    sums of parameters of one unit.
-
-    Args:
-        null: unit directions (q,) in relative coordinates.
-    """
+    """Return the products of powers that do not change along the null directions (q,); with `units`
+    the sums of parameters of one unit."""
     # From a relative coordinate to log |value|, whose powers these are, or to the value itself.
     to = np.array([u.per_log for u in unknowns])
     if units is not None:

@@ -63,13 +63,9 @@ _HUGE = 1e50
 def descend(
     rows: Callable[[np.ndarray], Rows], z: np.ndarray, moving: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Return the point (q,) of the least squares near z by Levenberg and Marquardt, and the sum
-    there less what a further step promises, infinite where nothing finite is found.
-
-    Args:
-        z: (q,) where the search begins.
-        moving: (q,) the coordinates that may change.
-    """
+    """Return the point (q,) of the least squares near z (q,) by Levenberg and Marquardt, where the
+    coordinates `moving` (q,) may change, and the sum there less what a further step promises,
+    infinite where nothing finite is found."""
     now, ridge, promised = rows(z), _RIDGE, math.inf
     squares = squares_of(now.r)
     for _ in range(_STEPS):
@@ -186,9 +182,6 @@ class Valley(NamedTuple):
     ) -> tuple[Combination, ...]:
         """Return the products of powers, else the sums, that change neither along null directions
         at the optimum nor far from it.
-
-        Args:
-            null: unit directions (q,) in relative coordinates, of one group of unknowns.
         """
         params = self.problem.model.Params
         units = {u.name: naming.unit(params, u.name) for u in unknowns if u.is_parameter}
@@ -287,9 +280,6 @@ def second_solutions(
 ) -> tuple[SecondSolution, ...]:
     """Return other admissible values of the free parameters that the data do not tell from those
     here, or that fit better.
-
-    Args:
-        optimum: whether it is one, about which the other unknowns may follow.
     """
     here = {n: float(v) for n, v in zip(at.layout.of_interest, e.named, strict=True)}
     here = {n: here[n] for n in problem.free if n in here}
@@ -333,9 +323,6 @@ def _alike(a: float, b: float) -> bool:
 def _exchanged_modes(problem: Problem, values: Mapping[str, float]) -> list[dict[str, float]]:
     """Return by pair of real modes of the linearised model the values of those parameters that
     exchange the two, but for what is not linear in them.
-
-    Args:
-        values: of the free parameters, SI.
     """
     model, flight = problem.model, problem.training[0]
     # What is zero has no relative change, and a delay makes no mode.

@@ -167,13 +167,7 @@ def _exchanged(group: Group) -> str:
 
 
 def _way_out(names: Sequence[str], v: Verdict, count: int = 1, switches: Sequence[str] = ()) -> str:
-    """Remedies for parameters that the data do not separate.
-
-    Args:
-        names: the parameters, gains and the time shift concerned.
-        v: which of them are parameters, and what remedies the model has.
-        count: how many of them have to be known for the rest to be determined.
-    """
+    """Remedies for parameters that the data do not separate, `count` of which have to be known."""
     parameters = [u.name for u in v.unknowns if u.name in names and u.is_parameter]
     # At most all of them: a direction may also run through gains and the time shift.
     number = min(count, len(parameters))

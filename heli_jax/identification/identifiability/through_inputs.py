@@ -18,7 +18,7 @@ import numpy as np
 
 from heli_jax.identification.estimation.evaluation import Evaluation, deviations, evaluate
 from heli_jax.identification.identifiability.verdict import Verdict
-from heli_jax.identification.unknowns.layout import FlightData, Solution
+from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.messages import sentence
 
 _LEFT = 10.0
@@ -49,8 +49,17 @@ def through_inputs(at: Solution, e: Evaluation) -> Evaluation | None:
         if np.nanstd(np.asarray(y)) > 0
     ):
         return None
-    simulated = at.data._replace(flights=tuple(_simulated(*pair) for pair in pairs))
-    J = np.array(evaluate(at.layout, simulated, at.noise, at.z).J)
+    # The simulated outputs in place of the measured ones, missing where these are.
+    flights = tuple(
+        flight._replace(
+            outputs={
+                n: jnp.where(jnp.isfinite(y), jnp.asarray(run[n], jnp.asarray(y).dtype), jnp.nan)
+                for n, y in flight.outputs.items()
+            }
+        )
+        for flight, run in pairs
+    )
+    J = np.array(evaluate(at.layout, at.data._replace(flights=flights), at.noise, at.z).J)
     # Between the samples' rows and the priors' stand those of the innovations' variances, which
     # are noise too.
     priors = len(at.layout.free) + at.layout.size - at.layout.first_nuisance
@@ -68,16 +77,6 @@ def through_inputs(at: Solution, e: Evaluation) -> Evaluation | None:
         if noise_only[i] and np.isfinite(sds[i])
     ]
     return e._replace(J=np.vstack([*alone, J]))
-
-
-def _simulated(flight: FlightData, simulated: dict[str, np.ndarray]) -> FlightData:
-    """The flight with its simulated outputs, missing where the measured ones are."""
-    return flight._replace(
-        outputs={
-            n: jnp.where(jnp.isfinite(y), jnp.asarray(simulated[n], jnp.asarray(y).dtype), jnp.nan)
-            for n, y in flight.outputs.items()
-        }
-    )
 
 
 class ByDisturbance(NamedTuple):

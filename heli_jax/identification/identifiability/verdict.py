@@ -190,11 +190,6 @@ class Verdict:
         return tuple(n for group in self.resting_groups for n in group.names)
 
     @property
-    def roughly(self) -> tuple[str, ...]:
-        """Parameters that are determined, but with a wide interval."""
-        return tuple(self.factors)
-
-    @property
     def exchangeable(self) -> tuple[str, ...]:
         """Nuisances, as 'flight 1/bias p', that make up for what is not determined."""
         groups = (*self.groups, *self.resting_groups)

@@ -7,10 +7,9 @@ where the model is curved, which counts once they are as large as the response.
 
 R comes from the residuals: autocovariances over the pairs of samples that are seen, under Parzen's
 lag window with a length that the record chooses (Andrews, 1991), their spectrum held at zero or
-above, so that no variance is lost. Two effects of a short record are allowed for: the fit takes
-from the residuals what lies along the sensitivities (as in HC2, MacKinnon and White, 1985), and
-few independent parts of a spectrum tell a variance poorly, which Student's t with their number
-(Satterthwaite) answers for.
+above. Two effects of a short record are allowed for: the fit takes from the residuals what lies
+along the sensitivities (HC2, MacKinnon and White, 1985), and few independent parts of a spectrum
+tell a variance poorly (Student's t with their number, Satterthwaite).
 """
 
 from typing import NamedTuple
@@ -66,7 +65,6 @@ class Sandwich(NamedTuple):
     def quantile(self, along: np.ndarray | None = None) -> np.ndarray:
         """Return Student's 97.5 % quantile of each combination, as `inflation` has them."""
         _, freedom = self._variance(self._scaled(along))
-        # Below one degree of freedom the quantile has no use: 12.7 standard deviations are enough.
         return scipy.special.stdtrit(np.maximum(freedom, 1.0), 0.975)
 
     def covariance(self) -> np.ndarray:
@@ -75,23 +73,21 @@ class Sandwich(NamedTuple):
         whole = self.bread @ meat @ self.bread
         variance, _ = self._variance(np.eye(self.norms.size))
         plain = np.diag(whole)
-        # `_variance` allows on each variance for what the fit took; the correlations stay.
+        # The correlations stay.
         factor = np.sqrt(np.divide(variance, plain, out=np.zeros_like(plain), where=plain > 0))
         whole *= np.outer(factor, factor)
-        # Where there is none, rounding has left a little of either sign.
         np.fill_diagonal(whole, variance)
         return whole / np.outer(self.norms, self.norms)
 
     def _scaled(self, along: np.ndarray | None) -> np.ndarray:
-        """Return the combinations (k, q) by unknowns of unit columns, their largest parts one: the
-        size of a combination changes neither inflation nor quantile."""
+        """Return the combinations (k, q) by unknowns of unit columns, their largest parts one."""
         if along is None:
             return np.eye(self.norms.size)
         along = along / self.norms
         return along / np.maximum(np.max(np.abs(along), axis=1, keepdims=True), 1e-300)
 
     def _variance(self, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(k,) of combinations, and the degrees of freedom with which they are known."""
+        """Return the variance (k,) of combinations, and its degrees of freedom (Satterthwaite)."""
         D = self.bread @ along.T
         variance = np.sum(D * (self.rest @ D), axis=0)
         uncertainty = np.zeros_like(variance)
@@ -99,8 +95,7 @@ class Sandwich(NamedTuple):
             of_flight, freedom = part.variance(D)
             variance = variance + of_flight
             uncertainty += of_flight**2 / freedom
-        # Satterthwaite: the degrees of freedom of a sum. Where priors alone speak, their variance
-        # is known, and the quotient would be one of zeros.
+        # Where priors alone speak the variance is known.
         known = uncertainty <= 1e-12 * variance**2
         return variance, np.where(known, 1e12, variance**2 / np.where(known, 1.0, uncertainty))
 
@@ -127,39 +122,29 @@ class _Part(NamedTuple):
         W = self.J @ D
         by_output = np.real(W.conj() * (self.S @ W))
         power = np.sum(by_output, axis=1)
-        # Its value at lag zero is the variance; what the window passes of its square says from how
-        # many independent parts of the spectrum that was made.
+        # At lag zero the variance; its windowed square gives the number of independent parts.
         p = np.fft.irfft(power, self.window.size, axis=0)
         whole = np.where(p[0] > 0, p[0], 1.0)
         spent = np.sum(np.square(self.window[:, None] * (p / whole)), axis=0)
-        # As many samples as those outputs have that the combination is known from: what a slow
-        # sensor tells has no more freedom for a fast one beside it.
+        # As many samples as those outputs have that the combination is known from.
         share = np.maximum(np.sum(by_output, axis=0), 0.0)
         seen = self.seen @ share / np.maximum(np.sum(share, axis=0), 1e-300)
         freedom = np.where(p[0] > 0, seen / np.where(spent > 0, spent, 1.0), 1.0)
         white = np.sum(D * (self.plain @ D), axis=0)
         taken = np.sum(D * (self.taken @ D), axis=0) / np.where(white > 0, white, 1.0)
-        # HC2 divides by what the fit leaves. Where it leaves next to nothing that is rounding, so
-        # the variance grows by a factor of four at most.
+        # HC2 divides by what the fit leaves, which may be next to nothing: a quarter at least.
         return np.maximum(p[0], 0.0) / (1.0 - np.clip(taken, 0.0, 0.75)), np.maximum(freedom, 1.0)
 
 
 def sandwich(
     layout: Layout, data: Data, e: Evaluation, curvature: Float[np.ndarray, "q q"] | None = None
 ) -> Sandwich:
-    """Return the covariance of the unknowns at an optimum of output error.
-
-    Several outputs of a flight enter with their cross-covariances, flights are independent.
-
-    Args:
-        curvature: (q, q) what the residuals add to J'J in the Hessian (`residual_curvature`);
-            nothing unless given.
-    """
+    """Return the covariance of the unknowns at an optimum of output error, with `curvature` of
+    `residual_curvature`; outputs of a flight are correlated, flights are independent."""
     J, r = np.asarray(e.J, np.float64), np.asarray(e.r, np.float64)
     norms = np.linalg.norm(J, axis=0)
     norms = np.where(norms > 0, norms, 1.0)
     J = J / norms
-    # The singular values of J are those of its triangle, which is (q, q) however long the record.
     _, singular, right = np.linalg.svd(np.linalg.qr(J, mode="r"), full_matrices=False)
     kept = singular > NULL * max(singular[0], 1e-300)
     T = right[kept].T / singular[kept]
@@ -181,11 +166,10 @@ def residual_curvature(
 ) -> Float[np.ndarray, "q q"]:
     """Return what the residuals add to J'J in the Hessian of r'r/2, (q, q): the sum of r_k r_k''.
 
-    By central differences of J'r along the unknowns of interest. Zero where it is not finite. Those
-    of a model that is not linear reach two standard deviations to either side: over less, what a
-    limit, a stop or a dead band makes of the slopes are kinks, whose differences are no curvature.
+    By central differences of J'r along the unknowns of interest; zero where it is not finite. Those
+    of a model that is not linear reach two standard deviations to either side, across the kinks
+    that a limit, a stop or a dead band makes.
     """
-    # The fit has compiled `slopes`; second derivatives would be another program, and a longer one.
     least = float(np.finfo(np.asarray(z).dtype).eps) ** 0.25
     at = residual_and_jacobian(layout, data, noise, z)
     J = np.asarray(at.J, np.float64)
@@ -220,27 +204,20 @@ def _bread(
     T: Float[np.ndarray, "q k"], singular: Float[np.ndarray, " k"], curvature: np.ndarray
 ) -> Float[np.ndarray, "q q"]:
     """Return the inverse of J'J + curvature, where T'(J'J)T = 1."""
-    # Along the flattest directions the differences are rounding, divided by a small number.
+    # Along the flattest directions the differences are rounding.
     resolved = singular > _RESOLVED * singular[0]
     added = T.T @ curvature @ T
     added[~resolved] = 0.0
     added[:, ~resolved] = 0.0
     values, vectors = np.linalg.eigh(np.eye(singular.size) + added)
     V = T @ vectors
-    # Residuals as large as the response can make the Hessian all but singular or indefinite, and
-    # the inverse of that says nothing.
+    # Residuals as large as the response can make the Hessian singular or indefinite.
     return V / np.maximum(values, _FLATTEST) @ V.T
 
 
 def _part(J: np.ndarray, r: np.ndarray, seen: np.ndarray, T: np.ndarray) -> _Part:
-    """Return what a flight adds.
-
-    Args:
-        J: sensitivities (outputs, N, q).
-        r: residuals (outputs, N), zero where not seen.
-        seen: (outputs, N) where something is measured.
-        T: (q, k) that whitens J'J.
-    """
+    """Return what a flight adds by its sensitivities J (outputs, N, q), residuals r (outputs, N),
+    zero where not seen, and T (q, k) that whitens J'J."""
     S, apart, window = _spectrum(r, seen)
     size, plain = window.size, np.tensordot(J, J, ((0, 1), (0, 1)))
     J = np.moveaxis(np.fft.rfft(J, size, axis=1), 0, 1)
@@ -254,17 +231,12 @@ def _part(J: np.ndarray, r: np.ndarray, seen: np.ndarray, T: np.ndarray) -> _Par
 
 
 def _spectrum(r: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the spectrum (f, outputs, outputs) of residuals (outputs, N), one over the number of
-    pairs of samples (2 f - 2, outputs, outputs), and the lag window (2 f - 2,).
-
-    Args:
-        r: zero where not seen.
-    """
+    """Return the spectrum (f, outputs, outputs) of residuals (outputs, N), zero where not seen, one
+    over the number of pairs (2 f - 2, outputs, outputs), and the lag window (2 f - 2,)."""
     k, n = r.shape
-    # A power of two, and twice the record at least: circular products then wrap onto zeros alone.
+    # Twice the record at least: circular products then wrap onto zeros alone.
     size = 2 << (n - 1).bit_length()
     pairs, R = _pairs(seen, size), _pairs(r, size)
-    # Over the pairs that are seen, so that gaps do not count as residuals of zero.
     apart = np.divide(1.0, pairs, where=pairs > 0.5, out=np.zeros_like(pairs))
     R *= apart
     window = _window(n, size, [_correlation_time(R[:, a, a], pairs[:, a, a], n) for a in range(k)])
@@ -292,7 +264,7 @@ def drawn(residual: np.ndarray, runs: int, rng: np.random.Generator) -> np.ndarr
     for run in noise:
         white = np.fft.rfft(rng.standard_normal((size, k)), axis=0)
         run[:] = np.fft.irfft((root @ white[..., None])[..., 0], size, axis=0)[:n]
-    # The variance is that of the residuals, whatever was held at zero in the spectrum.
+    # Whatever was held at zero in the spectrum, the variance is that of the residuals.
     variance = np.fft.irfft(np.real(np.diagonal(S, axis1=1, axis2=2)), size, axis=0)[0]
     expected = np.sum(r**2, axis=1) / np.maximum(seen.sum(axis=1), 1)
     scale = np.sqrt(np.divide(expected, variance, out=np.zeros(k), where=variance > 0))
@@ -324,16 +296,14 @@ def _correlation_time(R: np.ndarray, pairs: np.ndarray, n: int) -> float:
         return 1.0
     # Lags at which no pair is seen count as those between which they lie.
     whole = 1.0 + 2.0 * (n // 5) * float(np.mean((R[lags] / R[0]) ** 2))
-    # The noise of an autocorrelation has the variance 1 / n: its square adds that at each lag. At
-    # lag zero all samples that are seen are pairs.
+    # The noise of an autocorrelation has the variance 1 / n, which its square adds at each lag.
     return max(1.0, whole / (1.0 + 2.0 * (n // 5) / round(float(pairs[0]))))
 
 
 def _window(n: int, size: int, times: list[float]) -> Float[np.ndarray, " size"]:
     """Return Parzen's lag window (size,) over all lags, as long as the correlation times [samples]
     ask."""
-    # One window for all outputs, the longest: with one each, the matrix of windowed spectra need
-    # not be a covariance.
+    # One for all outputs: with one each, the windowed spectra need not be a covariance.
     length = max(_LENGTH * time * (n / time) ** 0.2 for time in times)
     x = np.minimum(np.arange(size // 2 + 1) / min(max(length, 2.0), max(_LONGEST * n, 2.0)), 1.0)
     half = np.where(x < 0.5, 1.0 - 6.0 * x**2 * (1.0 - x), 2.0 * (1.0 - x) ** 3)

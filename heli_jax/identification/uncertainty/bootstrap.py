@@ -42,12 +42,10 @@ class Refits(NamedTuple):
     values: dict[str, np.ndarray]
     """by free parameter, (records,); NaN where a record did not converge"""
     converged: np.ndarray
-    """(records,); False too of a record that `fit` would refuse, since an output of it has fewer
-    than 8 measured samples: of nothing measured the start would be the optimum"""
+    """(records,); False too where an output has fewer than 8 measured samples"""
     cost: np.ndarray
-    """(records,) sum of squares over the record's number of measured samples, by the noise of the
-    fit: 1 where a record is as noisy, more where the model explains it less; NaN of a record with
-    too few"""
+    """(records,) sum of squares over the number of measured samples, by the noise of the fit: 1
+    where a record is as noisy, more where the model explains it less; NaN with too few samples"""
 
 
 def refit(
@@ -59,9 +57,8 @@ def refit(
     """Estimate the parameters of a fit anew from other records, side by side.
 
     Each record has the flights of the fit, of the same length and rate, with inputs and outputs of
-    its own; model, free parameters, priors, noise levels and the scales of weak priors are those of
-    the fit, and all searches begin at its optimum. No verdict is made of a record, and no interval:
-    for these it is fitted by itself.
+    its own; all else is the fit's, and all searches begin at its optimum. No verdict is made of a
+    record, and no interval.
 
     Args:
         fit: with output error or filter error.
@@ -73,55 +70,33 @@ def refit(
         ValueError: a record is not like that of the fit, with what differs; a method that estimates
             the noise's spectrum.
     """
-    at, names = fit.reached, naming.names(fit.reached.layout.model.Inputs)
+    at = fit.reached
     if at.layout.noise_model == "spectrum":
         raise ValueError(f"refit: not available with method {fit.method}")
     if not records:
         raise ValueError("refit: expected one record at least, got none")
     flights = [_like(at, r, f"refit, record {k}") for k, r in enumerate(records)]
 
-    def stacked(signal: Callable[[Flight], Any], i: int) -> Array:
-        return jnp.asarray(np.stack([np.asarray(signal(r[i])) for r in flights]), at.z.dtype)
+    def stacked(signals: list[np.ndarray]) -> Array:
+        return jnp.asarray(np.stack(signals), at.z.dtype)
 
     inputs, outputs = [], []
-    for i, flight in enumerate(at.data.flights):
-        each = {n: stacked(lambda f, n=n: f.inputs[n], i) for n in names}
-        inputs.append(at.layout.model.Inputs(**each))
-        outputs.append({n: stacked(lambda f, n=n: f.outputs[n], i) for n in flight.outputs})
-    optima = _optima(at, len(flights), tuple(outputs), tuple(inputs), say=say)
-    # Of every output as many samples as `fit` asks for; there are none but the fit's outputs.
-    enough = np.array(
-        [
-            all(np.isfinite(y).sum() >= FEWEST_SEEN for f in record for y in f.outputs.values())
-            for record in flights
-        ]
-    )
+    for i, own in enumerate(at.data.flights):
+        names = naming.names(at.layout.model.Inputs)
+        driven = {n: stacked([r[i].inputs[n] for r in flights]) for n in names}
+        inputs.append(at.layout.model.Inputs(**driven))
+        outputs.append({n: stacked([r[i].outputs[n] for r in flights]) for n in own.outputs})
+
+    def data(record: Any) -> Data:
+        each = zip(at.data.flights, *record, strict=True)
+        return at.data._replace(flights=tuple(f._replace(outputs=y, inputs=u) for f, y, u in each))
+
+    optima = optimise_many(at, data, len(flights), (tuple(outputs), tuple(inputs)), say)
+    seen = [[np.isfinite(y).sum() for f in r for y in f.outputs.values()] for r in flights]
+    enough = np.array([min(counts) >= FEWEST_SEEN for counts in seen])
     converged = np.asarray(optima.converged) & enough
     values = {n: np.where(converged, v, np.nan) for n, v in _values(at, optima.z).items()}
     return Refits(values, converged, np.where(enough, np.asarray(optima.cost), np.nan))
-
-
-def _optima(
-    at: Solution,
-    count: int,
-    outputs: tuple[dict[str, Array], ...],
-    inputs: tuple[Any, ...] | None = None,
-    prior_means: Array | None = None,
-    say: Callable[[str], None] = lambda _: None,
-) -> Optimum:
-    """Fit `count` records in time, from the optimum; outputs (and inputs, and the means of priors
-    where they are others) have the records as leading axis."""
-
-    def data(record: Any) -> Data:
-        by_flight, driven, means = record
-        flights = [f._replace(outputs=y) for f, y in zip(at.data.flights, by_flight, strict=True)]
-        if driven is not None:
-            flights = [f._replace(inputs=u) for f, u in zip(flights, driven, strict=True)]
-        changed = at.data._replace(flights=tuple(flights))
-        return changed if means is None else changed._replace(prior_mean=means)
-
-    each = (outputs, inputs, prior_means)
-    return optimise_many(at, data, count, each, say)
 
 
 def _values(at: Solution, z: Any) -> dict[str, np.ndarray]:
@@ -202,13 +177,20 @@ def bootstrap(
     prior_sd = np.where(np.isfinite(at.data.prior_sd), at.data.prior_sd, 0.0)
     records = () if in_frequency else _records(fit, at, runs, seed, rng)
     means = values + prior_sd * rng.standard_normal((runs, values.size))
+    means = jnp.asarray(means, at.z.dtype)
+
+    def data(record: Any) -> Data:
+        outputs, mean = record
+        each = zip(at.data.flights, outputs, strict=True)
+        flights = tuple(f._replace(outputs=y) for f, y in each)
+        return at.data._replace(flights=flights, prior_mean=mean)
+
     if in_frequency:
         z, converged = _fit_by_lines(at, means, rng)
     else:
-        optima = _optima(at, runs, records, None, jnp.asarray(means, at.z.dtype), say)
+        optima = optimise_many(at, data, runs, (records, means), say)
         z, converged = optima.z, np.asarray(optima.converged)
-    # No nuisances: weak priors hold them, which are not drawn anew, so that they would scatter less
-    # than they are uncertain.
+    # No nuisances: weak priors hold them, which are not drawn anew.
     fitted = np.flatnonzero(converged)
     estimates = _values(at, np.asarray(z)[fitted])
     return Bootstrap(estimates, runs - fitted.size, tuple(map(int, fitted)))
@@ -225,7 +207,6 @@ def _records(
     for i, (flight, sds, outputs) in enumerate(each):
         if fit.coloured:
             residuals = [fit.signals[i].residual(n) for n in at.layout.outputs[i]]
-            # All outputs at once: their noises are correlated.
             coloured = drawn(np.stack(residuals), runs, rng)
         by_output = {}
         for n, y in flight.outputs.items():
@@ -234,34 +215,23 @@ def _records(
             if fit.coloured:
                 noise = coloured[:, at.layout.outputs[i].index(n)]
             record = np.asarray(outputs[n]) + float(u.biases[i][n]) + noise
-            # The same gaps: they are part of what the data can tell.
             record = np.where(np.isnan(np.asarray(y)), np.nan, record)
             by_output[n] = jnp.asarray(record, at.z.dtype)
         records.append(by_output)
     return tuple(records)
 
 
-# Bootstrap of fits in frequency: residuals, drawn line by line, on the estimated response.
-#
-# Whitened by its spectrum the residual at one frequency is as good as that at any other, with any
-# phase. So the model's response and the ends of each record stay, and to every line comes a
-# residual that another one had, at the size that the spectrum gives it there. Nothing is simulated
-# in time: unstable vehicles are no exception. The spectrum is estimated anew with each record.
-#
-# Source: Franke and Härdle (1992), On bootstrapping kernel spectral estimates.
-
-
 def _fit_by_lines(
-    at: Solution, means: Float[np.ndarray, "runs p"], rng: np.random.Generator
+    at: Solution, means: Float[Array, "runs p"], rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "runs q"], Bool[np.ndarray, " runs"]]:
-    """Fit drawn records one by one, each with its means of the priors; return the unknowns, and
-    whether they converged."""
+    """Fit drawn records one by one, each with its means of the priors and its own spectrum; return
+    the unknowns, and whether they converged."""
     z, converged = [], []
     begun = Optimum(
         at.z, jnp.zeros((), at.z.dtype), np.asarray(0), np.asarray(True), np.asarray(np.inf)
     )
     for mean, data in zip(means, _spectrum_records(at, rng), strict=False):
-        search = _FromOptimum(at.layout, data._replace(prior_mean=jnp.asarray(mean, at.z.dtype)))
+        search = _FromOptimum(at.layout, data._replace(prior_mean=mean))
         # Steps of its search are none of the stage's, which counts records.
         with stages.stage("one record", shown=False):
             best = relax_noise_covariance(search, at.noise, begun).best
@@ -281,31 +251,30 @@ class _FromOptimum(Search):
 
 
 def _spectrum_records(at: Solution, rng: np.random.Generator) -> Iterator[Data]:
-    """Yield the numbers of the problem, again and again with other noise."""
+    """Yield the numbers of the problem, again and again with other noise.
+
+    The model's response and the ends of each record stay, and every line gets a whitened residual
+    that another one had, with any phase, at the size that the spectrum gives it there (Franke and
+    Härdle, 1992, On bootstrapping kernel spectral estimates). Nothing is simulated in time.
+    """
     layout, noise = _in_lines(at)
     errors = jax.device_get(errors_of_lines(layout, at.data, noise, at.z).errors)
     records = records_of(layout)
     # What the unknowns fit of the noise is missing in the residual.
     rows = sum(2 * e.size for e in errors)
     freedom = (rows / max(rows - len(layout.of_interest), 1)) ** 0.5
-    white = [
-        (np.asarray(W) @ e[:, :, None])[:, :, 0]
-        for W, e in zip(noise.whitening, errors, strict=True)
-    ]
     # Flights of the same outputs share what is drawn from.
-    pools = {
-        names: np.concatenate(
-            [w for w, r in zip(white, records, strict=True) if layout.outputs[r.flight] == names]
-        )
-        for names in {layout.outputs[r.flight] for r in records}
-    }
+    white: dict[tuple[str, ...], list[np.ndarray]] = {}
+    for record, e, W in zip(records, errors, noise.whitening, strict=True):
+        whitened = (np.asarray(W) @ e[:, :, None])[:, :, 0]
+        white.setdefault(layout.outputs[record.flight], []).append(whitened)
+    pools = {names: np.concatenate(parts) for names, parts in white.items()}
     measured = [{n: np.asarray(y) for n, y in f.outputs.items()} for f in at.data.flights]
     while True:
         outputs = [{n: y.copy() for n, y in by_name.items()} for by_name in measured]
         for record, e, W in zip(records, errors, noise.whitening, strict=True):
             names = layout.outputs[record.flight]
             pool, K = pools[names], len(e)
-            # Residuals of other lines, with any phase, at the size of each.
             turned = np.exp(2j * np.pi * rng.random(K))[:, None]
             drawn_anew = pool[rng.integers(len(pool), size=K)] * turned
             other = np.linalg.solve(np.asarray(W), drawn_anew[:, :, None])[:, :, 0]

@@ -56,7 +56,6 @@ def intervals(
         profiles: parameters to profile; none unless given.
         runs: records of the bootstrap, 0 for none.
         draws: draws of each of four NUTS chains, 0 for none (needs the extra `bayes`).
-        seed: of bootstrap and chains.
         progress: called with a line of text before each longer part of the work.
 
     Raises:
@@ -69,7 +68,6 @@ def intervals(
     missing = [n for n in profiles or () if n not in fit.estimates]
     if missing:
         raise ValueError(f"profile: expected one of {', '.join(fit.estimates)}, got {missing[0]}")
-    # Without an optimum profiles and chains would wander off from where the optimiser stopped.
     if fit.status != "converged" and (profiles or runs or draws):
         findings.append(found("intervals.none", "doubt", *fit.not_identifiable))
         profiles, runs, draws = None, 0, 0
@@ -88,7 +86,6 @@ def intervals(
             posterior = nuts(fit, draws, seed=seed)
     by_parameter: dict[str, dict[str, _Ends]] = {}
     for name, estimate in fit.estimates.items():
-        # Nothing of a parameter that is not identifiable.
         if estimate.lower95 is None or estimate.upper95 is None:
             continue
         by_parameter[name] = {"gaussian": (estimate.lower95, estimate.upper95)}
@@ -128,20 +125,14 @@ def _findings(
     if posterior is not None and not posterior.trusted:
         numbers = {"rhat": posterior.rhat, "draws": posterior.effective}
         limits = {"most_rhat": RHAT, "least_draws": EFFECTIVE}
-        findings.append(
-            found("intervals.chains", value=posterior.divergent, **numbers, **limits),
-        )
+        findings.append(found("intervals.chains", value=posterior.divergent, **numbers, **limits))
     # With coloured residuals they differ for the reason that was given above.
     for name, by in () if fit.coloured else by_parameter.items():
         sampled = 0 if booted is None else booted.values[name].size
         limits = {"bootstrap": max(DIFFERENT, _OF_QUANTILES / max(sampled, 1) ** 0.5)}
-        others = {method: ends for method, ends in by.items() if method != "gaussian"}
-        far = [
-            method
-            for method, ends in others.items()
-            if apart(by["gaussian"], ends) > limits.get(method, DIFFERENT)
-        ]
-        if far:
+        others = {m: ends for m, ends in by.items() if m != "gaussian"}
+        apart_by = {m: apart(by["gaussian"], ends) for m, ends in others.items()}
+        if far := [m for m, d in apart_by.items() if d > limits.get(m, DIFFERENT)]:
             code = _which(far, others)
             findings.append(found(code, "doubt", name, methods=far, limit=DIFFERENT))
     return findings
@@ -151,7 +142,7 @@ def _which(far: Sequence[str], others: Mapping[str, _Ends]) -> str:
     """Return the code that tells which interval to believe where some differ from the Gaussian."""
     if not np.isfinite(others.get("profile", (0.0, 0.0))).all():
         return "intervals.unbounded"
-    # All against the Gaussian one: it is the parabola that is wrong, not one of their assumptions.
+    # All against the Gaussian one: the parabola is wrong, not one of their assumptions.
     if len(far) == len(others):
         return "intervals.not-quadratic"
     if "profile" in far:

@@ -1,6 +1,6 @@
 """Estimates with standard deviations and intervals: by Cramér-Rao's bound, or wider."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 from typing import NamedTuple
@@ -46,8 +46,6 @@ from heli_jax.identification.unknowns.layout import (
     unpack,
 )
 
-# Standard deviations.
-
 
 class StandardErrors(NamedTuple):
     """Standard deviations and verdict at an optimum."""
@@ -80,6 +78,10 @@ def standard_errors(
     """Return standard errors by the slopes, and by the likelihood where the slopes leave wide
     intervals.
 
+    With process noise they are Cramér-Rao's bound of the innovations; where these are not white, or
+    the spectrum of a disturbance tells more of a parameter than the inputs do, that of the
+    responses to the inputs alone.
+
     Args:
         before: the verdict at the first guess, which stands where the optimum has no Jacobian.
         white: whether the residuals are white and independent between outputs; of a method with
@@ -93,58 +95,33 @@ def standard_errors(
         return _by_slopes(problem, at, e, before, around, white=white)
 
     errors = slopes(e, around)
-    inputs = through_inputs(at, e) if optimum else None
-    if inputs is not None:
-        return _with_process_noise(problem, at, e, inputs, errors, around, slopes, white=white)
     if not optimum:
         return errors
     reaches = errors.wider * errors.quantiles
-    beyond = beyond_slopes(problem, at, e, errors.verdict, reaches, around)
-    return errors if beyond is around else slopes(e, beyond)._replace(limits=beyond.limits)
-
-
-def _with_process_noise(
-    problem: Problem,
-    at: Solution,
-    e: Evaluation,
-    inputs: Evaluation,
-    errors: StandardErrors,
-    around: Around,
-    slopes: Callable[[Evaluation, Around], StandardErrors],
-    *,
-    white: bool,
-) -> StandardErrors:
-    """Return Cramér-Rao's bound of a filter's innovations; where these are not white, or the
-    spectrum of a disturbance tells more of a parameter than the inputs do, that of the responses in
-    them alone.
-
-    Args:
-        inputs: what inputs and initial states tell there, of `through_inputs`.
-    """
+    inputs = through_inputs(at, e)
+    if inputs is None:
+        beyond = beyond_slopes(problem, at, e, errors.verdict, reaches, around)
+        return errors if beyond is around else slopes(e, beyond)._replace(limits=beyond.limits)
     # Neither names combinations, which take time to look for.
     by_all, by_inputs = (
         verdict_of(problem, at.layout, told, around._replace(valley=None)) for told in (e, inputs)
     )
     told = by_disturbance(by_all, by_inputs)
-    # Of several outputs one that is pushed moves the others, which is an answer to a motion that
-    # was measured. Of one the disturbance has its spectrum alone, as far as its model is right:
-    # that adds to what the inputs tell, and does not speak in their place.
+    # Of several outputs a pushed one moves the others, which is a response to a measured motion. A
+    # disturbance of one output has its spectrum alone, which only adds to what the inputs tell.
     spectrum_alone = all(len(outputs) == 1 for outputs in at.layout.outputs)
     counts = white and not (spectrum_alone and (told.resting or told.mostly))
     asked, names = errors.verdict, told.resting
     if not counts:
         lacking = dict.fromkeys((*asked.undetermined, *by_inputs.undetermined))
         asked = replace(asked, undetermined=tuple(lacking))
-    reaches = errors.wider * errors.quantiles
     beyond = beyond_slopes(problem, at, e, asked, reaches, around)
     if not counts:
-        # The likelihood has the colour in it: its ends are those of parameters that rest on
-        # responses.
+        # The likelihood has the colour in it: its ends hold where parameters rest on responses.
         limits = {n: ends for n, ends in beyond.limits.items() if n not in told.wider}
         beyond = beyond._replace(limits=limits)
         if names or len(by_inputs.null_directions) > len(by_all.null_directions):
-            # The colour has put the optimum where it is along directions that no input shows:
-            # slopes there name combinations that do not hold for the vehicle.
+            # Along directions that no input shows the colour has placed the optimum.
             beyond = beyond._replace(valley=None)
             names = names or by_inputs.undetermined
     if beyond is not around:
@@ -167,7 +144,6 @@ def _by_slopes(
     be estimated, the sandwich; the arguments are those of `standard_errors`."""
     layout, objective = at.layout, at.layout.objective
     usable = bool(np.all(np.isfinite(e.J)) and np.all(np.isfinite(e.r)))
-    # The noise is estimated from the same residuals: Student's t, not the normal distribution.
     freedom = max(objective.numbers(layout, at.data, at.noise) - layout.determined, 1)
     quantile = float(scipy.special.stdtrit(freedom, 0.975))
     quantiles = np.full(layout.size, quantile)
@@ -177,10 +153,8 @@ def _by_slopes(
         allowed = usable and not white and objective.noise_model == "spectrum"
         return StandardErrors(verdict, np.ones(layout.size), quantiles, allowed)
     errors = sandwich(layout, at.data, e, residual_curvature(layout, at.data, at.noise, at.z))
-    # Few independent parts of a spectrum tell a variance poorly; never better than all samples.
     quantiles = np.maximum(errors.quantile(), quantile)
-    # The rule of the factor of ten has to see the intervals that are reported, of which a verdict
-    # takes 1.96 standard deviations.
+    # The verdict, which takes 1.96 standard deviations, has to see the reported intervals.
     k = len(layout.of_interest)
     factor = quantiles[:k] / Z95
     reported = errors.covariance()[:k, :k] * np.outer(factor, factor)
@@ -195,16 +169,6 @@ def _by_slopes(
     )
 
 
-# How well the sizes of noises are known, where all are told relative to a small one.
-#
-# With the common scale of all noise concentrated out of the likelihood, the sizes among the
-# unknowns are relative to the measurement noise of one output. Behind an on-board filter that may
-# be next to nothing, and all that is relative to it is as uncertain as it is. In its own unit a
-# size is its coordinate plus the logarithm of the common scale, which moves by -1/2 of the mean of
-# log s (the variances of the innovations): large sizes beside a small reference stay where they
-# are.
-
-
 _STEP = 1e-3
 """of a coordinate, for a difference"""
 _NO_EFFECT = 1e-5
@@ -215,7 +179,11 @@ _TAKES_PART = 0.02
 
 def size_deviations(at: Solution, e: Evaluation) -> dict[str, float]:
     """Return by size of a noise the standard deviation of its logarithm, in its own unit; {} where
-    the sizes are not relative to one that may vanish."""
+    the sizes are not relative to the noise of one output, which may be next to nothing.
+
+    In its own unit a size is its coordinate plus the logarithm of the common scale, which moves by
+    -1/2 of the mean of log s (the variances of the innovations).
+    """
     layout = at.layout
     if not (layout.filtered and layout.concentrated and np.isfinite(e.J).all()):
         return {}
@@ -232,8 +200,6 @@ def size_deviations(at: Solution, e: Evaluation) -> dict[str, float]:
     sds = np.sqrt(sds**2 + 0.5 / n)
     return dict(zip(layout.sizes, map(float, sds), strict=True))
 
-
-# Estimates.
 
 _SAYS_NOTHING = 1e3
 """A disturbance's standard deviation or correlation time whose interval reaches by this factor to
@@ -257,11 +223,9 @@ def estimates_of(
         free = problem.free.get(u.name)
         searched, start = (-np.inf, np.inf), 1.0
         if u.name == "time_shift":
-            # Through a tanh, which has no value beyond: slopes and likelihood are taken on past it.
             searched, start = (-MAX_TIME_SHIFT, MAX_TIME_SHIFT), 0.0
         elif free is not None:
             start = free.start
-            # Symmetric, as that of what may be zero; what it was not searched for it cannot be.
             if u.at_bound or u.name in problem.model.delay_parameters:
                 searched = transforms.limits(free)
         low, high = (float(v) for v in np.clip(ends, *searched))
@@ -288,7 +252,6 @@ def _insensitivity(e: Evaluation) -> Float[np.ndarray, " q"]:
     sds = deviations(e.J)
     known = (norms > 0) & np.isfinite(sds)
     product = norms * np.where(known, sds, 1.0)
-    # Knowing more narrows an interval; what rounding has above 1 is taken off.
     return np.minimum(1.0, np.divide(1.0, product, where=known, out=np.ones_like(norms)))
 
 
@@ -356,11 +319,8 @@ def _unit_of(problem: Problem, u: FlightUnknown) -> str:
 
 
 def without_disturbance(estimate: Estimate, *, size: bool) -> Estimate:
-    """Return the estimate of a disturbance's parameter where no disturbance shows.
-
-    Args:
-        size: whether it is a size, which is zero then, at its bound; a time means nothing.
-    """
+    """Return the estimate of a disturbance's parameter where no disturbance shows: a size is zero
+    then, at its bound; a time means nothing."""
     value = 0.0 if size else estimate.value
     return estimate._replace(value=value, sd=None, lower95=None, upper95=None, at_bound=size)
 
@@ -368,11 +328,8 @@ def without_disturbance(estimate: Estimate, *, size: bool) -> Estimate:
 def noise_by_name(
     problem: Problem, noise: Noise, scales: Mapping[str, ArrayLike]
 ) -> dict[str, float]:
-    """Return the sd of the measurement noise as 'flight/output', in the output's SI unit.
-
-    Args:
-        scales: factors on it by output that are unknowns themselves (filter error); 1 unless named.
-    """
+    """Return the sd of the measurement noise as 'flight/output', in the output's SI unit; `scales`
+    are factors by output that are unknowns themselves, 1 unless named."""
     return {
         f"{label}/{n}": float(np.asarray(sd)) * float(np.asarray(scales.get(n, 1.0)))
         for label, by_name in zip(labels(problem.training), noise.sd, strict=True)

@@ -116,11 +116,9 @@ def nuts(fit: Fit, draws: int = 500, *, warmup: int = 200, seed: int = 0) -> Pos
     def density(xi: Array) -> Array:
         return log_posterior(at.layout, at.data, at.noise, at.z + root @ xi)
 
-    @jax.custom_vjp
-    def forward(xi: Array) -> Array:
-        return density(xi)
+    forward = jax.custom_vjp(density)
 
-    # Few unknowns and long records: the gradient by forward mode, as everywhere here.
+    # Few unknowns and long records: the gradient by forward mode.
     @jax.jit
     def primal(xi: Array) -> tuple[Array, Array]:
         value, push = jax.linearize(density, xi)
@@ -149,13 +147,12 @@ def _sample(
     adaptation = blackjax.window_adaptation(
         blackjax.nuts, density, target_acceptance_rate=_TARGET, initial_step_size=0.5
     )
-    # Whitened coordinates: a tenth of a standard deviation off the optimum.
     first = 0.1 * jax.random.normal(keys[0], (q,), at.z.dtype)
     run = jax.jit(adaptation.run, static_argnums=2)
     with stages.stage(f"NUTS, warm-up of {warmup} steps"):
         (state, parameters), _ = jax.block_until_ready(run(keys[1], first, warmup))
     sampler = blackjax.nuts(density, **parameters)
-    # Chains begin apart, so that R-hat can tell whether they meet; this much of them is left out.
+    # Chains begin apart, so that R-hat can tell whether they meet.
     settling = warmup // 2
 
     # The states are blackjax's own records: `Any`.
@@ -176,8 +173,7 @@ def _sample(
 
     pairs = jax.vmap(jax.random.split)(jax.random.split(keys[2], _CHAINS))
     chains = jax.jit(jax.vmap(begin))(pairs[:, 0])
-    # Some steps at a time, so that it can be said how far the chains are; those of the last block
-    # that nobody asked for are left out.
+    # Some steps at a time, to report progress; more than `count` are left out.
     count = draws + settling
     block = -(-count // _BLOCKS)
     split = jax.vmap(lambda key: jax.random.split(key, block * _BLOCKS))(pairs[:, 1])
@@ -188,9 +184,9 @@ def _sample(
             chains, drawn = some(chains, split[:, i : i + block])
             chunks.append(jax.device_get(drawn))
             stages.advance(min(block, count - i))
-    joined = jax.tree.map(lambda *v: np.concatenate(v, axis=1)[:, settling:count], *chunks)
-    positions, statistics = joined
-    # One for all chains: it was adapted before they began.
+    positions, statistics = jax.tree.map(
+        lambda *v: np.concatenate(v, axis=1)[:, settling:count], *chunks
+    )
     size = np.broadcast_to(np.asarray(parameters["step_size"]), statistics["lp"].shape)
     return positions, {**statistics, "step_size": size}
 
@@ -236,7 +232,6 @@ def log_posterior(
     The scale of the noise is integrated out under Jeffreys' prior: of each flight and output with
     output error, the common one with filter error, unless it was fixed.
     """
-    # Draws are of all parameters together: nothing is taken up by those of the mean.
     rows = rows_of(layout, data, noise._replace(own=()), z)
     rest = jnp.concatenate([prior_rows(layout, data, z), weak_rows(layout, z)])
     # The rows of the priors come last and have no scale to be integrated out.

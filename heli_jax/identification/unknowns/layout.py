@@ -237,11 +237,7 @@ def flight_places(layout: Layout) -> list[FlightPlaces]:
 
 
 def flight_unknowns(layout: Layout, called: Sequence[str]) -> tuple[FlightUnknown, ...]:
-    """Return the unknowns from `layout.first_nuisance` on, in the order of z.
-
-    Args:
-        called: the label of each flight.
-    """
+    """Return the unknowns from `layout.first_nuisance` on, in the order of z."""
     unknowns = []
     for i, ((count, _), outputs) in enumerate(zip(layout.windows, layout.outputs, strict=True)):
         ends = [f" of window {k + 1}" if count > 1 else "" for k in range(count)]
@@ -302,15 +298,12 @@ class Unknowns(NamedTuple):
 
 
 def layout_of(problem: Problem, flights: tuple[Flight, ...]) -> Layout:
-    """The static side of a problem over the given flights.
-
-    Args:
-        flights: those whose initial states, biases and offsets stand in z, in this order.
-    """
+    """The static side of a problem over the given flights."""
     # All of it is hashable and static: two problems of one layout share their compiled programs.
     objective = objective_of(problem.method)
     scaled, concentrated = objective.scaled_outputs(problem)
     nuisance = problem.nuisance
+    exact = problem.solver == "exact" or (problem.solver is None and problem.model.linear)
     return Layout(
         model=with_sensor_noise(problem.model, tuple(problem.filtered_noise)),
         free=tuple(problem.free),
@@ -329,7 +322,8 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...]) -> Layout:
         concentrated=concentrated,
         solver=problem.solver,
         substeps=problem.substeps,
-        block=_block(problem),
+        # Several samples a step only where the recurrence is exact.
+        block=_BLOCK if exact else 1,
         windows=tuple(_windows(problem, flight) for flight in flights),
         continuity=problem.continuity,
         holds=tuple(_holds(problem.model, flight) for flight in flights),
@@ -342,12 +336,6 @@ def within_bounds(layout: Layout, problem: Problem) -> Layout:
     """The layout whose free parameters are kept within their bounds by logit coordinates."""
     kinds = tuple(transforms.kind(f) for f in problem.free.values())
     return layout if kinds == layout.kinds else dataclasses.replace(layout, kinds=kinds)
-
-
-def _block(problem: Problem) -> int:
-    """Samples that one step of the recurrence takes: several only where it is exact."""
-    exact = problem.solver == "exact" or (problem.solver is None and problem.model.linear)
-    return _BLOCK if exact else 1
 
 
 def _holds(model: Model, flight: Flight) -> tuple[str, ...]:
@@ -381,12 +369,7 @@ def _windows(problem: Problem, flight: Flight) -> tuple[int, int]:
 
 
 def value_of(layout: Layout, data: Data, i: int, z: Real) -> Any:
-    """The value of a free parameter.
-
-    Args:
-        data: its sign or scale and its bounds.
-        i: which one, in the order of `layout.free`.
-    """
+    """The value of a free parameter."""
     return transforms.to_value(layout.kinds[i], z, data.sign[i], data.low[i], data.high[i])
 
 

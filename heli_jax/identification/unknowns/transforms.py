@@ -95,11 +95,7 @@ def inside(free: Free, value: float) -> bool:
 
 
 def coordinates(free: Free, kind: str, values: Real) -> np.ndarray:
-    """The coordinates of values; infinite or NaN of those on the bounds or outside.
-
-    Args:
-        kind: one of `KINDS`.
-    """
+    """The coordinates of values; infinite or NaN of those on the bounds or outside."""
     return np.asarray(to_coordinate(kind, values, sign_or_scale(free), *limits(free)))
 
 
@@ -122,13 +118,8 @@ def at_bound(free: Free, value: float) -> bool:
 
 
 def to_value(transform: str, z: Real, sign: Real, low: Real, high: Real) -> Real:
-    """The parameter's value for a coordinate.
-
-    Args:
-        transform: one of `KINDS`.
-        sign: +1 or -1; the parameter's scale where the transform is linear (`sign_or_scale`).
-        low, high: bounds, in the parameter's unit, infinite where there is none.
-    """
+    """The parameter's value for a coordinate of one of `KINDS`; its sign is its scale where that is
+    linear (`sign_or_scale`), and a bound that is missing is infinite."""
     # Which branch is taken is known before tracing: the compiled program holds one expression.
     if transform == "log":
         return sign * jnp.exp(z)
@@ -148,13 +139,7 @@ def to_value(transform: str, z: Real, sign: Real, low: Real, high: Real) -> Real
 
 
 def to_coordinate(transform: str, x: Real, sign: Real, low: Real, high: Real) -> Real:
-    """The coordinate of a value inside the bounds: the inverse of `to_value`, of numbers alone.
-
-    Args:
-        transform: one of `KINDS`.
-        sign: as in `to_value`.
-        low, high: bounds, in the parameter's unit, infinite where there is none.
-    """
+    """The coordinate of a value inside the bounds: the inverse of `to_value`, of numbers alone."""
     # By NumPy: each step by itself would be a program of JAX's to load.
     x, sign, low, high = (np.asarray(v) for v in (x, sign, low, high))
     # A value on a bound has an infinite coordinate: callers move it inside first.

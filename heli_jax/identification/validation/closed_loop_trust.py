@@ -45,7 +45,6 @@ from heli_jax.identification.estimation.frequency_noise import (
     smoothed,
 )
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
-from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Noise, Solution
 from heli_jax.identification.validation.follows_response import Feedback
@@ -87,9 +86,6 @@ class Moved(NamedTuple):
 def moved_by_feedback(at: Solution, J: Float[np.ndarray, "n q"]) -> dict[str, Moved]:
     """By unknown of interest; empty where the method knows no frequencies, or every input that
     moves is taken by instrument.
-
-    Args:
-        at: where the fit ended.
     """
     layout, data, noise, _ = at
     if layout.objective.fits_responses:
@@ -114,7 +110,14 @@ def moved_by_feedback(at: Solution, J: Float[np.ndarray, "n q"]) -> dict[str, Mo
     room = once_a_length(functools.partial(_room, direct=direct), *spectra)
     q = len(layout.of_interest)
     whole = J[:q, :q].T @ J[:q, :q]
-    may_be, held = (shares(information(at, w), whole) for w in (room, _where_held(at)))
+    # Up to where the loop that holds an unstable mode has to reach nothing tells test from
+    # correction.
+    poles, inside = held_poles(at), []
+    for record in records_of(layout):
+        dt = float(data.flights[record.flight].dt)
+        omega = 2.0 * np.pi * np.arange(1, record.lines + 1) / (record.samples * dt)
+        inside.append((omega <= _REACHES * poles[record.flight]).astype(float))
+    may_be, held = (shares(information(at, w), whole) for w in (room, inside))
     each = zip(layout.of_interest, may_be, held, strict=True)
     return {n: Moved(float(m), float(h)) for n, m, h in each}
 
@@ -150,11 +153,7 @@ def _of_responses(at: Solution) -> dict[str, Moved]:
 
 
 def information_by_line(at: Solution) -> Float[np.ndarray, "k q q"]:
-    """Information on the unknowns of interest at each line of the windows of fitted responses.
-
-    Args:
-        at: where the fit ended.
-    """
+    """Information on the unknowns of interest at each line of the windows of fitted responses."""
     layout, data, noise, z = at
     k, r = np.asarray(noise.whitening.whitening).shape[:2]
     q = len(layout.of_interest)
@@ -164,16 +163,7 @@ def information_by_line(at: Solution) -> Float[np.ndarray, "k q q"]:
     return np.einsum("ckra,ckrb->kab", J, J)
 
 
-def held_upright(at: Solution) -> bool:
-    """True if the model is unstable and a record does not grow as it would alone.
-
-    Args:
-        at: where the fit ended.
-    """
-    return any(pole > 0.0 for pole in _held_poles(at))
-
-
-def _held_poles(at: Solution) -> list[float]:
+def held_poles(at: Solution) -> list[float]:
     """By flight |p| [rad/s] of the model's fastest unstable mode that the record would show, and
     does not: somebody holds it. 0 where there is none."""
     layout, data, *_, z = at
@@ -192,17 +182,6 @@ def _held_poles(at: Solution) -> list[float]:
         stays = alone > 0.0 and np.log(grown) < 0.5 * half * alone
         held.append(float(np.max(np.abs(growing))) / float(flight.dt) if stays else 0.0)
     return held
-
-
-def _where_held(at: Solution) -> list[Float[np.ndarray, " K"]]:
-    """By record and frequency 1 up to where the loop that holds an unstable mode has to reach, and
-    0 above: nothing tells test from correction there."""
-    held, inside = _held_poles(at), []
-    for record in records_of(at.layout):
-        dt = float(at.data.flights[record.flight].dt)
-        omega = 2.0 * np.pi * np.arange(1, record.lines + 1) / (record.samples * dt)
-        inside.append((omega <= _REACHES * held[record.flight]).astype(float))
-    return inside
 
 
 class Loop(NamedTuple):
@@ -233,11 +212,7 @@ class Loop(NamedTuple):
 
 
 def untrusted(moved: Mapping[str, Moved], loop: Loop) -> tuple[str, ...]:
-    """The parameters that a fit cannot be trusted on: nothing where no loop is closed.
-
-    Args:
-        moved: of `moved_by_feedback`.
-    """
+    """The parameters that a fit cannot be trusted on: nothing where no loop is closed."""
     if not loop.closed:
         return ()
     most = BESIDE if loop.instruments else MAY_BE
@@ -246,24 +221,12 @@ def untrusted(moved: Mapping[str, Moved], loop: Loop) -> tuple[str, ...]:
     return tuple(n for n, m in moved.items() if m.may_be > most or m.held > beyond)
 
 
-def knows_no_gusts(problem: Problem) -> bool:
-    """True if a fit is one in time without gusts in its model."""
-    objective = objective_of(problem.method)
-    in_time = not (objective.noise_model == "spectrum" or objective.fits_responses)
-    return in_time and objective.noise_model != "disturbance"
-
-
 def _room(
     W: np.ndarray, S: np.ndarray, See: np.ndarray, direct: np.ndarray
 ) -> Float[np.ndarray, " k"]:
-    """By frequency the part of the input that a constant gain may have brought in.
-
-    Args:
-        W: whitening.
-        S: spectra of inputs and outputs together.
-        See: spectra of the residual.
-        direct: by input, True if it is taken for given.
-    """
+    """By frequency the part of the input that a constant gain may have brought in, from the
+    whitening, the spectra of inputs and outputs together, those of the residual, and by input True
+    if it is taken for given (`direct`)."""
     m = S.shape[1] - See.shape[1]
     e, u = (np.real(np.einsum("kii->ki", v)) for v in (See, S[:, :m, :m]))
     u = np.where(u > 0, u, 1e-300)
@@ -313,51 +276,37 @@ _MOST = 0.25
 weak"""
 
 
-def weak_by_instrument(
-    problem: Problem, at: Solution, J: Float[np.ndarray, "n q"]
-) -> tuple[str, ...]:
-    """The unknowns of interest of which instruments tell too little; () of a fit without any.
-
-    Args:
-        at: where the fit ended.
-    """
-    layout = at.layout
+def weak_by_instrument(problem: Problem, at: Solution) -> tuple[str, ...]:
+    """The unknowns of interest of which instruments tell too little; () of a fit without any."""
+    layout, data, noise, _ = at
     if layout.noise_model != "spectrum" or not instruments_of(problem):
         return ()
     if layout.objective.fits_responses:
-        weak = _shares_of_responses(problem, at)
-    elif at.data.flights[0].by_instrument is None:
+        # By the lines of the windows of the responses.
+        flights = problem.training
+        by = instrumented_inputs(problem, flights)
+        if by is None:
+            return ()
+        signals = [(f.inputs, b) for f, b in zip(flights, by, strict=True)]
+        F = _followed(signals, [(0, f.n_samples) for f in flights])[1][0]
+        hz = np.arange(1, len(F) + 1) / (flights[0].n_samples * flights[0].dt)
+        by_line = information_by_line(at)
+        part = by_line[np.interp(noise.whitening.windows.hz, hz, F) < STRONG].sum(axis=0)
+        whole = by_line.sum(axis=0)
+    elif data.flights[0].by_instrument is None:
         return ()
     else:
-        weak = _of_lines(at)
-    return tuple(n for n, share in zip(layout.of_interest, weak, strict=True) if share > _MOST)
-
-
-def _of_lines(at: Solution) -> Float[np.ndarray, " q"]:
-    """By unknown the part that is known of frequencies at which an instrument is weak."""
-    layout, data, noise, _ = at
-    records = records_of(layout)
-    signals = [
-        (naming.asdict(flight.inputs), naming.asdict(flight.by_instrument))
-        for flight in (data.flights[r.flight] for r in records)
-    ]
-    followed, F = _followed(signals, [(r.first, r.last) for r in records])
-    direct = at._replace(noise=noise._replace(by_instrument=np.zeros(())))
-    weak = [g * (f < STRONG) for g, f in zip(followed, F, strict=True)]
-    return shares(information(direct, weak), information(direct, followed))
-
-
-def _shares_of_responses(problem: Problem, at: Solution) -> Float[np.ndarray, " q"]:
-    """The same of fitted responses, by the lines of their windows."""
-    flights, by_line = problem.training, information_by_line(at)
-    by = instrumented_inputs(problem, flights)
-    if by is None:
-        return np.zeros(by_line.shape[1])
-    signals = [(f.inputs, b) for f, b in zip(flights, by, strict=True)]
-    F = _followed(signals, [(0, f.n_samples) for f in flights])[1][0]
-    hz = np.arange(1, len(F) + 1) / (flights[0].n_samples * flights[0].dt)
-    weak = np.interp(at.noise.whitening.windows.hz, hz, F) < STRONG
-    return shares(by_line[weak].sum(axis=0), by_line.sum(axis=0))
+        records = records_of(layout)
+        signals = [
+            (naming.asdict(flight.inputs), naming.asdict(flight.by_instrument))
+            for flight in (data.flights[r.flight] for r in records)
+        ]
+        followed, F = _followed(signals, [(r.first, r.last) for r in records])
+        direct = at._replace(noise=noise._replace(by_instrument=np.zeros(())))
+        weak = [g * (f < STRONG) for g, f in zip(followed, F, strict=True)]
+        part, whole = information(direct, weak), information(direct, followed)
+    each = zip(layout.of_interest, shares(part, whole), strict=True)
+    return tuple(n for n, share in each if share > _MOST)
 
 
 def _followed(
@@ -365,12 +314,8 @@ def _followed(
     spans: Sequence[tuple[int, int]],
 ) -> tuple[list[Float[np.ndarray, " K"]], list[Float[np.ndarray, " K"]]]:
     """By record and line the least canonical correlation of the inputs with their instruments,
-    squared, and its F.
-
-    Args:
-        signals: by record its flight's inputs, and what of them follows the instruments (N,).
-        spans: first sample of each record, and that behind the last.
-    """
+    squared, and its F; by record are given its flight's inputs with what of them follows the
+    instruments (N,), and its first sample with that behind its last."""
     first = signals[0]
     names = [n for n, u in first[0].items() if np.any(np.asarray(u) != np.asarray(first[1][n]))]
     lines = []

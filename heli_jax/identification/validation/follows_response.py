@@ -59,12 +59,8 @@ class Correlated(NamedTuple):
 def correlations_with_sums(
     u: Float[np.ndarray, " N"], e: Float[np.ndarray, "N p"], blocks: Sequence[tuple[int, int]]
 ) -> Correlated:
-    """Correlate u with the sums of each column of e over each block of lags.
-
-    Args:
-        u: NaN where it is missing.
-        e: likewise, in whole rows.
-    """
+    """Correlate u with the sums of each column of e over each block of lags; both are NaN where
+    missing, e in whole rows."""
     seen = np.isfinite(u) & np.isfinite(e).all(axis=1)
     u, e = np.where(seen, u, 0.0), np.where(seen[:, None], e, 0.0)
     n, N, (power, powers) = int(seen.sum()), u.size, (float(u @ u), np.sum(e**2, axis=0))
@@ -211,7 +207,6 @@ def feedback(
     nothing where the record is too short to tell.
 
     Args:
-        flight: inputs and outputs as measured; no model is asked.
         together: number of flights that are tested side by side, for the p values.
         earlier: by input, how much earlier than logged it is to be taken [s]; none unless given.
     """
@@ -252,15 +247,12 @@ def _rates_of(flight: Flight) -> tuple[float, ...]:
     # No faster than the inputs come, nor than half of the log: when a frame of a stick began within
     # a sample, and how it moved there, is not known, and an output that answers to it would pass
     # for news.
-    frames = min([0.5, *map(_frames, flight.inputs.values())]) / flight.dt
-    fast = float(np.clip(frames, _SLOW_RATE, RATE))
+    frames = [0.5]
+    for u in flight.inputs.values():
+        at = np.flatnonzero(np.diff(u) != 0.0)
+        frames += [1.0 / float(np.median(np.diff(at)))] if at.size > 1 else []
+    fast = float(np.clip(min(frames) / flight.dt, _SLOW_RATE, RATE))
     return (fast, _SLOW_RATE) if fast > _SLOW_RATE else (fast,)
-
-
-def _frames(u: np.ndarray) -> float:
-    """Share of the samples at which a moving input has a new value."""
-    at = np.flatnonzero(np.diff(u) != 0.0)
-    return 1.0 / float(np.median(np.diff(at))) if at.size > 1 else np.inf
 
 
 class _View(NamedTuple):
@@ -277,17 +269,12 @@ class _View(NamedTuple):
 
 def _views(flight: Flight, steps: Mapping[str, int], rate: float) -> list[_View]:
     """Two pairs of what is compared; none where all outputs stay or lack too much, the record is
-    too short, or no input moves freely.
-
-    Args:
-        steps: by how many samples an input is taken earlier than logged, where it is.
-        rate: samples a second at most [Hz].
-    """
+    too short, or no input moves freely; arguments as of `_decimated`."""
     inputs, outputs, parts, dt = _decimated(flight, steps, rate)
     if not outputs or next(iter(outputs.values())).size < _LEAST:
         return []
     # Steps are slopes at a lower rate.
-    quick = _decimated(flight, steps, RATE).inputs
+    quick, *_ = _decimated(flight, steps, RATE)
     moving = [n for n in inputs if _moves_freely(quick.get(n, inputs[n]))]
     free = {n: v for n in moving if (v := _unforeseen(inputs[n], inputs[n][:, None])) is not None}
     if not free:
@@ -336,31 +323,18 @@ def _moves_freely(u: Float[np.ndarray, " N"]) -> bool:
     # A commanded input that stays for twenty samples and jumps follows nothing in between; no more
     # does one whose steps are rounded off, as a programmed doublet's: what an autoregression leaves
     # of its corners rings on into the rest, as it does in the response.
-    return bool(np.mean(np.diff(u) != 0.0) >= _MOVES) and _rests(u) <= _AT_REST
-
-
-def _rests(u: Float[np.ndarray, " N"]) -> float:
-    """The part of the samples of an input that lie in long runs of one value, or as good as one: a
-    command that passed a filter comes to rest by and by."""
+    # A command that passed a filter comes to rest by and by: runs of one value, or as good as one.
     ends = np.flatnonzero(np.abs(np.diff(u)) > _STILL * np.ptp(u))
     runs = np.diff(np.concatenate([[-1], ends, [u.size - 1]]))
-    return float(np.sum(runs[runs >= _LONG_REST])) / u.size
+    rests = float(np.sum(runs[runs >= _LONG_REST])) / u.size
+    return bool(np.mean(np.diff(u) != 0.0) >= _MOVES) and rests <= _AT_REST
 
 
-class _Decimated(NamedTuple):
-    """Signals at a moderate rate, by name."""
-
-    inputs: dict[str, np.ndarray]
-    """those that move (N,)"""
-    outputs: dict[str, np.ndarray]
-    """those that are mostly seen (N,)"""
-    parts: dict[str, np.ndarray]
-    """means over parts of a sample (N, m) of the inputs that move"""
-    dt: float
-
-
-def _decimated(flight: Flight, earlier: Mapping[str, int], rate: float) -> _Decimated:
-    """A flight averaged down.
+def _decimated(
+    flight: Flight, earlier: Mapping[str, int], rate: float
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, np.ndarray], float]:
+    """A flight averaged down: by name the inputs that move (N,), the outputs that are mostly seen
+    (N,), means over parts of a sample (N, m) of these inputs, and the sample time [s].
 
     Args:
         earlier: by how many samples an input is taken earlier than logged, where it is.
@@ -389,16 +363,13 @@ def _decimated(flight: Flight, earlier: Mapping[str, int], rate: float) -> _Deci
     inputs = {n: u for n, u in inputs.items() if u.size and np.ptp(u) > 0}
     outputs = {n: thinned(taken(y, 0)) for n, y in flight.outputs.items()}
     # A record of less than one block leaves none.
-    return _Decimated(
-        {n: thinned(u) for n, u in inputs.items()},
-        {
-            n: y
-            for n, y in outputs.items()
-            if y.size and np.mean(np.isfinite(y)) >= _SEEN and np.nanstd(y) > 0
-        },
-        {n: within(u) for n, u in inputs.items()},
-        flight.dt * every,
-    )
+    outputs = {
+        n: y
+        for n, y in outputs.items()
+        if y.size and np.mean(np.isfinite(y)) >= _SEEN and np.nanstd(y) > 0
+    }
+    parts = {n: within(u) for n, u in inputs.items()}
+    return {n: thinned(u) for n, u in inputs.items()}, outputs, parts, flight.dt * every
 
 
 # Whether the inputs of a problem's flights follow the response.

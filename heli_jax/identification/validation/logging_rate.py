@@ -77,12 +77,8 @@ class Modes(NamedTuple):
         self, k: int, problem: Problem, flight: Flight, noise: Mapping[str, Any]
     ) -> tuple[float, str, str]:
         """Return the part of mode k in the response of an output to a step of an input's size, over
-        the output's noise, where that is largest, with the input's and the output's name. If no
-        input moves: the same of the free motion, all of which is the mode that shows best.
-
-        Args:
-            noise: sd by output, SI.
-        """
+        the output's noise (sd, SI), where that is largest, with the input's and the output's name.
+        If no input moves: the same of the free motion, all of which is the mode that shows best."""
         outputs = naming.names(problem.model.Outputs)
         best = (0.0, "", "")
         if not any(np.ptp(u) > 0 for u in flight.inputs.values()):
@@ -104,9 +100,6 @@ class Modes(NamedTuple):
 def _modes_of(problem: Problem, params: Any, flight: Flight) -> Modes | None:
     """Return the model's modes about the point that stands for a flight; None where its matrices
     are not finite.
-
-    Args:
-        params: of the flight, SI.
     """
     at = operating_point(
         problem.model, params, flight.inputs, flight.outputs, flight.dt, substeps=problem.substeps
@@ -154,11 +147,7 @@ def rates_against_modes(
     problem: Problem, params: Any, flight: Flight, noise: Mapping[str, Any]
 ) -> list[Rate]:
     """Return the rates of inputs that move, and of outputs, against the fastest mode that matters;
-    none if no mode does.
-
-    Args:
-        params: the model's Params, SI.
-        noise: sd by output, SI.
+    none if no mode does. Params and the noise's sd by output are in SI.
     """
     modes = sorted(_modes_that_show(problem, params, flight, noise))
     if not modes:
@@ -210,11 +199,7 @@ def _modes_that_show(
 
 def input_rate(flight: Flight, name: str, u: Float[np.ndarray, " N"]) -> float | None:
     """Return the rate [Hz] at which an input was sampled while it moved; None if it does not move,
-    or if it is known between its samples because it was commanded in steps.
-
-    Args:
-        flight: says what the input does between samples, and who decided that.
-    """
+    or if it is known between its samples because it was commanded in steps."""
     if np.ptp(u) == 0:
         return None
     step = flight.logged_step(name, "input")
@@ -407,11 +392,7 @@ something, chi-squared's few squares tell nothing"""
 
 
 def as_good_as_aliases(modes: Sequence[FastMode], valley: Valley) -> list[FastMode]:
-    """Return the modes, each with the parameters that take it to an alias which fits as well.
-
-    Args:
-        modes: of `fast_modes` at an optimum.
-    """
+    """Return the modes, each with the parameters that take it to an alias which fits as well."""
     # A filter's rows hold the level of its variances too, and no squares to take a part of.
     if valley.at.layout.noise_model != "white":
         return list(modes)

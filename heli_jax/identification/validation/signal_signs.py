@@ -67,14 +67,8 @@ def rates_and_angles(model: Model) -> list[tuple[str, str]]:
 def angle_over_rate(
     angle: Float[np.ndarray, " N"], rate: Float[np.ndarray, " N"], dt: float
 ) -> AngleOverRate | None:
-    """Compare the motion of an angle with the integral of its rate; None if a gap is long, the
-    record is short, or the two have little in common.
-
-    Args:
-        angle: [rad], NaN where missing.
-        rate: [rad/s], likewise.
-        dt: [s].
-    """
+    """Compare the motion of an angle [rad] with the integral of its rate [rad/s], both NaN where
+    missing; None if a gap is long, the record is short, or the two have little in common."""
     steps = max(1, round(WITHIN / dt))
     if min(np.isfinite(v).sum() for v in (angle, rate)) < 2 or angle.size < (PARTS + 1) * steps:
         return None
@@ -103,22 +97,13 @@ def _log_sd(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def integral(rate: Float[np.ndarray, " N"], dt: float) -> Float[np.ndarray, " N"]:
-    """Integral of a signal with straight lines between its samples, from zero.
-
-    Args:
-        rate: without a missing sample.
-        dt: [s].
-    """
+    """Integral of a signal without gaps, in straight lines between samples of dt [s], from zero."""
     return np.concatenate([np.zeros(1), np.cumsum(0.5 * dt * (rate[1:] + rate[:-1]))])
 
 
 def over_gaps(signal: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """A signal with straight lines over its gaps, and which samples (N,) are in no long one.
-
-    Args:
-        signal: (N,), NaN where missing, two samples or more known.
-        dt: [s].
-    """
+    """A signal (N,), NaN where missing, with straight lines over its gaps, and which samples (N,)
+    are in no long one; two samples or more have to be known."""
     seen = np.flatnonzero(np.isfinite(signal))
     rows = np.arange(signal.size)
     ends = np.r_[0, seen, signal.size - 1]
@@ -170,13 +155,22 @@ def against_start(
         simulated: by flight and output (N,), SI.
         sticks: by output the input that moves it, of `sticks_of`; of others any input may.
     """
-    by_flight = [_signs(f, run) for (_, f), run in zip(flights, simulated, strict=True)]
-    for (label, flight), of_flight in zip(flights, by_flight, strict=True):
+    # By output its correlation with the simulated one, where that is sure, and the latter's sd.
+    by_flight = [
+        {
+            name: (c, float(np.std(run[name])))
+            for name, measured in f.outputs.items()
+            if (c := _surely(measured, run[name], f.dt)) is not None
+        }
+        for (_, f), run in zip(flights, simulated, strict=True)
+    ]
+    for (label, flight), signs in zip(flights, by_flight, strict=True):
         groups: dict[tuple[str, ...], dict[str, float]] = {}
-        for name, sign in of_flight.items():
-            if _counts(name, sign, by_flight):
+        for name, (correlation, size) in signs.items():
+            others = [of_flight[name] for of_flight in by_flight if name in of_flight]
+            if correlation > 0 or not any(c > 0 and sd > _MORE * size for c, sd in others):
                 of = (sticks[name],) if name in sticks else tuple(flight.inputs)
-                groups.setdefault(of, {})[name] = sign.correlation
+                groups.setdefault(of, {})[name] = correlation
         for of, group in groups.items():
             turned = {n: c for n, c in group.items() if c < 0}
             if turned and len(turned) == len(group):
@@ -194,31 +188,6 @@ def sticks_of(model: Model) -> dict[str, str]:
             names = {axis.rate, axis.angle, *(a for r, a in _PAIRS if r == axis.rate)}
             sticks |= {name: axis.stick for name in names if name is not None}
     return sticks
-
-
-class _Sign(NamedTuple):
-    """Correlation of an output with the simulated one in a flight, where it is significant."""
-
-    correlation: float
-    size: float
-    """standard deviation of the simulated one, SI"""
-
-
-def _signs(flight: Flight, run: Mapping[str, np.ndarray]) -> dict[str, _Sign]:
-    """By output of a flight, those that are sure."""
-    return {
-        name: _Sign(c, float(np.std(run[name])))
-        for name, measured in flight.outputs.items()
-        if (c := _surely(measured, run[name], flight.dt)) is not None
-    }
-
-
-def _counts(name: str, sign: _Sign, by_flight: Sequence[Mapping[str, _Sign]]) -> bool:
-    """True unless a flight that shows more of an output shows that its sign is right."""
-    others = (signs[name] for signs in by_flight if name in signs)
-    return sign.correlation > 0 or not any(
-        o.correlation > 0 and o.size > _MORE * sign.size for o in others
-    )
 
 
 def _surely(measured: np.ndarray, simulated: np.ndarray, dt: float) -> float | None:
@@ -350,12 +319,8 @@ def inputs_in_other_units(
     simulated: Sequence[Mapping[str, np.ndarray]],
     sticks: Mapping[str, str],
 ) -> Iterator[OtherUnit]:
-    """Inputs that look like degrees for radians, per cent for plain numbers, or the reverse.
-
-    Args:
-        simulated: at the start values, by flight and output (N,), SI.
-        sticks: by output the input that moves it, of `sticks_of`; of others any input may.
-    """
+    """Inputs that look like degrees for radians, per cent for plain numbers, or the reverse;
+    arguments as of `against_start`."""
     for (label, flight), run in zip(flights, simulated, strict=True):
         for name, signal in (flight.source.inputs if flight.source else {}).items():
             if signal.constant is not None:
@@ -370,12 +335,7 @@ def inputs_in_other_units(
 
 
 def scaled_by(at: Solution, name: str) -> tuple[str, ...]:
-    """The parameters that another unit of a signal would change by a good part of its factor.
-
-    Args:
-        at: where the fit ended.
-        name: of the input or output.
-    """
+    """The parameters that another unit of a signal would change by a good part of its factor."""
     layout, data = at.layout, at.data
     flights = []
     for flight in data.flights:
