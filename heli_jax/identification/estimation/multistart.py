@@ -100,13 +100,15 @@ class Search:
         if not run.cost <= _GOOD:
             nothing = self.misfit_of_nothing(noise) / measured_count(self.data)
             run = run._replace(converged=run.converged & (run.cost <= 1.5 * nothing + _GOOD))
+        if self.bounded.kinds == self.layout.kinds:
+            return run
         values = named_values(self.layout, self.data, run.z)
         left = [
             n
             for n, f in self.problem.free.items()
             if np.isfinite(values[n]) and not coordinates.inside(f, values[n])
         ]
-        if not left or self.bounded.kinds == self.layout.kinds:
+        if not left:
             return run
         # A run that left its bounds starts again in coordinates that cannot leave them.
         run = optimum(self.bounded, self._convert(start, self.layout, self.bounded))
