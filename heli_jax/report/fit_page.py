@@ -349,7 +349,14 @@ def lines(fit: Fit) -> tuple[Line, Line, Line]:
         determined = Line("warning", "Identifiable, not trusted", text)
     adequate = Line("bad", "Not adequate", f"{'; '.join(fit.denials)}.")
     if fit.adequate:
+        against = [
+            f.brief
+            for f in fit.findings
+            if f.bad and f.brief and f.code.partition(".")[0] in ("adequacy", "dynamics")
+        ]
         told = ["Nothing in the record speaks against the model"]
+        if against:
+            told = [f"The model explains most of the record, but {against[0]}"]
         for agreement, how in (
             (fit.metrics, "simulated"),
             (fit.one_step, "one step ahead"),
@@ -359,7 +366,8 @@ def lines(fit: Fit) -> tuple[Line, Line, Line]:
             if shares:
                 worst = min(shares, key=lambda n: shares[n])
                 told.append(f"VAF of {worst} {vaf_percent(shares[worst])} {how}")
-        adequate = Line("good", "Adequate", f"{'; '.join(told)}.")
+        kind, word = ("warning", "Adequate, with doubts") if against else ("good", "Adequate")
+        adequate = Line(kind, word, f"{'; '.join(told)}.")
     return Line("good", "Converged", reached), determined, adequate
 
 

@@ -208,6 +208,8 @@ def sensitivities(at: Solution, e: Evaluation) -> dict[tuple[int, str], np.ndarr
 
 _PLAY = 0.1
 """part of an input's range that a linkage's play is asked for with; other plays answer alike"""
+_DEAD = 0.02
+"""part of an input's range, to either side of zero, that a deadband is asked for with"""
 
 
 def moving_inputs(at: Solution) -> list[str]:
@@ -222,14 +224,15 @@ def moving_inputs(at: Solution) -> list[str]:
 
 def nonlinear(y: np.ndarray, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Nonlinear functions of inputs and of the `motions` of a simulated output (each (N,)), and
-    what a linkage with play keeps of the inputs."""
+    what a linkage with play, or one that is dead about zero, keeps of the inputs."""
     u = [_normal(v) for v in inputs]
     response = [_normal(v) for v in motions(y)]
     curved = [w for v in (*u, *response) for w in (np.abs(v) * v, v**2)]
     # Friction has a sign and no size.
     curved += [np.sign(v) for v in response[:2]]
     # Play depends on where the stick came from, not on where it is: no power does.
-    return [*curved, *(v - _behind_play(v) for v in u)]
+    curved += [v - _behind_play(v) for v in u]
+    return curved + [np.clip(v, *_DEAD * np.array([-1, 1]) * np.ptp(v)) for v in inputs]
 
 
 def motions(y: np.ndarray) -> tuple[np.ndarray, ...]:
