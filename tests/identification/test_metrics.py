@@ -101,3 +101,10 @@ def test_free_initial_states_of_short_windows_do_not_colour_residuals_of_a_right
     assert alarms <= 2
     assert plain > 50
     assert found > 95
+
+
+def test_white_records_fail_the_whiteness_test_one_time_in_a_hundred():
+    # By chi-squared with as many degrees of freedom as lags, 3 % of such records failed.
+    rng = np.random.default_rng(5)
+    failed = sum(not whiteness(rng.standard_normal(400)).white for _ in range(1500))
+    assert 5 <= failed <= 28
