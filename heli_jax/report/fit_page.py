@@ -328,13 +328,17 @@ class Line(NamedTuple):
     """one sentence"""
 
 
+_SPEAK_AGAINST = ("adequacy", "dynamics", "units", "timing", "quality")
+"""topics whose doubts speak against a model that is adequate"""
+
+
 def lines(fit: Fit) -> tuple[Line, Line, Line]:
     """Did the optimiser converge; what do the data determine; is the model adequate."""
     if fit.status == "not-converged":
         stopped = "The optimiser stopped before an optimum, and these numbers are no result."
         return (
             Line("bad", "Not converged", stopped),
-            Line("none", "Identifiability not judged", "The data determine numbers at an optimum."),
+            Line("none", "Identifiability not judged", "The data are asked at an optimum alone."),
             Line("none", "Adequacy not judged", "A model is judged at an optimum."),
         )
     best, runs = sum(row.optimum == 1 for row in fit.starts), len(fit.starts)
@@ -352,7 +356,7 @@ def lines(fit: Fit) -> tuple[Line, Line, Line]:
         against = [
             f.brief
             for f in fit.findings
-            if f.bad and f.brief and f.code.partition(".")[0] in ("adequacy", "dynamics")
+            if f.bad and f.brief and f.code.partition(".")[0] in _SPEAK_AGAINST
         ]
         told = ["Nothing in the record speaks against the model"]
         if against:

@@ -236,6 +236,6 @@ def _of_model(curves: _Curves, pair: HandlingPair) -> HandlingQualities:
     beyond = "w180" if w180.value > last else "2 w180"
     words = (
         f"{beyond} lies beyond the band of the flights' responses, {last / (2.0 * np.pi):.3g} Hz: "
-        "what hangs on it is the model's word alone"
+        "values there are the model's, extrapolated"
     )
     return qualities._replace(sentences=(*qualities.sentences, words))

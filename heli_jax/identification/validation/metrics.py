@@ -169,9 +169,8 @@ def whiteness(
 
     Args:
         residual: (N,), any unit.
-        together: how many signals are judged side by side: the p value is multiplied by it
-            (Bonferroni), so that one in a hundred white records fails, not one in a hundred
-            signals.
+        together: how many signals are judged side by side: p is that of the least of as many, so
+            that one in a hundred white records fails, not one in a hundred signals.
         fitted: (N, k) what of the signal the unknowns could follow, see `seen_autocorrelation`.
     """
     fitted = None if fitted is None else fitted[kept(residual)]
@@ -184,8 +183,8 @@ def whiteness(
     # Few lags see a short memory that many lags would drown; both must agree with white noise.
     short = min(lags, 20)
     p_all, p_short = (_chance(q[k - 1], k, n) for k in (lags, short))
-    # Bonferroni again, for two tests of each signal.
-    p = min(1.0, 2.0 * together * min(p_all, p_short))
+    # Two tests of each signal (Sidak, 1967).
+    p = -np.expm1(2 * together * np.log1p(-min(p_all, p_short, 1.0 - 1e-12)))
     outside = float(np.mean(np.abs(r) * whole > band99(pairs, whole)))
     return Whiteness(bool(p > 0.01), float(p), lags, outside, float(r[0] * whole[0]))
 
