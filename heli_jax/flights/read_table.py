@@ -7,7 +7,6 @@ forward is told by its repeated values (`repeats.carried_on`).
 """
 
 import itertools
-import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,9 +18,9 @@ from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.clock import (
     ROWS,
     clock_scale,
-    contradicted_rate,
     counted,
     require_increasing,
+    require_likely,
     unit_notes,
     with_runs,
 )
@@ -30,11 +29,19 @@ from heli_jax.flights.describe import TimeInfo, describe_table
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.formats.arrays import SEGMENT, ArrayTable
 from heli_jax.flights.grid import LATEST, without_overflow
-from heli_jax.flights.log import ChannelLog, TableRows, Topic, as_floats
+from heli_jax.flights.log import (
+    ChannelLog,
+    Table,
+    TableRows,
+    Topic,
+    as_floats,
+    column,
+    listed,
+    shown,
+    wrong,
+)
 from heli_jax.flights.request import Request
 from heli_jax.flights.resample import SLOWER, usual_step
-from heli_jax.flights.table import Table, column, listed, shown, wrong
-from heli_jax.flights.time_units import require_likely
 
 _SHARED = 0.1
 """of the rows of the smaller of two topics that hold the other too, at most: stamps may coincide"""
@@ -113,10 +120,9 @@ def _checked(
         raise wrong(table.path, problem, table.place(row), column(time.name))
     stamps = without_overflow(stamps)
     require_increasing(table, time.name, stamps)
-    step = float(np.median(np.diff(stamps))) * scale if stamps.size > 1 else math.inf
-    cautions = contradicted_rate(table, time.name, 1.0 / step)
+    cautions: tuple[Finding, ...] = ()
     if not stated and time.scale == 1.0:
-        cautions += require_likely(table.path, time.name, time.unit, stamps, time.assumed)
+        cautions = require_likely(table.path, time.name, time.unit, stamps, time.assumed)
     return said, cautions
 
 

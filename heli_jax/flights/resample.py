@@ -6,7 +6,6 @@ samples' unit, NaN where too much is missing. Holds take times from the first st
 """
 
 import functools
-from dataclasses import dataclass
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -29,15 +28,6 @@ _CELLS = 16
 0.1 % off what is at 0.4 of the rate"""
 
 
-@dataclass(frozen=True)
-class Clock:
-    """Grid to sample at: `times` (M,) [s], `dt` apart, with notes for the reader."""
-
-    times: np.ndarray
-    dt: float
-    notes: tuple[Finding, ...]
-
-
 def longest_gap(seconds: np.ndarray) -> float:
     """The longest step [s] between stamps (N,) [s] that may be bridged."""
     # The larger of the two: in a slow log a few steps are longer than the time, and in a fast one
@@ -45,20 +35,16 @@ def longest_gap(seconds: np.ndarray) -> float:
     return max(_GAP_STEPS * float(np.median(np.diff(seconds))), _GAP_SECONDS)
 
 
-def new_clock(seconds: np.ndarray, rate: float) -> Clock:
-    """A uniform clock of `rate` [Hz] from the first of the stamps (N,) [s] to the last."""
+def rate_notes(seconds: np.ndarray, rate: float) -> list[Finding]:
+    """Notes on what becomes of samples at these stamps (N,) [s] at a rate [Hz]."""
     usual = float(np.median(np.diff(seconds)))
-    # The last sample is not lost to the rounding of its stamp.
-    count = int(np.floor((seconds[-1] - seconds[0]) * rate + 1e-6)) + 1
-    # Counted and multiplied, never added up: the sum of 1e6 rounded steps would drift.
     words = f"resampled to {rate:.6g} Hz from about {1 / usual:.6g} Hz"
-    notes = [note("resampling.rate", words, value=1 / usual)]
-    notes += _long_steps(seconds, usual)
+    notes = [note("resampling.rate", words, value=1 / usual), *_long_steps(seconds, usual)]
     if rate * usual < _GOES_DOWN:
         passed = PASSED * rate
         words = f"low-pass filtered first: {passed:.3g} Hz and below pass, not held inputs"
         notes.append(note("resampling.low-passed", words, value=passed))
-    return Clock(seconds[0] + np.arange(count) / rate, 1.0 / rate, tuple(notes))
+    return notes
 
 
 def _long_steps(seconds: np.ndarray, usual: float) -> tuple[Finding, ...]:

@@ -11,7 +11,6 @@ import numpy as np
 
 from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.clock import (
-    COUNTS_ROWS,
     ROWS,
     counted,
     is_called_time,
@@ -19,11 +18,10 @@ from heli_jax.flights.clock import (
 )
 from heli_jax.flights.describe import LogInfo, describe_table
 from heli_jax.flights.formats.arrays import ArrayTable, by_clocks
-from heli_jax.flights.log import ChannelLog, as_floats
+from heli_jax.flights.log import ChannelLog, Table, as_floats, shown, wrong
 from heli_jax.flights.marks import without_marks
 from heli_jax.flights.open_log import chosen_flights, open_flights
 from heli_jax.flights.read_table import in_runs, rate_note
-from heli_jax.flights.table import Table, shown, wrong
 from heli_jax.new_config.guess import Series
 
 _ASSUMED = 100.0
@@ -177,9 +175,8 @@ def _from_first(stamps: np.ndarray, duration: float) -> np.ndarray:
 
 def _without_time(info: LogInfo) -> str:
     """Reason why none of a table's columns is a time."""
-    strays = next((f"{shown(c.name)}: {c.strays}" for c in info.columns if c.strays), "")
-    notes = [strays, *(n.sentence for n in info.notes if n.code == COUNTS_ROWS)]
-    return "; ".join(filter(None, ("no column is a time", *notes)))
+    strays = next((f"; {shown(c.name)}: {c.strays}" for c in info.columns if c.strays), "")
+    return f"no column is a time{strays}"
 
 
 def _is_known(values: np.ndarray) -> bool:

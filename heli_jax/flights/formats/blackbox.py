@@ -28,8 +28,7 @@ from heli_jax.flights.formats.blackbox_frames import (
     narrowed,
     read_header,
 )
-from heli_jax.flights.log import ChannelLog, Topic
-from heli_jax.flights.table import wrong
+from heli_jax.flights.log import ChannelLog, Topic, wrong
 from heli_jax.regular_file import read_regular
 
 _LARGEST = 10**9

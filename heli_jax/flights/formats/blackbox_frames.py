@@ -17,7 +17,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from heli_jax.flights.table import shown, wrong
+from heli_jax.flights.log import shown, wrong
 
 Decoded = tuple[np.ndarray, np.ndarray]
 

@@ -22,9 +22,9 @@ import numpy as np
 from heli_jax import units
 from heli_jax.finding import Finding, note
 from heli_jax.flights import progress
+from heli_jax.flights.clock import is_date, seconds_of_dates, time_unit
 from heli_jax.flights.formats.arrow import floats
-from heli_jax.flights.progress import Digest
-from heli_jax.flights.table import (
+from heli_jax.flights.log import (
     Budget,
     Survey,
     column,
@@ -34,7 +34,7 @@ from heli_jax.flights.table import (
     shown,
     wrong,
 )
-from heli_jax.flights.time_units import is_date, seconds_of_dates, time_unit
+from heli_jax.flights.progress import Digest
 from heli_jax.regular_file import read_regular, size_words
 
 # Imported again within the functions that need it: it takes a quarter of a second, which

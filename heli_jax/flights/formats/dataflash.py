@@ -17,8 +17,7 @@ import numpy as np
 
 from heli_jax.finding import note
 from heli_jax.flights import progress
-from heli_jax.flights.log import ChannelLog, Topic, require_samples, sharing_clocks
-from heli_jax.flights.table import wrong
+from heli_jax.flights.log import ChannelLog, Topic, require_samples, wrong
 from heli_jax.regular_file import read_regular
 
 # The first message of a log is the format of formats: two bytes with which every message begins,
@@ -39,6 +38,8 @@ FIELDS: dict[str, tuple[str, float | None]] = {
     "L": ("<i4", 1e-7), "d": ("<f8", None), "M": ("<i1", None), "q": ("<i8", None),
     "Q": ("<u8", None),
 }  # fmt: skip
+_APART = 1.0
+"""s before and after the board's time that a message may have some"""
 _FEWEST_ROWS = 10
 """of a message, from which on a time that is out of order stands out"""
 # New firmware counts microseconds, old firmware milliseconds.
@@ -384,7 +385,14 @@ def _clock(table: _Table, board: tuple[float, float] | None) -> str:
     clocks = _clocks(table)
     if board is None or (len(clocks) < 2 and "Week" not in table.form.columns):
         return next(iter(clocks), "")
-    return next(iter(sharing_clocks({c: table.rows[c] * _CLOCKS[c] for c in clocks}, board)), "")
+    first, last = board
+    shares = {}
+    for clock in clocks:
+        times = table.rows[clock] * _CLOCKS[clock]
+        inside = (times >= first - _APART) & (times <= last + _APART)
+        shares[clock] = float(np.mean(inside)) if times.size else 0.0
+    nearest = max(shares, key=lambda clock: shares[clock])
+    return nearest if shares[nearest] > 0.5 else ""
 
 
 def _topic(name: str, table: _Table, rows: np.ndarray, clock: str, scaled: bool) -> Topic:

@@ -13,7 +13,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ from heli_jax.flights.formats.arrays import (
     holds_numbers,
     text_of,
 )
-from heli_jax.flights.table import Budget, listed, shown, wrong
+from heli_jax.flights.log import Budget, listed, shown, wrong
 from heli_jax.regular_file import read_regular
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -51,7 +51,6 @@ _MOST_REFERENCES = 1000
 """of an array of references that are followed"""
 _DEEPEST = 10
 """groups, structures and references within one another"""
-_LONGEST_TEXT = 1000
 _NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
 """the name that NetCDF 4 gives to a dimension without values, which stands in the file as zeros"""
 
@@ -176,10 +175,6 @@ def _matlab(path: Path, sets: DataSets) -> None:
         kind = value.dtype
         if kind.names and "_Class" in kind.names:
             objects[name] = str(value.ravel()[0]["_Class"])  # a table, a timetable, ...
-        elif kind.kind == "U":
-            texts = [text.strip("\0 ") for text in value.ravel()[:MOST_ELEMENTS].tolist()]
-            texts = [text for text in texts if len(text) <= _LONGEST_TEXT]
-            sets.labels |= dict(zip(_indexed(name, len(texts)), texts, strict=True))
         elif kind.names or kind.kind == "O":
             # Structures, or cells; in MATLAB's order, the columns first.
             elements = value.ravel("F")[:MOST_ELEMENTS]
@@ -188,7 +183,7 @@ def _matlab(path: Path, sets: DataSets) -> None:
                     take(f"{path}.{field}", element[field], depth + 1)
                 if not kind.names:
                     take(path, element, depth + 1)
-        else:
+        elif kind.kind != "U":
             sets.add(name, value, {})
 
     for name, value in loadmat(path).items():
@@ -252,13 +247,12 @@ class _Hdf5:
                 self.visit(item[key], f"{name}{between}{leaf}" if name else leaf, depth + 1)
 
     def data_set(self, item: Any, name: str, depth: int) -> None:
-        """Take in one data set: texts, references or numbers."""
+        """Take in one data set: references or numbers."""
         sets, size, kind = self.sets, int(item.size or 0), item.dtype
         matlab_class = text_of(item.attrs.get("MATLAB_class", ""))
-        if matlab_class == "char":
-            if 0 < size <= _LONGEST_TEXT:
-                sets.labels[name] = "".join(map(chr, np.ravel(self.content(item))))
-        elif kind.kind == "O" and self.h5py.check_ref_dtype(kind) is not None:
+        if matlab_class == "char" or kind.kind == "S":
+            return
+        if kind.kind == "O" and self.h5py.check_ref_dtype(kind) is not None:
             if not self.is_matlab or not 0 < size <= _MOST_REFERENCES:
                 return
             parent, _, field = name.rpartition(".")
@@ -268,11 +262,6 @@ class _Hdf5:
                 path = f"{name}[{i}]" if is_cell else f"{parent}[{i}].{field}"
                 if reference:
                     self.visit(item.file[reference], path, depth + 1)
-        elif kind.kind in "SO":
-            if 0 < size <= MOST_ELEMENTS and kind.itemsize <= _LONGEST_TEXT:
-                texts: Sequence[Any] = list(np.ravel(self.content(item)))
-                if all(isinstance(t, bytes | str) and len(t) <= _LONGEST_TEXT for t in texts):
-                    sets.add_texts(name, texts)
         elif not holds_numbers(kind, item.ndim):
             sets.leave_out(name, kind, item.shape)
         elif not text_of(item.attrs.get("NAME", "")).startswith(_NO_VARIABLE):
