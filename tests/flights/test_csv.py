@@ -101,7 +101,6 @@ READ = {
     "a rule": ("a.csv", text(TUP, "-----")),
     "a separator": ("a.csv", text("sep=;", "t;u;p", between=";")),
     "units below": ("a.csv", text(TUP, "[s],[-],[deg/s]")),
-    "units above": ("a.csv", text("s,-,deg/s", TUP)),
     "units in capitals": ("a.csv", text(TUP, "SEC,PCT,DEG/SEC")),
     "a delimiter at the end": ("a.csv", text("t,u,p", end=",")),
     "empty rows at the end": ("a.csv", text("t;u;p;;", between=";", end=";;") + ";;;;\n" * 30),
@@ -115,7 +114,7 @@ READ = {
     "German dates": ("a.csv", text("t;u;p", between=";", first=times("%d.%m.%Y %H:%M:%S,%F"))),
     "times of day": ("a.csv", text(TUP, first=times("%H:%M:%S.%F"))),
 }  # fmt: skip
-NOTED = {"units below": "text.units-line", "units above": "text.units-line",
+NOTED = {"units below": "text.units-line",
          "units in capitals": "text.units-line", "a last line cut off": "text.line-cut-off",
               "names and units in comments": "text.units-line"}  # fmt: skip
 
@@ -199,7 +198,7 @@ REFUSED = {
     ),
     "a text behind quotes": (
         with_cell(2, "t", '"0.04\n"').replace("0.100000,0", "0.100000,zwei"),
-        "line 8, column 'u'",
+        "line 4",
     ),
     "an open quote": (with_cell(4, "p", '"4'), "line 6"),
     "a column twice": (text("t,u,u"), "'u'"),
