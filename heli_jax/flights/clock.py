@@ -21,7 +21,6 @@ from heli_jax.flights.grid import not_increasing, shared_stamps, without_overflo
 from heli_jax.flights.log import (
     Survey,
     Table,
-    TableView,
     column,
     listed,
     require_columns,
@@ -399,9 +398,12 @@ def by_rate(rate: float, counter: str | None = None) -> Signal:
     return Signal(counter or ROWS, "s", "s", scale=1.0 / rate)
 
 
-def counted(table: Table) -> Table:
-    """A table of which the numbers of the rows can be asked for as a column, `ROWS`."""
-    return TableView(table, columns={ROWS: None})
+def columns_of(table: Table, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """The columns of a table as float64 (N,), `ROWS` as the numbers of its rows, from 0."""
+    own = [name for name in names if name != ROWS] or [table.names[0]]
+    columns = table.numbers(list(dict.fromkeys(own)))
+    columns[ROWS] = np.arange(columns[own[0]].size, dtype=np.float64)
+    return {name: columns[name] for name in names}
 
 
 def stated_rate(surveys: Sequence[Survey]) -> tuple[float, str] | None:
@@ -467,33 +469,28 @@ def restarts(stamps: np.ndarray) -> np.ndarray:
     return falls if anew.all() else none
 
 
-def _changes(numbers: np.ndarray) -> np.ndarray:
-    """The rows (n,) in which the number of a run is another than in the row before."""
-    return np.flatnonzero(np.diff(numbers) != 0) + 1
-
-
 def with_runs(
-    table: Table, clock: str, numbers: Mapping[str, np.ndarray], scale: float, column: str = ""
-) -> Table:
-    """A table whose runs follow one another; as it is where it holds one.
+    table: Table, clock: str, columns: Mapping[str, np.ndarray], scale: float, runs: str = ""
+) -> tuple[dict[str, np.ndarray], tuple[Finding, ...]]:
+    """Return the columns (N,) with a clock in which runs follow one another, and a note; as they
+    are where the table holds one run.
 
     Args:
-        numbers: that column (N,), and the one that numbers runs.
+        columns: of the table, the clock among them.
         scale: [s] of a unit of the stamps.
-        column: that numbers runs; without one they begin where the time does.
+        runs: the column that numbers runs; without one they begin where the time does.
     """
-    stamps = numbers[clock]
-    starts = _changes(numbers[column]) if column else restarts(stamps)
+    stamps = columns[clock]
+    starts = np.flatnonzero(np.diff(columns[runs])) + 1 if runs else restarts(stamps)
     if not starts.size:
-        return table
+        return dict(columns), ()
     apart = stamps.copy()
     for start in starts:
         apart[start:] += apart[start - 1] - apart[start] + _BETWEEN / scale
     places = listed(table.place(int(start)) for start in starts)
-    why = f"{shown(column)} is another" if column else "the time begins anew"
+    why = f"{shown(runs)} is another" if runs else "the time begins anew"
     words = (
         f"{why} in {places}: {starts.size + 1} runs, put one after another with "
         f"{_BETWEEN:g} s between"
     )
-    said = note("clock.runs", words, value=starts.size + 1)
-    return TableView(table, columns={clock: apart}, note=said)
+    return {**columns, clock: apart}, (note("clock.runs", words, value=starts.size + 1),)

@@ -238,19 +238,18 @@ def describe_table(
     """
     surveys = table.survey()
     signal, guessed, said = table_clock(table, surveys, time, unit, rate)
-    starts = np.zeros(0, int)
-    if signal is not None and signal.name != ROWS:
-        stamps = _values(surveys, signal.name)
-        if (starts := restarts(stamps)).size:
+    clock = None
+    if signal is not None:
+        rows = np.arange(_n_rows(surveys), dtype=np.float64)
+        stamps = rows if signal.name == ROWS else _values(surveys, signal.name)
+        runs = restarts(stamps).size + 1
+        if runs > 1:
             scale = clock_scale(table, signal)
-            table = with_runs(table, signal.name, {signal.name: stamps}, scale)
-            surveys = table.survey()
+            stamps = with_runs(table, signal.name, {signal.name: stamps}, scale)[0][signal.name]
+        clock = replace(_describe_time(table, signal, stamps, guessed), said=said, runs=runs)
     # A stamp is never taken as missing: a wrong one is refused with its row.
     measured = [s for s in surveys if signal is None or s.name != signal.name]
     marks = mark_notes((s.name, s.values) for s in measured if s.values is not None)
-    clock = None if signal is None else _describe_time(table, surveys, signal, guessed)
-    if clock is not None:
-        clock = replace(clock, said=said, runs=starts.size + 1)
     return LogInfo(
         path=table.path,
         format=table.format,
@@ -317,11 +316,7 @@ def _values(surveys: list[Survey], name: str) -> np.ndarray:
     return values
 
 
-def _describe_time(table: Table, surveys: list[Survey], signal: Signal, guessed: bool) -> TimeInfo:
-    if signal.name == ROWS:
-        stamps = np.arange(_n_rows(surveys), dtype=np.float64)
-    else:
-        stamps = _values(surveys, signal.name)
+def _describe_time(table: Table, signal: Signal, stamps: np.ndarray, guessed: bool) -> TimeInfo:
     if signal.name == ROWS or signal.scale != 1.0:
         clock = _describe_stamps(signal.name, "s", stamps, signal.scale)
         return replace(clock, guessed=guessed, counted=round(1.0 / signal.scale, 9))

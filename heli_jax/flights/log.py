@@ -3,7 +3,6 @@
 A table of rows becomes a log of one topic (`heli_jax/flights/read_table.py`).
 """
 
-import dataclasses
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -179,57 +178,6 @@ class Table(Protocol):
     def time_unit(self, name: str) -> str | None:
         """The unit of a column that holds stamps of a clock by its type, otherwise None."""
         ...
-
-
-class TableView:
-    """A `Table` with columns (N,) in place of another's, or beside them; None stands for the
-    numbers of its rows."""
-
-    def __init__(
-        self,
-        table: Table,
-        columns: Mapping[str, np.ndarray | None],
-        note: Finding | None = None,
-    ) -> None:
-        self.table, self._columns = table, columns
-        self.path, self.format, self.size = table.path, table.format, table.size
-        self.names = tuple(dict.fromkeys((*table.names, *columns)))
-        self.units = table.units
-        self.notes = (*table.notes, *([note] if note else []))
-
-    @property
-    def sha256(self) -> str:
-        """SHA-256 of the file."""
-        return self.table.sha256
-
-    def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """The columns as float64 (N,), NaN where a cell is empty."""
-        own = [n for n in names if n not in self._columns] or [self.table.names[0]]
-        columns = self.table.numbers(list(dict.fromkeys(own)))
-        count = columns[own[0]].size
-        for name, values in self._columns.items():
-            columns[name] = np.arange(count, dtype=np.float64) if values is None else values
-        return {n: columns[n] for n in names}
-
-    def survey(self) -> list[Survey]:
-        """Every column of the file, in its order."""
-        made = []
-        for each in self.table.survey():
-            values = self._columns.get(each.name)
-            made.append(each if values is None else dataclasses.replace(each, values=values))
-        return made
-
-    def place(self, row: int) -> str:
-        """The place of a row in the file."""
-        return self.table.place(row)
-
-    def cell_text(self, name: str, row: int) -> str:
-        """The content of a cell, in words."""
-        return self.table.cell_text(name, row) if name in self.table.names else str(row)
-
-    def time_unit(self, name: str) -> str | None:
-        """The unit of a column of time stamps."""
-        return self.table.time_unit(name) if name in self.table.names else None
 
 
 # Channels.

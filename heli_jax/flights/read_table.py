@@ -18,7 +18,7 @@ from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.clock import (
     ROWS,
     clock_scale,
-    counted,
+    columns_of,
     require_increasing,
     require_likely,
     unit_notes,
@@ -67,12 +67,10 @@ def load_table(table: Table, request: Request) -> ChannelLog:
             names += sources(signal.name, known, request.options.swashplate)
         except ValueError as e:
             raise wrong(table.path, str(e), column(signal.name)) from e
-    names = list(dict.fromkeys(names))
-    table = counted(table) if time.name == ROWS else table
-    numbers = table.numbers(names)
+    numbers = columns_of(table, list(dict.fromkeys(names)))
+    said: tuple[Finding, ...] = ()
     if request.options.split:
-        table = with_runs(table, time.name, numbers, clock_scale(table, time), runs)
-        numbers = table.numbers(names)
+        numbers, said = with_runs(table, time.name, numbers, clock_scale(table, time), runs)
     stamps = numbers[time.name]
     # Stamps that are no clock are refused with their line.
     is_clock = stamps.size and np.isfinite(stamps).all() and np.all(np.diff(stamps) >= 0)
@@ -82,11 +80,11 @@ def load_table(table: Table, request: Request) -> ChannelLog:
         columns = {s.name: log.channel(s.name).values for s in request.signals.values()}
         inputs = {s.name for (_, kind), s in request.signals.items() if kind == "input"}
         if is_joined(stamps * clock_scale(table, time), columns, inputs):
-            return without_joins(log, joined=True)
-    said, cautions = _checked(table, time, stamps)
+            return without_joins(replace(log, notes=(*log.notes, *said)), joined=True)
+    units_said, cautions = _checked(table, time, stamps)
     # A counter that began anew is a clock once it goes on.
     log = log or with_derived(_with_clock(table, numbers, time), request.options.swashplate)
-    return replace(log, notes=(*log.notes, *said), cautions=cautions)
+    return replace(log, notes=(*log.notes, *said, *units_said), cautions=cautions)
 
 
 def _with_clock(
@@ -108,7 +106,8 @@ def _checked(
     table: Table, time: Signal, stamps: np.ndarray
 ) -> tuple[tuple[Finding, ...], tuple[Finding, ...]]:
     """Refuse stamps (N,) that are no clock; return notes on their unit, and cautions."""
-    stated, scale = table.time_unit(time.name), clock_scale(table, time)
+    stated = None if time.name == ROWS else table.time_unit(time.name)
+    scale = clock_scale(table, time)
     # A type is unmistakable; only words may be meant for something else.
     is_sure = time.scale != 1.0 or (stated and not table.units.get(time.name))
     said = () if is_sure else unit_notes(time, stated)
@@ -127,15 +126,6 @@ def _checked(
 
 
 # Without a request: the clock is guessed, and all columns are taken.
-
-
-def in_runs(table: Table, clock: TimeInfo) -> Table:
-    """Return a table with its runs one after another, where its clock begins anew."""
-    if clock.runs < 2:
-        return table
-    return with_runs(
-        table, clock.column, table.numbers([clock.column]), clock_scale(table, clock.signal)
-    )
 
 
 def rate_note(clock: TimeInfo) -> Finding:
@@ -184,8 +174,11 @@ def guessed_log(table: Table, time: str | None, unit: str | None, rate: float | 
     twice = next((n for n in names if names.count(n) > 1), None)
     if twice is not None:
         raise wrong(table.path, f"two columns are named {shown(twice)}, expected different names")
-    table = counted(table) if clock.column == ROWS else in_runs(table, clock)
-    numbers = table.numbers(list(dict.fromkeys([*names, clock.column])))
+    numbers = columns_of(table, list(dict.fromkeys([*names, clock.column])))
+    if clock.runs > 1:
+        scale = clock_scale(table, clock.signal)
+        numbers, said = with_runs(table, clock.column, numbers, scale)
+        notes += said
     log = _with_clock(table, numbers, clock.signal, "the table")
     return replace(log, notes=(*notes, *log.notes))
 
