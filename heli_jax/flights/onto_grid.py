@@ -167,27 +167,16 @@ def topic_clock(log: ChannelLog, topic: Topic, window: tuple[float, float] | Non
     return clock
 
 
-def signals_of(
-    log: ChannelLog, request: Request
-) -> tuple[dict[Key, ClockedSignal], tuple[Finding, ...]]:
-    """Return the signals in SI inside the window, each on the clock of its topic, and notes."""
+def signals_of(log: ChannelLog, request: Request) -> dict[Key, ClockedSignal]:
+    """Return the signals in SI inside the window, each on the clock of its topic."""
     clocks: dict[str, TopicClock] = {}
-    numbers: dict[Key, np.ndarray] = {}
-    topics: dict[str, list[Key]] = {}
+    signals = {}
     for key, signal in request.signals.items():
-        topic = log.topic_of(signal.name)
-        numbers[key] = log.channel(signal.name).values
+        topic, channel = log.topic_of(signal.name), log.channel(signal.name)
         if topic.name not in clocks:
             clocks[topic.name] = topic_clock(log, topic, request.options.window)
-        topics.setdefault(topic.name, []).append(key)
-    notes: tuple[Finding, ...] = ()
-    signals = {}
-    for name, keys in topics.items():
-        inputs = {request.signals[k].name: numbers[k] for k in keys if k[1] == "input"}
-        clock, said = _of_known_inputs(clocks[name], inputs)
-        notes += said
-        signals |= {key: _in_si(log, request, key, numbers[key], clock) for key in keys}
-    return {key: signals[key] for key in request.signals}, notes
+        signals[key] = _in_si(log, request, key, channel.values, clocks[topic.name])
+    return signals
 
 
 def _in_si(
@@ -210,31 +199,6 @@ def _in_si(
     cell = f"{numbers[i]:g}" if is_derived else table.cell_text(signal.name, row)
     problem = f"got {cell}, expected a finite number{more}"
     raise wrong(log.path, problem, table.place(row), column(signal.name))
-
-
-def _of_known_inputs(
-    clock: TopicClock, inputs: Mapping[str, np.ndarray]
-) -> tuple[TopicClock, tuple[Finding, ...]]:
-    """Leave out the rows before an input's first value or behind its last, with a note.
-
-    An input is somewhere all the time, and where it was before its first value nobody knows: a
-    table whose cells are filled with the last value begins so, with the topic that came first.
-    """
-    count = clock.seconds.size
-    first, stop, cut = 0, count, []
-    for name, numbers in inputs.items():
-        known = np.flatnonzero(~np.isnan(numbers[clock.rows]))
-        # Of a column without any value the first row is told.
-        if known.size and known[-1] - known[0] + 1 < count:
-            first, stop = max(first, int(known[0])), min(stop, int(known[-1]) + 1)
-            cut.append(name)
-    if not cut or stop - first < FEWEST:
-        return clock, ()
-    where = f"from {clock.seconds[first]:.6g} s to {clock.seconds[stop - 1]:.6g} s"
-    left = count - (stop - first)
-    words = f"{', '.join(map(shown, cut))}: no value before or behind, {left} rows are left out"
-    said = note("windows.inputs-known", f"the flight is {where}: {words}", *cut, value=left)
-    return clock.part(slice(first, stop)), (said,)
 
 
 def window_note(

@@ -109,7 +109,7 @@ def read_parts(
         key: dataclasses.replace(s, values=measured(request.signals[key], s.values))
         if key[1] == "output"
         else s
-        for key, s in _clocked(logs, request)[0].items()
+        for key, s in _clocked(logs, request).items()
     }
     rate = options.rate
     needed = clocks_of(signals.values()) if rate is None else on_all_the_time(signals, rate)
@@ -247,25 +247,22 @@ def _opened(
     return _Opened(log, keys, tuple(beside), everything, inputs)
 
 
-def _clocked(
-    logs: _Opened, request: Request
-) -> tuple[dict[Key, ClockedSignal], tuple[Finding, ...]]:
+def _clocked(logs: _Opened, request: Request) -> dict[Key, ClockedSignal]:
     """The signals inside the window, each on its clock, in seconds from the first log's
-    beginning, and notes."""
-    signals, notes = signals_of(logs.log, _only(request, logs.keys))
+    beginning."""
+    signals = signals_of(logs.log, _only(request, logs.keys))
     for one in logs.beside:
         signals |= {key: _within(s, request) for key, s in one.signals.items()}
-    return signals, notes
+    return signals
 
 
 def _flight(logs: _Opened, request: Request) -> Flight:
     """The flight inside the window, with its constant inputs."""
     log = logs.log
     try:
-        signals, more = _clocked(logs, request)
-        notes = (*log.notes, *_beyond(logs, request), *(one.note for one in logs.beside), *more)
+        notes = (*log.notes, *_beyond(logs, request), *(one.note for one in logs.beside))
         flight = flight_of_signals(
-            signals,
+            _clocked(logs, request),
             request,
             Source(
                 log.path,
@@ -340,14 +337,14 @@ def _beside(log: ChannelLog, request: Request, also: Also) -> tuple[_Beside, Req
     file = also.log or open_log(asked.path, asked.options.number)
     other = _open(asked, file)
     asked = with_file_units(other, asked)
-    signals, _ = signals_of(other, asked)
+    signals = signals_of(other, asked)
     name = Path(also.path).name
     stated = f"{name} (sha256 {file.sha256[:12]})"
     if also.same:
         lag, said = _aligned(log, request, also, file, stated)
     else:
         lag = float(other.begin - log.begin)
-        ours = signals_of(log, _only(request, frozenset(request.signals), whole=True))[0]
+        ours = signals_of(log, _only(request, frozenset(request.signals), whole=True))
         said = _as_one(request, also, _span(ours, log.begin), _span(signals, other.begin), stated)
     shifted = {}
     for key, signal in signals.items():
@@ -371,8 +368,8 @@ def _aligned(
     # Apart from the others, since it may well be one of them.
     options = ReadOptions(number=also.number)
     alone = Request(also.path, also.time, {}, {also.same: Signal(also.to, "1", "1")}, options)
-    reference = signals_of(log, _only(request, frozenset({key}), whole=True))[0][key].timed
-    (twin,) = signals_of(_open(alone, file), alone)[0].values()
+    reference = signals_of(log, _only(request, frozenset({key}), whole=True))[key].timed
+    (twin,) = signals_of(_open(alone, file), alone).values()
     reference = reference._replace(values=measured(request.signals[key], reference.values))
     # A scale does not matter for it, so that no unit is asked for.
     motion = (-1.0 if also.reverse else 1.0) * without_marks(twin.values)

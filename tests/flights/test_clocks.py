@@ -7,7 +7,6 @@ from heli_jax.errors import InputError
 from heli_jax.flights import Signal, describe_log, read_flight
 from heli_jax.flights.clock import likely_unit, split_unit, time_unit
 from heli_jax.flights.convert import Selection, convert_log
-from heli_jax.flights.resample import rate_notes
 
 N, DT = 300, 0.01
 T = DT * np.arange(N)
@@ -151,19 +150,3 @@ def test_a_counter_of_32_bits_goes_on_and_other_faults_are_refused_with_their_li
     ):
         with pytest.raises(InputError, match=f"line {line}, column 't'"):
             read(stamped(tmp_path, [f"{s:.3f}" for s in stamps]))
-
-
-def test_a_step_of_the_clock_is_told_with_its_time():
-    t = 0.01 * np.arange(6000)
-    t[3000:] += 0.1
-    said = [n for n in rate_notes(t, 100.0) if n.code == "clock.long-steps"]
-    assert [n.value for n in said] == [pytest.approx(0.11)]
-
-
-def test_nothing_is_said_of_an_ordinary_clock():
-    rng = np.random.default_rng(1)
-    for _ in range(20):
-        t = 0.01 * np.arange(4000) + 0.002 * rng.uniform(-1, 1, 4000)
-        # Many samples lost here and there: the shares of missing samples say so.
-        for stamps in (t, t[rng.uniform(size=t.size) > 0.4]):
-            assert "clock.long-steps" not in {n.code for n in rate_notes(stamps, 50.0)}
