@@ -5,45 +5,31 @@ each run, or a column numbers them, the runs are put one after another with some
 a gap, at which they become flights.
 """
 
+import datetime
 import math
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import PurePath
 
 import numpy as np
 
 from heli_jax import units
-from heli_jax.errors import InputError, nearest
+from heli_jax.errors import nearest
 from heli_jax.finding import Finding, note
 from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.grid import not_increasing, shared_stamps, without_overflow
-from heli_jax.flights.log import holds_commands
-from heli_jax.flights.table import (
+from heli_jax.flights.log import (
     Survey,
     Table,
-    TableView,
     column,
     listed,
     require_columns,
     shown,
     wrong,
 )
-from heli_jax.flights.time_units import (
-    LETTERS,
-    SECONDS,
-    TIME_NAMES,
-    likely_unit,
-    split_unit,
-    time_unit,
-)
 
 ROWS = "row number"
 """what the numbers of rows are called, from 0, as a column"""
-COUNTS_ROWS = "clock.counts-rows"
-"""code of a column that might be taken for a clock"""
-_SAMPLED = "timestamp_sample"
-"""of a topic of PX4, beside `timestamp`, when it was published"""
 _PACKETS = {"frame", "frames", "seq", "sequence", "index", "idx", "packet", "row", "iteration"}
 """counts of which only each second or tenth may be of the samples at hand, as where packets of
 several sensors are counted together"""
@@ -56,8 +42,6 @@ _OTHERS = {"freq", "freqs", "frequency", "frequencies", "hz", "distance", "dist"
 _STEPS, _RATES = {"ts", "dt", "tsample", "tsamp", "tsampling"}, {"fs", "hz"}
 _OF_SAMPLES = {"sample", "samples", "sampling", "time"}
 _STEP_WORDS, _RATE_WORDS = {"time", "step", "period", "interval"}, {"rate", "freq", "frequency"}
-_OTHER_RATE = 0.01
-"""by which a stated rate differs from that of the times at least: less is a clock's own error"""
 _FASTEST, _SLOWEST = 1e5, 0.2
 """Hz: no record of a flight is outside of these"""
 _BETWEEN = 10.0
@@ -66,10 +50,146 @@ _SHORTEST = 20
 """rows of a run"""
 _BEGINNING = 0.1
 """part of the run before, in which the next begins: a stamp that goes back is no new run"""
-_RUN_NAMES = {
-    *("run", "runs", "segment", "seg", "maneuver", "manoeuvre", "experiment", "exp", "trial"),
-    *("test", "record", "repetition", "rep", "case", "leg"),
+
+
+# Units of time, in words or at the end of a name.
+
+TIME_NAMES = {
+    *("t", "time", "timestamp", "timestamps", "seconds", "sec", "elapsed", "clock", "zeit", "temps")
 }
+"""words in the names of clocks"""
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "day": 86400.0}
+"""of the units that clocks have: pint, which knows all, takes a quarter of a second to load"""
+_WORDS = {
+    "s": ("s", "sec", "secs", "second", "seconds"),
+    "ms": ("ms", "msec", "msecs", "millis", "millisec", "millisecond", "milliseconds"),
+    "us": ("us", "usec", "usecs", "micros", "microsec", "microsecond", "microseconds"),
+    "ns": ("ns", "nsec", "nsecs", "nanos", "nanosec", "nanosecond", "nanoseconds"),
+    "min": ("min", "mins", "minute", "minutes"),
+    "h": ("h", "hr", "hrs", "hour", "hours"),
+    "day": ("d", "day", "days"),
+}
+_UNITS = {word: unit for unit, words in _WORDS.items() for word in words}
+# A unit stands behind a name as time_ms, 'time ms', time[ms] or time(ms); the group tells whether a
+# bracket was opened that has to be closed.
+_AT_END = re.compile(r"^(.*?)\s*(?:_|\s|(?P<open>[\[(]))([^\W\d_]+)(?(open)[\])])$")
+# TimeUS, timestampMs: joined by a capital alone.
+_JOINED = re.compile(r"^(.*(?:[Tt]ime|[Ss]tamp|TIME))(US|Us|MS|Ms|NS|Ns|Sec|Secs|S)$")
+_SINCE = re.compile(r"\s+since\s+\S", re.IGNORECASE)
+"""of 'days since 2024-03-01', as the CF conventions write the unit of a clock"""
+LETTERS = ("h", "d")
+"""units that mean other things too, as pos_d a position down: with brackets around them alone"""
+_SLOWEST_STEP = 5.0
+"""s: no flight is logged once in more"""
+_LONGEST_FLIGHT, _LONGEST_SLOW = 6 * 3600.0, 2 * 3600.0
+"""s: ticks that would make a longer one are more likely of the next smaller unit, and those of a
+slow log sooner: 20 s at 1 kHz in ms would be hours at 1 Hz in s"""
+
+
+def time_unit(text: str) -> str | None:
+    """The unit of time that a text means: `ms` of Milliseconds, msec and Ms; None for others.
+
+    Of a clock, a capital is a way of writing: megaseconds nobody logs.
+    """
+    # Of which the epoch does not matter: times count from the first sample.
+    text = _SINCE.split(text, maxsplit=1)[0]
+    # The micro sign, and the Greek letter that looks the same.
+    word = text.strip().casefold().replace("µ", "u").replace("μ", "u")
+    return _UNITS.get(word)
+
+
+def split_unit(name: str) -> tuple[str, str]:
+    """A column's name without the unit of time at its end, and this unit, empty where there is
+    none."""
+    match = _AT_END.fullmatch(name)
+    if match is None and (joined := _JOINED.fullmatch(name)):
+        return joined[1], time_unit(joined[2]) or ""
+    unit = time_unit(match[3]) if match else None
+    if match and unit and not match["open"] and match[3].casefold() in LETTERS:
+        return name, ""
+    return (match[1], unit) if match and unit else (name, "")
+
+
+def likely_unit(stamps: np.ndarray | None) -> str:
+    """The unit of stamps (N,) by their usual step and their length: no flight is logged once in
+    5 s, or lasts a day."""
+    if stamps is None or stamps.size < 2:
+        return "s"
+    with np.errstate(all="ignore"):
+        step = float(np.median(np.diff(stamps)))
+        length = float(stamps[-1] - stamps[0])
+    # From the coarsest unit on: the first in which the usual step is that of a log is taken.
+    for unit, most, slow in (("s", _SLOWEST_STEP, 0.5), ("ms", 1e3, 100.0), ("us", 1e6, np.inf)):
+        longest = _LONGEST_SLOW if step >= slow else _LONGEST_FLIGHT
+        # Of parts of a second nothing is finer.
+        whole = unit == "ms" or step >= slow
+        if not step >= most and not (whole and length * SECONDS[unit] > longest):
+            return unit
+    return "ns"
+
+
+# Dates of ISO 8601 and of German spreadsheets, and times of day.
+
+_ISO = re.compile(r"\d{4}[-/]\d\d[-/]\d\d[T ,]+\d\d:\d\d(?::\d\d.*)?")
+_GERMAN = re.compile(r"(\d\d?)\.(\d\d?)\.(\d{4}),? (\d{1,2}:\d\d:\d\d(?:[.,]\d{1,6})?)")
+_TIME_OF_DAY = re.compile(r"(\d{1,3}):(\d\d):(\d\d(?:[.,]\d{1,12})?)")
+_LONGEST_TIME = 60
+"""characters of a time; of a damaged file a cell may be as long as itself"""
+
+
+def is_date(cell: str) -> bool:
+    """True for a date with a time of day, or a time of day."""
+    return len(cell) <= _LONGEST_TIME and _form_of(cell) is not None
+
+
+def seconds_of_dates(cells: Sequence[str | None]) -> np.ndarray | int:
+    """Seconds (N,) from the first midnight, NaN where a cell is empty.
+
+    Times of day go on behind midnight. All cells have to be of one kind, and dates with an offset
+    from UTC or without.
+
+    Returns:
+        The row of the first cell that is none, in place of the seconds.
+    """
+    filled = [i for i, cell in enumerate(cells) if cell is not None]
+    values = np.full(len(cells), np.nan)
+    if not filled:
+        return values
+    form = _form_of(cells[filled[0]] or "")
+    begin = None
+    for i in filled:
+        cell = cells[i] or ""
+        if form is None or len(cell) > _LONGEST_TIME or _form_of(cell) is not form:
+            return i
+        try:
+            if form is _TIME_OF_DAY:
+                hours, minutes, seconds = cell.replace(",", ".").split(":")
+                values[i] = 3600.0 * int(hours) + 60.0 * int(minutes) + float(seconds)
+                continue
+            date = _date(cell, form)
+            begin = begin or date.replace(hour=0, minute=0, second=0, microsecond=0)
+            values[i] = (date - begin).total_seconds()
+        # TypeError: dates with an offset from UTC and without cannot be compared.
+        except (ValueError, TypeError, OverflowError):
+            return i
+    if form is _TIME_OF_DAY:
+        day = SECONDS["day"]
+        falls = np.diff(values[filled]) < -0.5 * day
+        values[filled] += np.cumsum(np.r_[0.0, np.where(falls, day, 0.0)])
+    return values
+
+
+def _form_of(cell: str) -> re.Pattern[str] | None:
+    return next((form for form in (_ISO, _GERMAN, _TIME_OF_DAY) if form.fullmatch(cell)), None)
+
+
+def _date(cell: str, form: re.Pattern[str]) -> datetime.datetime:
+    if form is _GERMAN:
+        date, clock = cell.replace(", ", " ").split(" ", 1)
+        day, month, year = map(int, date.split("."))
+        cell = f"{year}-{month:02d}-{day:02d}T{clock.replace(',', '.').zfill(8)}"
+    text = cell.replace("/", "-").removesuffix(" UTC").removesuffix(" GMT")
+    return datetime.datetime.fromisoformat(re.sub("[ ,]+", "T", text, count=1))
 
 
 # Which column it is.
@@ -121,10 +241,8 @@ def guess_clock(
     values = {s.name: s.values for s in reversed(surveys) if s.values is not None}
     numeric = [s.name for s in surveys if s.values is not None]
     increasing = [n for n in numeric if _increases(values[n])]
-    # When a sample was taken, before when its message arrived: rostopic writes both. Then a name
-    # decides before the numbers do: a counter or a distance may increase all along too.
-    found = [n for n in increasing if _says_when_sampled(table, n)]
-    found += [n for n in numeric if is_called_time(n) or table.time_unit(n)]
+    # A name decides before the numbers do: a counter or a distance may increase all along too.
+    found = [n for n in numeric if is_called_time(n) or table.time_unit(n)]
     # Those whose last word is one of time: flight_time could be a parameter, but for its steps.
     found += [n for n in increasing if TIME_NAMES & set(words_in(split_unit(n)[0])[-1:])]
     if not by_name:
@@ -153,20 +271,6 @@ def is_called_time(name: str) -> bool:
     stem, _ = split_unit(name)
     # Of a path, log.roll.time, the last part is the name; %time and __time are names of tools.
     return re.split(r"[./]", stem)[-1].strip("%_ ").casefold() in TIME_NAMES
-
-
-def _says_when_sampled(table: Table, name: str) -> bool:
-    """True for a clock that goes before all others, since it is that of the samples themselves:
-    field.header.stamp, timestamp_sample."""
-    *_, last = path = tuple(re.split(r"[./]", name.casefold()))
-    if last != _SAMPLED:
-        return path[-2:] == ("header", "stamp")
-    # `convert` has put the clock of the topic beside what it copied. And a command acts from when
-    # it was published, 0.4 to 3 ms behind the gyro's sample: by the topic before the column
-    # (`/actuator_motors/timestamp_sample`) or by the name of the file, as ulog2csv gives it.
-    topic = re.split(r"[./]", name)[-2:-1]
-    commands = holds_commands(topic[0] if any(topic) else PurePath(table.path).name)
-    return "time" not in table.names and not commands
 
 
 def _increases(values: np.ndarray) -> bool:
@@ -201,14 +305,6 @@ def counter_of(surveys: Sequence[Survey]) -> str | None:
         ),
         None,
     )
-
-
-def counter_notes(surveys: Sequence[Survey]) -> tuple[Finding, ...]:
-    """A note on a column that might be taken for a clock and counts rows, where one does."""
-    name = counter_of(surveys)
-    if name is None:
-        return ()
-    return (note(COUNTS_ROWS, f"{shown(name)} counts rows and is taken for no time", name),)
 
 
 def _asked(table: Table, surveys: Sequence[Survey], time: str | Signal) -> Signal:
@@ -273,6 +369,27 @@ def require_increasing(table: Table, name: str, stamps: np.ndarray) -> None:
     raise wrong(table.path, f"{problem}; {remedy}", table.place(row), column(name))
 
 
+def require_likely(
+    path: str, name: str, unit: str, stamps: np.ndarray, assumed: bool = False
+) -> tuple[Finding, ...]:
+    """Refuse stamps in seconds that are a flight's in another unit alone, where their name says
+    that one or nobody stated seconds; a caution where somebody did.
+    """
+    named, likely = split_unit(name)[1], likely_unit(stamps)
+    if unit != "s" or likely == "s":
+        return ()
+    step, length = float(np.median(np.diff(stamps))), float(stamps[-1] - stamps[0])
+    problem = f"in s its stamps are {step:.4g} s apart over {length:.4g} s: they look like {likely}"
+    if named != likely and not assumed:
+        words = f"time: {shown(name)}: {problem}."
+        return (Finding("units.unlikely", "doubt", words, step, "seconds between stamps", (name,)),)
+    why = f", as its name says {named}" if named == likely else ""
+    remedy = f"expected its unit: {{signal: {name}, unit: {likely}}}"
+    if named != likely:
+        remedy += ", or unit: s where it is so slow"
+    raise wrong(path, f"{problem}{why}; {remedy}", column(name))
+
+
 # Rates in place of times.
 
 
@@ -281,9 +398,12 @@ def by_rate(rate: float, counter: str | None = None) -> Signal:
     return Signal(counter or ROWS, "s", "s", scale=1.0 / rate)
 
 
-def counted(table: Table) -> Table:
-    """A table of which the numbers of the rows can be asked for as a column, `ROWS`."""
-    return TableView(table, columns={ROWS: None})
+def columns_of(table: Table, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """The columns of a table as float64 (N,), `ROWS` as the numbers of its rows, from 0."""
+    own = [name for name in names if name != ROWS] or [table.names[0]]
+    columns = table.numbers(list(dict.fromkeys(own)))
+    columns[ROWS] = np.arange(columns[own[0]].size, dtype=np.float64)
+    return {name: columns[name] for name in names}
 
 
 def stated_rate(surveys: Sequence[Survey]) -> tuple[float, str] | None:
@@ -300,38 +420,6 @@ def stated_rate(surveys: Sequence[Survey]) -> tuple[float, str] | None:
     # 1/0.02 is 50 in numbers of the vehicle, 1/0.033 is what it is.
     near = round(rate, 6)
     return (near if math.isclose(rate, near, rel_tol=1e-9) else rate), words
-
-
-def contradicted_rate(table: Table, clock: str, rate: float) -> tuple[Finding, ...]:
-    """A caution for each rate that a file states and that is neither that of its times [Hz] nor a
-    whole multiple, of which every second or tenth sample may have been logged."""
-    if not (math.isfinite(rate) and rate > 0):
-        return ()
-    stated: dict[float, str] = {}
-    for name in table.names:
-        # Of another clock than this one its path tells.
-        if _is_step(name) is not None and _group(name) == _group(clock):
-            try:
-                stated |= _rate_of(name, table.numbers([name])[name])
-            except InputError:
-                continue
-    return tuple(
-        Finding(
-            "clock.rate-contradicted",
-            "doubt",
-            f"the file states {other:.6g} Hz ({words}), and its times {shown(clock)} are at "
-            f"{rate:.6g} Hz: one of the two clocks is wrong, and rates that follow from it are off "
-            f"by {abs(other / rate - 1):.0%}.",
-            other / rate,
-            f"stated rate over that of the times, whole numbers to {_OTHER_RATE:g}",
-        )
-        for other, words in stated.items()
-        if abs(other / rate / max(round(other / rate), 1) - 1.0) > _OTHER_RATE
-    )
-
-
-def _group(name: str) -> str:
-    return re.split(r"[./][^./]*$", name)[0] if re.search(r"[./]", name) else ""
 
 
 def _rate_of(name: str, values: np.ndarray) -> dict[float, str]:
@@ -381,54 +469,28 @@ def restarts(stamps: np.ndarray) -> np.ndarray:
     return falls if anew.all() else none
 
 
-def _changes(numbers: np.ndarray) -> np.ndarray:
-    """The rows (n,) in which the number of a run is another than in the row before."""
-    return np.flatnonzero(np.diff(numbers) != 0) + 1
-
-
 def with_runs(
-    table: Table, clock: str, numbers: Mapping[str, np.ndarray], scale: float, column: str = ""
-) -> Table:
-    """A table whose runs follow one another; as it is where it holds one.
+    table: Table, clock: str, columns: Mapping[str, np.ndarray], scale: float, runs: str = ""
+) -> tuple[dict[str, np.ndarray], tuple[Finding, ...]]:
+    """Return the columns (N,) with a clock in which runs follow one another, and a note; as they
+    are where the table holds one run.
 
     Args:
-        numbers: that column (N,), and the one that numbers runs.
+        columns: of the table, the clock among them.
         scale: [s] of a unit of the stamps.
-        column: that numbers runs; without one they begin where the time does.
+        runs: the column that numbers runs; without one they begin where the time does.
     """
-    stamps = numbers[clock]
-    starts = _changes(numbers[column]) if column else restarts(stamps)
+    stamps = columns[clock]
+    starts = np.flatnonzero(np.diff(columns[runs])) + 1 if runs else restarts(stamps)
     if not starts.size:
-        return table
+        return dict(columns), ()
     apart = stamps.copy()
     for start in starts:
         apart[start:] += apart[start - 1] - apart[start] + _BETWEEN / scale
     places = listed(table.place(int(start)) for start in starts)
-    why = f"{shown(column)} is another" if column else "the time begins anew"
+    why = f"{shown(runs)} is another" if runs else "the time begins anew"
     words = (
         f"{why} in {places}: {starts.size + 1} runs, put one after another with "
         f"{_BETWEEN:g} s between"
     )
-    said = note("clock.runs", words, value=starts.size + 1)
-    return TableView(table, columns={clock: apart}, note=said)
-
-
-def numbering(surveys: Sequence[Survey]) -> str:
-    """The column that numbers runs, by its name and numbers; empty without one."""
-    for each in surveys:
-        values = each.values
-        if values is None or not _RUN_NAMES & set(words_in(each.name)):
-            continue
-        if not np.isfinite(values).all() or np.any(values != np.rint(values)):
-            continue
-        bounds = np.concatenate([[0], _changes(values), [values.size]])
-        if bounds.size > 2 and np.all(np.diff(values) >= 0) and np.diff(bounds).min() >= _SHORTEST:
-            return each.name
-    return ""
-
-
-def numbering_notes(column: str) -> tuple[Finding, ...]:
-    """A note on a column that numbers runs, where one does."""
-    remedy = f"time: {{..., runs: {column}}} in a configuration makes a flight of each"
-    words = f"{shown(column)} seems to number runs, which the time does not part: {remedy}"
-    return (note("clock.runs-numbered", words, column),)
+    return {**columns, clock: apart}, (note("clock.runs", words, value=starts.size + 1),)

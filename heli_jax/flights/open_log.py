@@ -16,8 +16,7 @@ from heli_jax.flights.formats import (
     numpy_arrays,
     ulog,
 )
-from heli_jax.flights.log import ChannelLog
-from heli_jax.flights.table import Table, require_short_names, shown, wrong
+from heli_jax.flights.log import ChannelLog, Table, require_short_names, shown, wrong
 from heli_jax.regular_file import open_regular, require_regular
 
 _SNIFFED = 8192

@@ -6,7 +6,6 @@ samples' unit, NaN where too much is missing. Holds take times from the first st
 """
 
 import functools
-from dataclasses import dataclass
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -18,24 +17,11 @@ from heli_jax.numerics.jumps import split
 # still near a straight line. What lies in a longer gap nobody knows.
 _GAP_STEPS = 5.0
 _GAP_SECONDS = 0.25
-_LONG = 3.0
-"""usual steps, from which on one is long"""
-_MOST_LONG = 0.002
-"""part of the steps that are long, at most, for them to be noted one by one"""
 _GOES_DOWN = 0.9
 """new rate over old, below which something between the two Nyquist frequencies could fold"""
 _CELLS = 16
 """parts of a grid step over which a held signal is averaged before it is low-passed: the mean takes
 0.1 % off what is at 0.4 of the rate"""
-
-
-@dataclass(frozen=True)
-class Clock:
-    """Grid to sample at: `times` (M,) [s], `dt` apart, with notes for the reader."""
-
-    times: np.ndarray
-    dt: float
-    notes: tuple[Finding, ...]
 
 
 def longest_gap(seconds: np.ndarray) -> float:
@@ -45,39 +31,16 @@ def longest_gap(seconds: np.ndarray) -> float:
     return max(_GAP_STEPS * float(np.median(np.diff(seconds))), _GAP_SECONDS)
 
 
-def new_clock(seconds: np.ndarray, rate: float) -> Clock:
-    """A uniform clock of `rate` [Hz] from the first of the stamps (N,) [s] to the last."""
+def rate_notes(seconds: np.ndarray, rate: float) -> list[Finding]:
+    """Notes on what becomes of samples at these stamps (N,) [s] at a rate [Hz]."""
     usual = float(np.median(np.diff(seconds)))
-    # The last sample is not lost to the rounding of its stamp.
-    count = int(np.floor((seconds[-1] - seconds[0]) * rate + 1e-6)) + 1
-    # Counted and multiplied, never added up: the sum of 1e6 rounded steps would drift.
     words = f"resampled to {rate:.6g} Hz from about {1 / usual:.6g} Hz"
     notes = [note("resampling.rate", words, value=1 / usual)]
-    notes += _long_steps(seconds, usual)
     if rate * usual < _GOES_DOWN:
         passed = PASSED * rate
         words = f"low-pass filtered first: {passed:.3g} Hz and below pass, not held inputs"
         notes.append(note("resampling.low-passed", words, value=passed))
-    return Clock(seconds[0] + np.arange(count) / rate, 1.0 / rate, tuple(notes))
-
-
-def _long_steps(seconds: np.ndarray, usual: float) -> tuple[Finding, ...]:
-    """A note on steps that are bridged and are much longer than the `usual` one [s], where they are
-    few: of many the share of missing samples tells."""
-    steps = np.diff(seconds)
-    long = np.flatnonzero((steps > _LONG * usual) & (steps <= longest_gap(seconds)))
-    if not 0 < long.size <= max(3, _MOST_LONG * steps.size):
-        return ()
-    worst = long[np.argmax(steps[long])]
-    which = "a step" if long.size == 1 else f"{long.size} steps"
-    size = f"of {steps[worst]:.4g} s" if long.size == 1 else f"of up to {steps[worst]:.4g} s"
-    at = "at" if long.size == 1 else "the longest at"
-    words = (
-        f"the clock has {which} {size}, {at} {seconds[worst]:.6g} s, where {usual:.4g} s is "
-        "usual: samples were lost there, or the clock was set; if it was set, what was flown "
-        "before and after is farther apart than it was, and the estimates are off"
-    )
-    return (note("clock.long-steps", words, value=float(steps[worst])),)
+    return notes
 
 
 def in_gaps(seconds: np.ndarray, times: np.ndarray) -> np.ndarray:

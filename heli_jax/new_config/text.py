@@ -269,21 +269,17 @@ def _flight(chosen: Chosen, signals: Signals, time: TimeInfo | None, log: str) -
 
 def _time(time: TimeInfo) -> str:
     """The clock of a table."""
-    runs = f", runs: {_value(time.numbering)}" if time.numbering else ""
     if time.counted is None:
         unit = "" if time.unit == "s" else f", unit: {time.unit}"
-        guesses = ["the unit, by its steps"] * time.guessed + ["that each run is a flight"] * bool(
-            runs
-        )
-        guessed = f"   # GUESS: {'; '.join(guesses)}" if guesses else ""
-        return f"      time: {{signal: {_value(time.column)}{unit}{runs}}}{guessed}"
+        guessed = "   # GUESS: the unit, by its steps" if time.guessed else ""
+        return f"      time: {{signal: {_value(time.column)}{unit}}}{guessed}"
     counter = "" if time.column == ROWS else f"signal: {_value(time.column)}, "
     if math.isnan(time.counted):
         return (
             f"      time: {{{counter}rate: {EDIT}}}   # Hz, samples a second: no column is a time"
         )
     said = f"   # GUESS: the file says {_comment(time.said)}" if time.said else ""
-    return f"      time: {{{counter}rate: {time.counted:.10g}{runs}}}{said}"
+    return f"      time: {{{counter}rate: {time.counted:.10g}}}{said}"
 
 
 def _preset(preset: str, outputs: Sequence[str], filtered: Mapping[str, Filtered]) -> list[str]:

@@ -31,7 +31,7 @@ from heli_jax.analysis.handling_qualities import NUMBERS, UNITS, HandlingQualiti
 from heli_jax.analysis.response_agreement import USUAL_J, ResponseAgreement
 from heli_jax.finding import Distrust, Finding, sentences
 from heli_jax.flights import Flight
-from heli_jax.flights.origins import as_content
+from heli_jax.flights.flight import as_content
 from heli_jax.identification.diagnostics.noise import COLOURED, TOO_NARROW
 from heli_jax.identification.equation_error.start import (
     Equation,

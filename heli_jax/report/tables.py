@@ -11,8 +11,7 @@ from heli_jax.analysis.attitude_responses import Handling
 from heli_jax.analysis.handling_qualities import NUMBERS, UNITS, HandlingQualities, Number
 from heli_jax.analysis.response_agreement import USUAL_J, ResponseAgreement
 from heli_jax.finding import sentences
-from heli_jax.flights.flight import Flight
-from heli_jax.flights.origins import in_words
+from heli_jax.flights.flight import Flight, in_words
 from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.equation_error.start import EquationErrorStart
 from heli_jax.identification.frequency_start import FrequencyErrorStart

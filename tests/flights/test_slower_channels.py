@@ -5,7 +5,7 @@ import pytest
 
 from heli_jax.errors import InputError
 from heli_jax.flights import Signal, read_flight
-from heli_jax.flights.repeats import usual_run, without_repeats
+from heli_jax.flights.marks import usual_run, without_repeats
 from heli_jax.flights.resample import Timed, at_nearest
 from heli_jax.numerics.white_noise import noise_guess
 

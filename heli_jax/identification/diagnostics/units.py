@@ -14,7 +14,7 @@ from heli_jax.dynamics.model import Model
 from heli_jax.finding import Finding, found
 from heli_jax.flights.channel_names import no_stick, unit_in_name
 from heli_jax.flights.flight import Flight
-from heli_jax.flights.table import shown
+from heli_jax.flights.log import shown
 from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.validation.signal_signs import (
     AGAINST,
