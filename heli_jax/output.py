@@ -80,7 +80,8 @@ def _print_details(run: FitRun) -> None:
         _tell_table(responses)
     if problem.first_guess is not None:
         _print_first_guess(problem.first_guess)
-    tell(plain_words(f"acceptance card: {summary(card(problem, fit), _GATES)}"))
+    gates = card(problem, fit, supplementary.responses)
+    tell(plain_words(f"acceptance card: {summary(gates, _GATES)}"))
     if supplementary.choice is not None:
         compared = report_tables.choice(supplementary.choice)
         _tell_table(compared)

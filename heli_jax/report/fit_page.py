@@ -96,8 +96,7 @@ def render(
         problem=problem,
         baseline=analysis.baseline,
         more=analysis.supplementary,
-        # Once: it takes spectra of every pair of signals.
-        card=card(problem, fit),
+        card=card(problem, fit, analysis.supplementary.responses),
         summary=summary,
         # The template asks this module for its rows.
         lines=lines(fit),
