@@ -12,7 +12,7 @@ from heli_jax.report.card import card
 from heli_jax.report.files import SupplementaryAnalyses, fit_json
 from heli_jax.report.fit_page import Analysis, drawings, render
 from heli_jax.report.fitted_responses import NO_RESPONSES, fitted_responses
-from heli_jax.report.tables import handling_lines
+from heli_jax.report.tables import handling
 from tests import responses
 
 
@@ -62,8 +62,8 @@ def test_they_are_drawn_told_and_written(sound, shown):
     assert [p.label for p in chart.panels][2:] == ["coherence", "error [dB]", "error [deg]"]
     page = render(analysis, "title", {}, [])
     assert "Handling qualities" in page
-    (line,) = handling_lines(shown.handling)
-    assert line.startswith("x_roll to roll: bandwidth [rad/s] model")
+    first = handling(shown.handling).rows[0]
+    assert (first[0], first[1], first[-1]) == ("x_roll to roll", "bandwidth", "rad/s")
     (content,) = fit_json(fit, problem, baseline, supplementary)["handling_qualities"]
     model, data = (content[s]["numbers"]["phase_bandwidth"] for s in ("model", "data"))
     assert data["lower95"] < model["value"] < data["upper95"]
