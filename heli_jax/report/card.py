@@ -11,7 +11,7 @@ import numpy as np
 
 from heli_jax.analysis.spectra import COHERENT
 from heli_jax.identification.fit import Estimate, Fit
-from heli_jax.identification.identifiability.analysis import ILL_CONDITIONED
+from heli_jax.identification.identifiability.verdict import ILL_CONDITIONED
 from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.adequacy import EXPECTED

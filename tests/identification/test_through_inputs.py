@@ -9,7 +9,7 @@ from heli_jax import Flight, Free, Problem, fit, linear_model
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.identifiability.analysis import verdict_of
-from heli_jax.identification.identifiability.through_inputs import through_inputs
+from heli_jax.identification.uncertainty.standard_errors import through_inputs
 from heli_jax.identification.search import first_guess
 from heli_jax.identification.unknowns.layout import Solution
 

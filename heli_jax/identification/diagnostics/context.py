@@ -24,13 +24,12 @@ from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Signals, Status
 from heli_jax.identification.uncertainty.estimates import (
-    StandardErrors,
     estimates_of,
     flight_nuisances,
     noise_by_name,
-    standard_errors,
     without_disturbance,
 )
+from heli_jax.identification.uncertainty.standard_errors import StandardErrors, standard_errors
 from heli_jax.identification.unknowns.layout import Solution, scales_of
 from heli_jax.identification.validation.adequacy import (
     EXPLAINED,
