@@ -300,25 +300,19 @@ def require_increasing(table: Table, name: str, stamps: np.ndarray) -> None:
     raise wrong(table.path, f"{problem}; {remedy}", table.place(row), column(name))
 
 
-def require_likely(
-    path: str, name: str, unit: str, stamps: np.ndarray, assumed: bool = False
-) -> tuple[Finding, ...]:
-    """Refuse stamps in seconds that are a flight's in another unit alone, where their name says
-    that one or nobody stated seconds; a caution where somebody did.
-    """
-    named, likely = split_unit(name)[1], likely_unit(stamps)
-    if unit != "s" or likely == "s":
-        return ()
+def require_likely(path: str, time: Signal, stamps: np.ndarray) -> None:
+    """Refuse stamps (N,) in seconds that are a flight's in another unit alone, where their name
+    says that one or nobody stated seconds."""
+    named, likely = split_unit(time.name)[1], likely_unit(stamps)
+    if time.unit != "s" or likely == "s" or not (named == likely or time.assumed):
+        return
     step, length = float(np.median(np.diff(stamps))), float(stamps[-1] - stamps[0])
     problem = f"in s its stamps are {step:.4g} s apart over {length:.4g} s: they look like {likely}"
-    if named != likely and not assumed:
-        words = f"time: {shown(name)}: {problem}."
-        return (Finding("units.unlikely", "doubt", words, step, "seconds between stamps", (name,)),)
     why = f", as its name says {named}" if named == likely else ""
-    remedy = f"expected its unit: {{signal: {name}, unit: {likely}}}"
+    remedy = f"expected its unit: {{signal: {time.name}, unit: {likely}}}"
     if named != likely:
         remedy += ", or unit: s where it is so slow"
-    raise wrong(path, f"{problem}{why}; {remedy}", column(name))
+    raise wrong(path, f"{problem}{why}; {remedy}", column(time.name))
 
 
 # Rates in place of times.

@@ -79,8 +79,7 @@ def load_table(table: Table, request: Request) -> ChannelLog:
         inputs = {s.name for (_, kind), s in request.signals.items() if kind == "input"}
         if is_joined(stamps * clock_scale(table, time), columns, inputs):
             return without_joins(replace(log, notes=(*log.notes, *said)), joined=True)
-    units_said, cautions = _checked(table, time, stamps)
-    return replace(log, notes=(*log.notes, *said, *units_said), cautions=cautions)
+    return replace(log, notes=(*log.notes, *said, *_checked(table, time, stamps)))
 
 
 @np.errstate(over="ignore", invalid="ignore")  # stamps that are no clock are refused later
@@ -99,10 +98,8 @@ def _with_clock(
     return ChannelLog.of_table(table, (topic,), notes=table.notes, origin=first * scale)
 
 
-def _checked(
-    table: Table, time: Signal, stamps: np.ndarray
-) -> tuple[tuple[Finding, ...], tuple[Finding, ...]]:
-    """Refuse stamps (N,) that are no clock; return notes on their unit, and cautions."""
+def _checked(table: Table, time: Signal, stamps: np.ndarray) -> tuple[Finding, ...]:
+    """Refuse stamps (N,) that are no clock; return notes on their unit."""
     stated = None if time.name == ROWS else table.time_unit(time.name)
     scale = clock_scale(table, time)
     # A type is unmistakable; only words may be meant for something else.
@@ -116,10 +113,9 @@ def _checked(
         raise wrong(table.path, problem, table.place(row), column(time.name))
     stamps = without_overflow(stamps)
     require_increasing(table, time.name, stamps)
-    cautions: tuple[Finding, ...] = ()
     if not stated and time.scale == 1.0:
-        cautions = require_likely(table.path, time.name, time.unit, stamps, time.assumed)
-    return said, cautions
+        require_likely(table.path, time, stamps)
+    return said
 
 
 # Without a request: the clock is guessed, and all columns are taken.
