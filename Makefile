@@ -15,7 +15,7 @@ BIN := .venv/bin
 	if [ -z "$$found" ]; then \
 	  echo "heli_jax needs Python 3.12 or newer: install python3.13 (with its venv module) or uv." >&2; exit 1; fi; \
 	if [ ! -x $(BIN)/python ]; then "$$found" -m venv .venv || exit 1; fi; \
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev,logs,bayes,distributed,docs]' -c constraints.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev,logs,fused,bayes,distributed,docs]' -c constraints.txt
 	@touch $@
 
 demo: .venv/.installed

@@ -21,7 +21,7 @@ from heli_jax.interrupts import resumable
 from heli_jax.numbers import ADEQUATE
 from heli_jax.regular_file import read_regular
 from heli_jax.stages import Note
-from heli_jax.terminal import print_table, tell
+from heli_jax.terminal import print_table, tell, tell_table
 from heli_jax.versions import version
 
 if TYPE_CHECKING:
@@ -383,12 +383,10 @@ def _fit_study(options: argparse.Namespace, study: "Study") -> int:
     _require_out(options)
     out = _directory(options)
     options.interrupts.words = lambda: resumable(out, directory.FINISHED)
-    # Workers of dask have to be told; our own processes end with this one.
-    options.interrupts.unwinds = bool(options.scheduler)
-    # Without a scheduler --workers are processes of our own, for which dask is not needed.
-    with _dask_client(options) if options.scheduler else contextlib.nullcontext() as client:
-        how = {"workers": options.workers, "client": client, "reports": options.reports}
-        result = studies.run(study, out, studies.Options(options.resume, **how, say=options.say))
+    options.interrupts.unwinds = True  # workers of dask have to be told
+    with _dask_client(options) as client:
+        how = {"client": client, "reports": options.reports, "say": options.say}
+        result = studies.run(study, out, studies.Options(options.resume, **how))
     simulation_output.print_study(result)
     tell(f"fits: {out / 'fits'}\nDataset: {out / studies.STORE}")
     return simulation_output.study_exit_code(result)
@@ -664,9 +662,9 @@ def _compare(options: argparse.Namespace) -> int:
     for number, row in zip(numbered.labels, compared.verdicts.rows, strict=True):
         label, model, method, status, verdict, adequate = row
         tell(f"{number}: {label}: {model} by {method}, {status}. {verdict} adequate: {adequate}")
-    print_table(numbered.estimates.head, list(numbered.estimates.rows))
+    tell_table(numbered.estimates)
     # Output, flights and metric are a row's name, where a narrow terminal parts the table too.
-    print_table(numbered.agreement.head, list(numbered.agreement.rows), keys=3)
+    tell_table(numbered.agreement, keys=3)
     for found in numbered.notes:
         tell(f"! {found.sentence}")
     if place is None:

@@ -1,5 +1,6 @@
 """Versions of what numbers came from."""
 
+import contextlib
 import importlib.metadata
 import platform
 from collections.abc import Mapping
@@ -25,7 +26,11 @@ def version() -> str:
 def versions() -> dict[str, str]:
     """The versions of Python and of the packages that numbers depend on."""
     # Of the installed distributions: not every package has a __version__, and none is imported.
-    packages = {name: importlib.metadata.version(name) for name in _PACKAGES}
+    packages = {}
+    for name in _PACKAGES:
+        # llvmlite is an extra.
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            packages[name] = importlib.metadata.version(name)
     return {"python": platform.python_version(), **packages}
 
 

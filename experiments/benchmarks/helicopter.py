@@ -145,14 +145,8 @@ def fused(run: Run, model: Model = MODEL) -> Callable[[], np.ndarray]:
     kernel = Kernel(whole.run, lanes_for(np.dtype(float)))
     begin = jax.jit(jax.vmap(lambda x: whole.own(vehicle, run.inputs, x)))
     common = whole.common(vehicle, run.inputs, Ixx[0])
-    records = [np.asarray(u) for u in jax.tree.leaves(run.inputs)]
 
-    def call() -> np.ndarray:
-        carry, own = jax.tree.map(lambda v: np.moveaxis(np.asarray(v), 0, -1), begin(Ixx))
-        stays = [np.asarray(v) for v in whole.stays(own, common)]
-        return jax.tree.unflatten(whole.results, kernel(stays, records, carry, 1)).value
-
-    return call
+    return lambda: whole.compute(kernel, begin(Ixx), common, run.inputs, 1).value
 
 
 def in_c(

@@ -10,9 +10,9 @@ Of the response of an attitude to a stick, as ADS-33E-PRF (2000), Figure 2, defi
 - phase delay: (lag at 2 w180 - 180) / (57.3 * 2 w180), angles in degrees; where the phase is not
   straight between w180 and 2 w180 the lag is that of the line fitted to it by least squares.
 
-Intervals rest on each number's derivative by all that the response hangs on (the delta method), be
-it the parameters of a fit or the random errors of a measured response; those of frequencies are
-where the response's own interval holds the level that defines them.
+Intervals rest on each number's derivative by all that the response hangs on (the delta method, by
+finite differences), be it the parameters of a fit or the random errors of a measured response;
+those of frequencies are where the response's own interval holds the level that defines them.
 
 Compared with what others say of the standard, not with its own text: Ham, Gardner and Tischler
 (1993), Flight testing and frequency domain analysis for rotorcraft handling qualities
@@ -52,6 +52,8 @@ _DB = 20.0 / np.log(10.0)
 _Z95 = 1.959963984540054
 _POINTS = 500
 """of the grid on which crossings are looked for"""
+_STEP = 1e-4
+"""of finite differences, in standard deviations"""
 _LINE = 60
 """frequencies from w180 to 2 w180 through which the line of the phase delay is fitted"""
 _RISES = np.radians(10.0)
@@ -90,18 +92,6 @@ class HandlingQualities(NamedTuple):
     """[rad/s] in which the response is known"""
 
 
-class _Place(NamedTuple):
-    """A frequency that is defined by the response."""
-
-    omega: float
-    at: Point
-    """one frequency"""
-    by: np.ndarray
-    """(q,) derivative of its logarithm"""
-    ends: tuple[float, float]
-    """[rad/s] of its 95 % interval; beyond the band infinitely far away, NaN where not known"""
-
-
 def handling_qualities(curve: Curve, kind: Kind = "rate") -> HandlingQualities:
     """Bandwidth and phase delay of an attitude's response, or crossover and margins of a loop.
 
@@ -111,33 +101,43 @@ def handling_qualities(curve: Curve, kind: Kind = "rate") -> HandlingQualities:
             that of a vehicle whose lag grows from 0 or 90 deg on, as its gain falls. An open loop
             is taken as it is.
     """
-    grid = np.geomspace(*curve.band, _POINTS)
-    points = curve.at(grid)
-    sign, phase = (1, _loop_phase(points)) if kind == "open-loop" else _branch(grid, points)
-    response = _Response(curve, grid, points, phase)
+    x = np.log(np.geomspace(*curve.band, _POINTS))
+    points = curve.at(np.exp(x))
+    sign, phase = (1, _loop_phase(x, points)) if kind == "open-loop" else _branch(x, points)
+    response = _Response(x, points.log_gain, phase, points)
+    values, by = _values(kind, x, response.gain, phase), _derivatives(kind, response)
     numbers: dict[str, Number] = {}
     sentences = [curve.caution] if curve.caution else []
+    for name in NUMBERS[kind]:
+        if name not in values:
+            continue
+        if name in _LEVELS:
+            _put_frequency(name, response, values, by, numbers, sentences)
+        # The delays hang on w180.
+        elif kind == "open-loop" or "w180" in numbers:
+            numbers[name] = _linear(values[name], by[name])
     if kind == "open-loop":
-        _loop(response, numbers, sentences)
+        _explain_loop(response, values, sentences)
     else:
-        _attitude(response, kind, numbers, sentences)
+        _put_bandwidth(kind, numbers, sentences)
+        _explain_attitude(curve.band[1], values, numbers, sentences)
     return HandlingQualities(kind, numbers, tuple(sentences), sign, curve.band)
 
 
-def _branch(grid: np.ndarray, points: Point) -> tuple[int, np.ndarray]:
+def _branch(x: np.ndarray, points: Point) -> tuple[int, np.ndarray]:
     """The sign of the response, and its phase (k,) [rad] unwrapped, on the branch of its slope."""
     phase = np.unwrap(points.phase)
     # Bode's relation: a gain that falls with the n-th power of the frequency goes with n right
     # angles of lag, whatever the stick's sign. It fails near a mode that grows, and delays add to
     # the lag towards higher frequencies: what most of the lower half of the band says.
-    low = slice(0, grid.size // 2)
-    turns = np.round((phase - 0.5 * np.pi * points.gain_slope)[low] / np.pi)
+    low = slice(0, x.size // 2)
+    turns = np.round((phase - 0.5 * np.pi * np.gradient(points.log_gain, x))[low] / np.pi)
     values, counts = np.unique(turns, return_counts=True)
     turn = int(values[np.argmax(counts)])
     return (-1 if turn % 2 else 1), phase - np.pi * turn
 
 
-def _loop_phase(points: Point) -> np.ndarray:
+def _loop_phase(x: np.ndarray, points: Point) -> np.ndarray:
     """An open loop's phase (k,) [rad] unwrapped, between -360 and 0 deg at the crossover: its sign
     is known, and that of an unstable vehicle may lag by 180 deg from the lowest frequency on."""
     phase = np.unwrap(points.phase)
@@ -145,127 +145,147 @@ def _loop_phase(points: Point) -> np.ndarray:
     if falls.size:
         turns = np.ceil(phase[falls[-1]] / (2.0 * np.pi))
     else:
-        turns = np.round(np.median(phase - 0.5 * np.pi * points.gain_slope) / (2.0 * np.pi))
+        turns = np.round(
+            np.median(phase - 0.5 * np.pi * np.gradient(points.log_gain, x)) / (2.0 * np.pi)
+        )
     return phase - 2.0 * np.pi * turns
 
 
-class _Response:
-    """A curve with its phase on one branch."""
+class _Response(NamedTuple):
+    """A curve on a grid, with its phase on one branch; arrays (k,)."""
 
-    def __init__(self, curve: Curve, grid: np.ndarray, points: Point, phase: np.ndarray) -> None:
-        self.curve, self.grid, self.x = curve, grid, np.log(grid)
-        self.gain, self.phase, self.points = points.log_gain, phase, points
-
-    def at(self, omega: float) -> Point:
-        """One frequency, on the branch."""
-        point = self.curve.at(np.array([omega]))
-        near = np.interp(np.log(omega), self.x, self.phase)
-        turns = np.round((point.phase - near) / np.pi)
-        return point._replace(phase=point.phase - np.pi * turns)
-
-    def falls(
-        self, quantity: str, level: float, below: float | None = None, first: bool = False
-    ) -> float | None:
-        """Return the highest frequency (or the first) at which gain or phase falls below a level;
-        None if it does not within the band, or not below `below`.
-
-        Args:
-            quantity: log_gain or phase.
-            below: [rad/s]
-        """
-        values = (self.gain if quantity == "log_gain" else self.phase) - level
-        end = self.grid.size if below is None else int(np.searchsorted(self.grid, below))
-        downward = np.flatnonzero((values[: end - 1] > 0) & (values[1:end] <= 0))
-        if below is not None and end < self.grid.size and values[end - 1] > 0:
-            # Between the last point of the grid and the frequency itself.
-            downward = np.append(downward, end - 1)
-        if not downward.size:
-            return None
-        i = downward[0 if first else -1]
-
-        def off(x: float) -> float:
-            return float(getattr(self.at(float(np.exp(x))), quantity)[0]) - level
-
-        low, high = float(self.x[i]), float(self.x[i + 1])
-        high = high if below is None else min(high, float(np.log(below)))
-        ends = off(low), off(high)
-        if ends[0] * ends[1] > 0:  # rounding, where a point of the grid lies on the level
-            x = low if abs(ends[0]) < abs(ends[1]) else high
-        else:
-            # Here: a third of a second to load.
-            from scipy.optimize import root_scalar
-
-            x = root_scalar(off, bracket=(low, high), xtol=1e-13).root
-        return float(np.exp(x))
-
-    def place(self, omega: float, quantity: str, by_level: np.ndarray | float = 0.0) -> _Place:
-        """A frequency where a quantity has a level, which itself may have a derivative (q,)."""
-        at = self.at(omega)
-        gain = quantity == "log_gain"
-        gradient = (at.gain_gradient if gain else at.phase_gradient)[0] - by_level
-        slope = at.gain_slope if gain else at.phase_slope
-        every = (self.points.gain_gradient if gain else self.points.phase_gradient) - by_level
-        off = (self.gain - at.log_gain[0]) if gain else (self.phase - at.phase[0])
-        reach = _Z95 * np.linalg.norm(every, axis=1)
-        start = _Z95 * float(np.linalg.norm(gradient))
-        return _Place(omega, at, -gradient / slope[0], self._ends(omega, off, reach, start))
-
-    def _ends(
-        self, omega: float, off: np.ndarray, reach: np.ndarray, start: float
-    ) -> tuple[float, float]:
-        """Frequencies next to omega past which the curve's band (Fieller) leaves out the level.
-
-        Not the error over the slope: of a noisy curve the slope is known worse than the value.
-
-        Args:
-            omega: where the curve has the level [rad/s].
-            off: (k,) of the curve from the level, on the grid.
-            reach: (k,) of the curve's interval.
-        """
-        if not np.isfinite(reach).all():
-            return np.nan, np.nan
-        i, x0, ends = int(np.searchsorted(self.grid, omega)), np.log(omega), []
-        for where, beyond, missing in (
-            (np.arange(i)[::-1], reach - off, 0.0),
-            (np.arange(i, self.grid.size), reach + off, np.inf),
-        ):
-            left = where[beyond[where] <= 0]
-            if not left.size:
-                ends.append(missing)
-                continue
-            k = np.flatnonzero(where == left[0])[0]
-            x1, f1 = (x0, start) if k == 0 else (self.x[where[k - 1]], beyond[where[k - 1]])
-            x2, f2 = self.x[where[k]], beyond[where[k]]
-            ends.append(float(np.exp(x1 + (x2 - x1) * f1 / (f1 - f2) if f1 > f2 else x1)))
-        return ends[0], ends[1]
+    x: np.ndarray
+    """logarithm of the frequency"""
+    gain: np.ndarray
+    """natural logarithm"""
+    phase: np.ndarray
+    """[rad]"""
+    points: Point
 
 
-def _attitude(
-    response: _Response, kind: Kind, numbers: dict[str, Number], sentences: list[str]
+_LEVELS: dict[str, tuple[str, float]] = {
+    "w180": ("phase", -np.pi),
+    "phase_bandwidth": ("phase", -0.75 * np.pi),
+    "gain_bandwidth": ("gain", np.nan),
+    "crossover": ("gain", 0.0),
+}
+"""by frequency the quantity whose level defines it, and the level; that of the gain bandwidth moves
+with the gain at w180"""
+
+
+def _values(kind: Kind, x: np.ndarray, gain: np.ndarray, phase: np.ndarray) -> dict[str, float]:
+    """The numbers of a response on a grid, those that there are; of frequencies the logarithms.
+
+    `level` is that of the gain bandwidth.
+    """
+    found: dict[str, float | None] = {"w180": _fall(x, phase, -np.pi, first=True)}
+    neutral = found["w180"]
+    if kind == "open-loop":
+        crossover = found["crossover"] = _fall(x, gain, 0.0)
+        if crossover is not None:
+            found["phase_margin"] = 180.0 + np.degrees(np.interp(crossover, x, phase))
+        if neutral is not None:
+            found["gain_margin"] = -_DB * np.interp(neutral, x, gain)
+    else:
+        found["phase_bandwidth"] = _fall(x, phase, -0.75 * np.pi, below=neutral)
+        if neutral is not None:
+            level = found["level"] = float(np.interp(neutral, x, gain)) + 6.0 / _DB
+            found["gain_bandwidth"] = _fall(x, gain, level, below=neutral)
+            if neutral + np.log(2.0) <= x[-1] + 1e-9:
+                found |= _delays(x, phase, neutral)
+    return {name: float(value) for name, value in found.items() if value is not None}
+
+
+def _fall(
+    x: np.ndarray, values: np.ndarray, level: float, below: float | None = None, first: bool = False
+) -> float | None:
+    """Return the last place (or the first) where values (k,) fall below a level; None where there
+    is none before `below`."""
+    off = values - level
+    i = np.flatnonzero((off[:-1] > 0) & (off[1:] <= 0))
+    places = x[i] + (x[i + 1] - x[i]) * off[i] / (off[i] - off[i + 1])
+    places = places if below is None else places[places < below]
+    return float(places[0 if first else -1]) if places.size else None
+
+
+def _delays(x: np.ndarray, phase: np.ndarray, neutral: float) -> dict[str, float | None]:
+    """The phase delay between w180 and its double, by two points and by a line."""
+    omega = np.exp(neutral) * np.linspace(1.0, 2.0, _LINE)
+    lag = np.interp(np.log(omega), x, phase)
+    return {
+        "phase_delay": -(lag[-1] + np.pi) / omega[-1],
+        "phase_delay_line": -0.5 * np.polyfit(omega - omega.mean(), lag, 1)[0],
+    }
+
+
+def _derivatives(kind: Kind, response: _Response) -> dict[str, np.ndarray]:
+    """Derivatives (q,) of the numbers; NaN where they are not known."""
+    x, gain, phase, points = response
+    steps = []
+    for by_gain, by_phase in zip(points.gain_gradient.T, points.phase_gradient.T, strict=True):
+        ends = [_values(kind, x, gain + h * by_gain, phase + h * by_phase) for h in (_STEP, -_STEP)]
+        steps.append(ends)
+    names = (*NUMBERS[kind], "level")
+    return {
+        n: np.array([(a.get(n, np.nan) - b.get(n, np.nan)) / (2.0 * _STEP) for a, b in steps])
+        for n in names
+    }
+
+
+def _ends(response: _Response, name: str, values: dict[str, float], by: dict[str, np.ndarray]):
+    """Frequencies [rad/s] next to a number's past which the curve's band (Fieller) leaves out the
+    level; beyond the band infinitely far away, NaN where errors are not known.
+
+    Not the error over the slope: of a noisy curve the slope is known worse than the value.
+    """
+    of_gain = _LEVELS[name][0] == "gain"
+    level, by_level = _LEVELS[name][1], 0.0
+    if name == "gain_bandwidth":
+        level, by_level = values["level"], by["level"]
+    points, x, x0 = response.points, response.x, values[name]
+    off = (response.gain if of_gain else response.phase) - level
+    gradient = points.gain_gradient if of_gain else points.phase_gradient
+    reach = _Z95 * np.linalg.norm(gradient - by_level, axis=1)
+    if not np.isfinite(reach).all():
+        return np.nan, np.nan
+    i, ends = int(np.searchsorted(x, x0)), []
+    for where, beyond, missing in (
+        (np.arange(i)[::-1], reach - off, 0.0),
+        (np.arange(i, x.size), reach + off, np.inf),
+    ):
+        left = np.flatnonzero(beyond[where] <= 0)
+        if not left.size:
+            ends.append(missing)
+            continue
+        k = where[left[0]]
+        start = (x0, np.interp(x0, x, reach)) if left[0] == 0 else None
+        x1, f1 = start or (x[where[left[0] - 1]], beyond[where[left[0] - 1]])
+        f2 = beyond[k]
+        ends.append(float(np.exp(x1 + (x[k] - x1) * f1 / (f1 - f2) if f1 > f2 else x1)))
+    return ends[0], ends[1]
+
+
+def _put_frequency(
+    name: str,
+    response: _Response,
+    values: dict[str, float],
+    by: dict[str, np.ndarray],
+    numbers: dict[str, Number],
+    sentences: list[str],
 ) -> None:
-    neutral = response.falls("phase", -np.pi, first=True)
-    phase = response.falls("phase", -0.75 * np.pi, neutral)
-    places: dict[str, _Place] = {}
-    if phase is not None:
-        places["phase_bandwidth"] = response.place(phase, "phase")
-    else:
-        sentences.append(_missing("phase bandwidth", "the phase does not fall through -135 deg"))
-    if neutral is None:
-        words = f"the phase does not reach -180 deg up to {_hz(response.curve.band[1])}"
-        sentences.append(_missing("w180, gain bandwidth and phase delay", words))
-    else:
-        places["w180"] = at = response.place(neutral, "phase")
-        bandwidth = _gain_bandwidth(response, at)
-        if bandwidth is not None:
-            places["gain_bandwidth"] = bandwidth
-        else:
-            words = "the gain is nowhere in the band 6 dB above that at w180"
-            sentences.append(_missing("gain bandwidth", words))
-    for name, place in places.items():
-        _put_frequency(name, place, numbers, sentences)
-    _put_bandwidth(kind, numbers, sentences)
-    if "w180" in numbers:
-        _put_delays(response, places["w180"], numbers, sentences)
+    """Put a frequency among the numbers, or a sentence where its interval says nothing."""
+    omega, sd = float(np.exp(values[name])), float(np.linalg.norm(by[name]))
+    low, high = _ends(response, name, values, by)
+    if low < omega / _VAGUE or high > omega * _VAGUE or sd > 1.0:
+        words = "its interval reaches past half or twice its value, or out of the band"
+        sentences.append(_missing(name.replace("_", " "), words))
+        return
+    numbers[name] = Number(omega, omega * sd, low, high)
+
+
+def _linear(value: float, by: np.ndarray) -> Number:
+    sd = float(np.linalg.norm(by))
+    return Number(value, sd, value - _Z95 * sd, value + _Z95 * sd)
 
 
 def _missing(what: str, why: str) -> str:
@@ -276,25 +296,27 @@ def _hz(omega: float) -> str:
     return f"{omega / (2.0 * np.pi):.3g} Hz ({omega:.3g} rad/s)"
 
 
-def _gain_bandwidth(response: _Response, neutral: _Place) -> _Place | None:
-    level = float(neutral.at.log_gain[0]) + 6.0 / _DB
-    omega = response.falls("log_gain", level, neutral.omega)
-    if omega is None:
-        return None
-    # The level moves with the gain at w180, and with w180 itself.
-    by = neutral.at.gain_gradient[0] + neutral.at.gain_slope[0] * neutral.by
-    return response.place(omega, "log_gain", by)
-
-
-def _put_frequency(
-    name: str, place: _Place, numbers: dict[str, Number], sentences: list[str]
+def _explain_attitude(
+    high: float, values: dict[str, float], numbers: dict[str, Number], sentences: list[str]
 ) -> None:
-    sd, (low, high) = float(np.linalg.norm(place.by)), place.ends
-    if low < place.omega / _VAGUE or high > place.omega * _VAGUE or sd > 1.0:
-        words = "its interval reaches past half or twice its value, or out of the band"
-        sentences.append(_missing(name.replace("_", " "), words))
+    """State why numbers of an attitude's response are missing.
+
+    Args:
+        high: end of the band [rad/s].
+    """
+    if "phase_bandwidth" not in values:
+        sentences.append(_missing("phase bandwidth", "the phase does not fall through -135 deg"))
+    if "w180" not in values:
+        words = f"the phase does not reach -180 deg up to {_hz(high)}"
+        sentences.append(_missing("w180, gain bandwidth and phase delay", words))
         return
-    numbers[name] = Number(place.omega, place.omega * sd, low, high)
+    if "gain_bandwidth" not in values:
+        words = "the gain is nowhere in the band 6 dB above that at w180"
+        sentences.append(_missing("gain bandwidth", words))
+    if "w180" in numbers and "phase_delay" not in values:
+        twice = 2.0 * numbers["w180"].value
+        words = f"the response is known to {_hz(high)}, 2 w180 is {_hz(twice)}"
+        sentences.append(_missing("phase delay", words))
 
 
 def _put_bandwidth(kind: Kind, numbers: dict[str, Number], sentences: list[str]) -> None:
@@ -319,65 +341,25 @@ def _put_bandwidth(kind: Kind, numbers: dict[str, Number], sentences: list[str])
         )
 
 
-def _put_delays(
-    response: _Response, neutral: _Place, numbers: dict[str, Number], sentences: list[str]
-) -> None:
-    twice, high = 2.0 * neutral.omega, response.curve.band[1]
-    if twice > high * (1.0 + 1e-9):
-        words = f"the response is known to {_hz(high)}, 2 w180 is {_hz(twice)}"
-        sentences.append(_missing("phase delay", words))
-        return
-    end = response.at(min(twice, high))
-    value = -(float(end.phase[0]) + np.pi) / twice
-    by = -(end.phase_gradient[0] + end.phase_slope[0] * neutral.by) / twice - value * neutral.by
-    numbers["phase_delay"] = _linear(value, by)
-    at = neutral.omega * np.linspace(1.0, 2.0, _LINE)
-    each = [response.at(float(min(w, high))) for w in at]
-    # The slope of a line is a weighted sum of the phases; w180 moves all of the frequencies.
-    centred = np.linspace(-0.5, 0.5, _LINE)
-    weights = centred / np.sum(centred**2)
-    slope = float(weights @ [float(p.phase[0]) for p in each]) / neutral.omega
-    moved = [p.phase_gradient[0] + p.phase_slope[0] * neutral.by for p in each]
-    by = weights @ np.stack(moved) / neutral.omega - slope * neutral.by
-    numbers["phase_delay_line"] = _linear(-0.5 * slope, -0.5 * by)
-
-
-def _linear(value: float, by: np.ndarray) -> Number:
-    sd = float(np.linalg.norm(by))
-    return Number(float(value), sd, float(value - _Z95 * sd), float(value + _Z95 * sd))
-
-
-def _loop(response: _Response, numbers: dict[str, Number], sentences: list[str]) -> None:
-    crossover = response.falls("log_gain", 0.0)
-    if crossover is None:
+def _explain_loop(response: _Response, values: dict[str, float], sentences: list[str]) -> None:
+    """State why numbers of a loop are missing, and how far the gain of one around an unstable
+    vehicle may fall."""
+    if "crossover" not in values:
         sentences.append(_missing("crossover", "the gain does not fall through 0 dB in the band"))
     else:
-        place = response.place(crossover, "log_gain")
-        _put_frequency("crossover", place, numbers, sentences)
-        at = place.at
-        by = at.phase_gradient[0] + at.phase_slope[0] * place.by
-        margin = 180.0 + np.degrees(float(at.phase[0]))
-        numbers["phase_margin"] = _linear(margin, np.degrees(by))
-        _low_gain(response, crossover, sentences)
-    neutral = response.falls("phase", -np.pi, first=True)
-    if neutral is None:
+        _explain_low_gain(response, values["crossover"], sentences)
+    if "w180" not in values:
         sentences.append(_missing("gain margin", "the phase does not reach -180 deg in the band"))
-        return
-    place = response.place(neutral, "phase")
-    _put_frequency("w180", place, numbers, sentences)
-    by = place.at.gain_gradient[0] + place.at.gain_slope[0] * place.by
-    numbers["gain_margin"] = _linear(-_DB * float(place.at.log_gain[0]), _DB * by)
 
 
-def _low_gain(response: _Response, crossover: float, sentences: list[str]) -> None:
-    """Return how far the gain of a loop around an unstable vehicle may fall."""
-    below = response.grid < crossover
-    values = response.phase[below] + np.pi
+def _explain_low_gain(response: _Response, crossover: float, sentences: list[str]) -> None:
+    values = response.phase[response.x < crossover] + np.pi
     upward = np.flatnonzero((values[:-1] <= 0) & (values[1:] > 0))
     i = upward[-1] if upward.size else 0
     if upward.size or (values.size and values[0] < values[-1] - _RISES):
+        at, degrees = _hz(float(np.exp(response.x[i]))), np.degrees(response.phase[i])
         sentences.append(
             "caution: the phase rises up to the crossover, as where an unstable vehicle is in the "
             f"loop; it may have a margin towards low gain too, {-_DB * response.gain[i]:.3g} dB at "
-            f"{_hz(response.grid[i])}, where the phase is {np.degrees(response.phase[i]):.0f} deg"
+            f"{at}, where the phase is {degrees:.0f} deg"
         )

@@ -1,7 +1,7 @@
 """Frequency responses as smooth curves with errors: of a measured response, and of a model.
 
-Both know at every frequency gain and phase, how steep they are, and how they hang on what the
-response rests on: the random errors of bins, or the parameters of a fit with their covariance.
+Both know at every frequency gain and phase, and how they hang on what the response rests on: the
+random errors of bins, or the parameters of a fit with their covariance.
 """
 
 from collections.abc import Callable, Sequence
@@ -40,10 +40,6 @@ class Point(NamedTuple):
     """natural logarithm"""
     phase: Float[np.ndarray, " k"]
     """[rad], on any branch"""
-    gain_slope: Float[np.ndarray, " k"]
-    """by the logarithm of the frequency"""
-    phase_slope: Float[np.ndarray, " k"]
-    """[rad] likewise"""
     gain_gradient: Float[np.ndarray, "k q"]
     """of the logarithm of the gain; NaN where no error is known"""
     phase_gradient: Float[np.ndarray, "k q"]
@@ -81,11 +77,7 @@ def integrated(curve: Curve) -> Curve:
 
     def at(omega: np.ndarray) -> Point:
         p = curve.at(omega)
-        return p._replace(
-            log_gain=p.log_gain - np.log(omega),
-            phase=p.phase - 0.5 * np.pi,
-            gain_slope=p.gain_slope - 1.0,
-        )
+        return p._replace(log_gain=p.log_gain - np.log(omega), phase=p.phase - 0.5 * np.pi)
 
     return curve._replace(at=at)
 
@@ -155,20 +147,18 @@ def measured_curve(
     root = _root(w, relative, window)
 
     def at(query: np.ndarray) -> Point:
-        value, slope = _local(x, np.log(query), relative)
+        value = _local(x, np.log(query), relative)
         gradient, nothing = value @ root, np.zeros((query.size, run.size))
         # What phase rests on are other numbers than what gain does: both errors are independent.
-        log, steep = value @ y, slope @ y
+        log = value @ y
         return Point(
             log[:, 0],
             log[:, 1],
-            steep[:, 0],
-            steep[:, 1],
             np.concatenate([gradient, nothing], axis=1),
             np.concatenate([nothing, gradient], axis=1),
         )
 
-    off = y - _local(x, x, relative)[0] @ y
+    off = y - _local(x, x, relative) @ y
     return Curve(at, (float(w[0]), float(w[-1])), _too_sharp(w, np.max(np.abs(off), 1), relative))
 
 
@@ -215,9 +205,8 @@ def _root(omega: np.ndarray, relative: np.ndarray, window: float) -> np.ndarray:
     return vectors * np.sqrt(np.maximum(values, 0.0))
 
 
-def _local(x: np.ndarray, query: np.ndarray, relative: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (l, k) that make of values at x those of local quadratics at the queries, and their
-    slopes."""
+def _local(x: np.ndarray, query: np.ndarray, relative: np.ndarray) -> np.ndarray:
+    """Rows (l, k) that make of values at x those of local quadratics at the queries."""
     d = x[None, :] - query[:, None]
     # Further where errors are larger, as the least mean squared error of local quadratics asks.
     size = np.interp(query, x, octave_mean(np.exp(x), relative))
@@ -229,8 +218,7 @@ def _local(x: np.ndarray, query: np.ndarray, relative: np.ndarray) -> tuple[np.n
     weights = np.maximum(1.0 - d**2, 0.0) ** 2 * precise
     X = np.stack([np.ones_like(d), d, d**2], axis=2)
     normal = np.einsum("lka,lk,lkb->lab", X, weights, X)
-    rows = np.linalg.solve(normal, np.swapaxes(X * weights[:, :, None], 1, 2))
-    return rows[:, 0], rows[:, 1] / reach[:, None]
+    return np.linalg.solve(normal, np.swapaxes(X * weights[:, :, None], 1, 2))[:, 0]
 
 
 class LinearResponses(NamedTuple):
@@ -337,12 +325,8 @@ def modelled_curve(
         by = by + x @ dC[:, i].T + y @ dB[:, :, j].T + dD[:, i, j]
         with np.errstate(all="ignore"):
             relative = by / H[:, None] + by_gain - 1j * omega[:, None] * by_late
-            steep = omega * (-1j * np.sum(y * x, axis=1) / H - 1j * late)
             log = np.log(H * acting.gain) - 1j * omega * late
-        return Point(
-            log.real, log.imag, steep.real, steep.imag,
-            gradient(relative.real), gradient(relative.imag),
-        )  # fmt: skip
+        return Point(log.real, log.imag, gradient(relative.real), gradient(relative.imag))
 
     return Curve(at, band)
 

@@ -6,6 +6,7 @@ Small arrays are taken apart, long ones left in memory (`Stored`).
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,7 +47,8 @@ def said(error: Exception) -> str:
     return f"{type(error).__name__}: {words[:200]}"
 
 
-class Value(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Value:
     """A number of the program."""
 
     operand: str
@@ -189,7 +191,7 @@ class Code:
 
     def compare(self, name: str, a: Value, b: Value) -> Value:
         """A truth value, by `fcmp olt` and the like."""
-        return self.operation(name, a, b)._replace(dtype=np.dtype(bool))
+        return replace(self.operation(name, a, b), dtype=np.dtype(bool))
 
     def intrinsic(self, name: str, *values: Value) -> Value:
         """A function that LLVM knows, such as `sqrt`; of vectors it makes the processor's own, or
@@ -204,33 +206,48 @@ class Code:
         return self.made(f"call {kind} {full}({operands})", values[0].dtype, shared)
 
     def library(self, name: str, *values: Value) -> Value:
-        """A function that LLVM does not know and the C library has, such as `log1p`: called for
-        each vehicle."""
+        """A function that LLVM does not know and the C library has, such as `log1p`."""
         dtype = values[0].dtype
-        kind, shared = type_of(dtype), all(v.shared for v in values)
+        kind = type_of(dtype)
         own = f"{name}{'f' if kind == 'float' else ''}"
         takes = ", ".join([kind] * len(values))
         self.declared[f"@{own}"] = f"declare {kind} @{own}({takes}) nounwind memory(none)"
-        operands = [self.of(v, shared) for v in values]
+
+        def call(*scalars: Value) -> Value:
+            arguments = ", ".join(f"{kind} {v.operand}" for v in scalars)
+            return self.made(f"call {kind} @{own}({arguments})", dtype, True)
+
+        return self.by_lane(call, dtype, *values)
+
+    def by_lane(self, function: Callable[..., Value], dtype: np.dtype, *values: Value) -> Value:
+        """A function of scalars for each vehicle; once where all values are shared."""
+        shared = all(v.shared for v in values)
         if shared or self.lanes == 1:
-            arguments = ", ".join(f"{kind} {o}" for o in operands)
-            return self.made(f"call {kind} @{own}({arguments})", dtype, shared)
-        vector, joined = self.vector(kind), "poison"
+            return replace(function(*values), shared=shared)
+        joined = Value("poison", dtype, False)
+        vector = self.typed(dtype, False)
         for lane in range(self.lanes):
-            each = [
-                self.made(f"extractelement {vector} {o}, i64 {lane}", dtype, True).operand
-                for o in operands
+            scalars = [
+                v
+                if v.shared
+                else self.made(
+                    f"extractelement {self.typed(v.dtype, False)} {v.operand}, i64 {lane}",
+                    v.dtype,
+                    True,
+                )
+                for v in values
             ]
-            arguments = ", ".join(f"{kind} {o}" for o in each)
-            result = self.made(f"call {kind} @{own}({arguments})", dtype, True).operand
-            right = f"insertelement {vector} {joined}, {kind} {result}, i64 {lane}"
-            joined = self.made(right, dtype, False).operand
-        return Value(joined, dtype, False)
+            result = function(*scalars).operand
+            right = (
+                f"insertelement {vector} {joined.operand}, {type_of(dtype)} {result}, i64 {lane}"
+            )
+            joined = self.made(right, dtype, False)
+        return joined
 
     def any(self, which: Value) -> Value:
         """True if it is true of any of the vehicles that are computed together."""
         if which.shared or self.lanes == 1:
-            return which._replace(shared=True)
+            return replace(which, shared=True)
         name, vector = f"@llvm.vector.reduce.or.v{self.lanes}i1", self.vector("i1")
         self.declared[name] = f"declare i1 {name}({vector})"
         return self.made(f"call i1 {name}({vector} {which.operand})", which.dtype, True)
@@ -264,29 +281,19 @@ class Code:
 
     def load(self, pointer: str, index: Value, dtype: np.dtype) -> Value:
         """The element of an array that all vehicles share; of each another where the index is."""
-        at, kind = self.register(), type_of(np.dtype(dtype))
-        if not index.shared and self.lanes > 1:
-            return self._load_each(pointer, index, np.dtype(dtype))
+        dtype, kind = np.dtype(dtype), type_of(np.dtype(dtype))
         stored = "i8" if kind == "i1" else kind
-        place = f"{type_of(index.dtype)} {index.operand}"
-        self.write(f"{at} = getelementptr {stored}, ptr {pointer}, {place}")
-        right = f"load {stored}, ptr {at}"
-        value = self.made(right, np.dtype(dtype), index.shared)
-        if kind != "i1":
-            return value
-        return self.made(f"trunc i8 {value.operand} to i1", np.dtype(dtype), index.shared)
 
-    def _load_each(self, pointer: str, index: Value, dtype: np.dtype) -> Value:
-        kind, vector, joined = type_of(index.dtype), self.typed(index.dtype, False), "poison"
-        for lane in range(self.lanes):
-            of_lane = f"extractelement {vector} {index.operand}, i64 {lane}"
-            at = self.made(of_lane, index.dtype, True)
-            value = self.load(pointer, at, dtype)
-            right = f"insertelement {self.typed(dtype, False)} {joined}, "
-            right += f"{type_of(dtype)} {value.operand}, i64 {lane}"
-            joined = self.made(right, dtype, False).operand
-        assert kind in ("i32", "i64")
-        return Value(joined, dtype, False)
+        def element(index: Value) -> Value:
+            at = self.register()
+            place = f"{type_of(index.dtype)} {index.operand}"
+            self.write(f"{at} = getelementptr {stored}, ptr {pointer}, {place}")
+            value = self.made(f"load {stored}, ptr {at}", dtype, True)
+            return (
+                value if kind != "i1" else self.made(f"trunc i8 {value.operand} to i1", dtype, True)
+            )
+
+        return self.by_lane(element, dtype, index)
 
     def table(self, values: np.ndarray) -> str:
         """A pointer to numbers that are known when the program is written."""
@@ -303,8 +310,7 @@ class Code:
 
 
 MOST = 4096
-"""Elements of an array that is taken apart; more would take
-minutes to compile."""
+"""Elements of an array that is taken apart; more would take minutes to compile."""
 LONG = 64
 """elements above which an array that repeats one number is not taken apart, and up to which one
 may be looked for among all"""
@@ -326,7 +332,7 @@ type Elements = np.ndarray[Any, Any]
 type Operand = Elements | Stored
 
 
-def elements(code: Code, operand: Operand) -> Elements:
+def elements(operand: Operand) -> Elements:
     """An operand as an array of Values."""
     if isinstance(operand, Stored):
         if int(np.prod(operand.shape)) > MOST:
@@ -335,19 +341,25 @@ def elements(code: Code, operand: Operand) -> Elements:
         for at in np.ndindex(operand.shape):
             every[at] = operand.element(tuple(constant(i, INDEX) for i in at))
         return every
-    if operand.dtype == object:
-        return operand
-    made = np.empty(operand.shape, object)
-    for at in np.ndindex(operand.shape):
-        value: Any = operand[at]
-        made[at] = constant(value, operand.dtype)
-    return made
+    return operand if operand.dtype == object else applied(constant, operand, dtype=operand.dtype)
 
 
-def scalar(code: Code, operand: Operand) -> Value:
+def applied(function: Callable[..., Any], *arrays: Elements, **others: Any) -> Elements:
+    """A function of Values, element by element of arrays that NumPy broadcasts."""
+    mapped = np.frompyfunc(lambda *v: function(*v, **others), len(arrays), 1)
+    return np.asarray(mapped(*arrays), object)
+
+
+def scalar(operand: Operand) -> Value:
     """The Value of an operand that is one number."""
-    value: Value = elements(code, operand).item()
-    return value
+    return elements(operand).item()
+
+
+def dtype_of(operand: Operand) -> np.dtype:
+    """The type of an operand's numbers."""
+    if isinstance(operand, Stored) or operand.dtype != object:
+        return operand.dtype
+    return operand.ravel()[0].dtype
 
 
 def at_place(code: Code, operand: Operand, at: tuple[Value, ...]) -> Value:
@@ -355,7 +367,7 @@ def at_place(code: Code, operand: Operand, at: tuple[Value, ...]) -> Value:
     if isinstance(operand, Stored):
         return operand.element(at)
     if operand.shape == ():
-        return scalar(code, operand)
+        return scalar(operand)
     if operand.dtype != object:
         return code.load(code.table(operand), flat(code, operand.shape, at), operand.dtype)
     if all(not i.operand.startswith("%") for i in at):
@@ -365,17 +377,10 @@ def at_place(code: Code, operand: Operand, at: tuple[Value, ...]) -> Value:
             f"an element at a computed place of a computed array {operand.shape}"
         )
     # Every element is at hand in a register: the one that is meant is chosen among all.
-    places = list(np.ndindex(operand.shape))
-    # Any: of an array's element NumPy's types make an array as well.
-    chosen: Any = operand[places[-1]]
-    for place in reversed(places[:-1]):
-        value: Any = operand[place]
-        here = None
-        for index, k in zip(at, place, strict=True):
-            same = code.compare("icmp eq", index, constant(k, index.dtype))
-            here = same if here is None else code.operation("and", here, same)
-        assert here is not None
-        chosen = code.choose(here, value, chosen)
+    place, chosen = flat(code, operand.shape, at), operand.ravel()[-1]
+    for k in range(operand.size - 2, -1, -1):
+        here = code.compare("icmp eq", place, constant(k, place.dtype))
+        chosen = code.choose(here, operand.ravel()[k], chosen)
     return chosen
 
 
@@ -386,9 +391,3 @@ def flat(code: Code, shape: tuple[int, ...], at: tuple[Value, ...]) -> Value:
         flat = code.operation("mul", flat, constant(length, INDEX))
         flat = code.operation("add", flat, index)
     return flat
-
-
-def dtype_of(operand: Operand) -> np.dtype:
-    if isinstance(operand, Stored) or operand.dtype != object:
-        return operand.dtype
-    return operand.ravel()[0].dtype

@@ -52,50 +52,41 @@ class Run(NamedTuple):
     """one at least"""
 
 
-def whole(stored: Sequence[Argument]) -> list[Argument]:
-    """The same with one pointer each: those of vehicles' own are read sample by sample too."""
-    return [argument._replace(shared=True) for argument in stored]
-
-
-class Text(NamedTuple):
-    """A program in LLVM's language: of one function, `run`.
+def write(run: Run, lanes: int) -> tuple[str, list[Argument]]:
+    """A run in LLVM's language, of one function, `run`; and the results.
 
     Its arguments are four tables of pointers (what stays, what is stored, the carry, the results:
     one for each array that is shared or stored, one for each row of the others, where a row has a
     number of each vehicle), between which vehicles it is to compute, and how many there are.
-    """
-
-    assembly: str
-    results: list[Argument]
-
-
-def write(run: Run, lanes: int) -> Text:
-    """Write the program of a run.
 
     Raises:
         UnsupportedError: an operation that has no translation.
     """
     code = Code(lanes)
     stored = _stored(code, run.stored)
-    rows, shared = _tables(code, "%stays", run.stays)
-    starts, _ = _tables(code, "%carry", run.carry)
+    read_stays, read_carry = (
+        _read(code, name, arguments)
+        for name, arguments in (("%stays", run.stays), ("%carry", run.carry))
+    )
     code.write("br label %vehicles")
     entry = code.block
     code.label("vehicles")
     code.write(f"%b = phi i64 [ %begin, %{entry} ], [ %following, %done ]")
-    stays = [_of_row(code, *v) if v[1] else shared[i] for i, v in enumerate(rows)]
-    carry = [_of_row(code, *v) for v in starts]
+    stays, carry = read_stays(), read_carry()
     # How many there are is known: an index that cannot leave the record need not be clipped to it.
     steps = constant(run.steps, INDEX)
 
     def step(index: Value, carried: list[Operand]) -> list[Operand]:
         return translate(
-            code, run.step.jaxpr, run.step.consts, [*stays, *stored, *carried, _single(index)]
+            code,
+            run.step.jaxpr,
+            run.step.consts,
+            [*stays, *stored, *carried, np.asarray(index, object)],
         )
 
     carried = loop(code, steps, carry, step)
     results = translate(code, run.last.jaxpr, run.last.consts, [*stays, *stored, *carried])
-    arrays = [elements(code, v) for v in results]
+    arrays = [elements(v) for v in results]
     kinds = [Argument(v.shape, v.ravel()[0].dtype, False) for v in arrays]
     for i, value in enumerate(v for array in arrays for v in array.ravel()):
         _store(code, value, code.pointer("%results", i))
@@ -115,32 +106,20 @@ def write(run: Run, lanes: int) -> Text:
     # registers would lie across lines of the cache: a quarter of the time of an exact step.
     attributes = 'alignstack(64) "prefer-vector-width"="512" "min-legal-vector-width"="512"'
     function = f"define void @run({arguments}) nounwind {attributes} {{\nentry:\n{body}\n}}"
-    return Text("\n".join([*head, function, ""]), kinds)
-
-
-def _single(value: Value) -> Elements:
-    single = np.empty((), object)
-    single[()] = value
-    return single
+    return "\n".join([*head, function, ""]), kinds
 
 
 def _stored(code: Code, arguments: Sequence[Argument]) -> list[Stored]:
-    made = []
-    for i, argument in enumerate(arguments):
+    """Records, read by the sample."""
+
+    def read(pointer: str, argument: Argument) -> Stored:
         if len(argument.shape) != 1:
             raise UnsupportedError(f"a record of shape {argument.shape}")
-        pointer, dtype = code.pointer("%stored", i), argument.dtype
-        if argument.shared:
-            made.append(
-                Stored(argument.shape, dtype, lambda at, p=pointer, d=dtype: code.load(p, at[0], d))
-            )
-        else:
-            made.append(
-                Stored(
-                    argument.shape, dtype, lambda at, p=pointer, d=dtype: _own(code, p, at[0], d)
-                )
-            )
-    return made
+        of_sample = code.load if argument.shared else functools.partial(_own, code)
+        dtype = argument.dtype
+        return Stored(argument.shape, dtype, lambda at: of_sample(pointer, at[0], dtype))
+
+    return [read(code.pointer("%stored", i), argument) for i, argument in enumerate(arguments)]
 
 
 def _own(code: Code, pointer: str, index: Value, dtype: np.dtype) -> Value:
@@ -154,37 +133,32 @@ def _own(code: Code, pointer: str, index: Value, dtype: np.dtype) -> Value:
     return _vector(code, pointer, place, dtype)
 
 
-def _tables(
-    code: Code, name: str, arguments: Sequence[Argument]
-) -> tuple[list[tuple[Argument, list[str]]], dict[int, Operand]]:
-    """Pointers to the rows of what is not shared, and what is."""
-    rows: list[tuple[Argument, list[str]]] = []
-    shared: dict[int, Operand] = {}
+def _read(code: Code, name: str, arguments: Sequence[Argument]) -> Callable[[], list[Operand]]:
+    """Arrays of a table of pointers: what is shared is read now, the vehicles' own when called."""
+    made: list[Callable[[], Operand]] = []
     place = 0
-    for i, argument in enumerate(arguments):
-        size = int(np.prod(argument.shape))
-        pointers = []
-        for _ in range(1 if argument.shared else size):
-            pointers.append(code.pointer(name, place))
-            place += 1
-        if not argument.shared:
-            rows.append((argument, pointers))
-            continue
-        rows.append((argument, []))
-        table = Stored(argument.shape, argument.dtype, _looked_up(code, pointers[0], argument))
-        # A long one, such as a model's table, stays in memory: it can be looked something up in.
-        shared[i] = table if size > LONG else elements(code, table)
-    return rows, shared
+    for argument in arguments:
+        size = 1 if argument.shared else int(np.prod(argument.shape))
+        pointers = [code.pointer(name, place + k) for k in range(size)]
+        place += size
+        if argument.shared:
+            shared = _shared(code, pointers[0], argument)
+            made.append(lambda shared=shared: shared)
+        else:
+            made.append(functools.partial(_of_row, code, argument, pointers))
+    return lambda: [read() for read in made]
 
 
-def _looked_up(
-    code: Code, pointer: str, argument: Argument
-) -> Callable[[tuple[Value, ...]], Value]:
+def _shared(code: Code, pointer: str, argument: Argument) -> Operand:
+    """An array that all vehicles share."""
+
     def element(at: tuple[Value, ...]) -> Value:
         place = flat(code, argument.shape, at) if at else constant(0, INDEX)
         return code.load(pointer, place, argument.dtype)
 
-    return element
+    table = Stored(argument.shape, argument.dtype, element)
+    # A long one, such as a model's table, stays in memory: it can be looked something up in.
+    return table if int(np.prod(argument.shape)) > LONG else elements(table)
 
 
 def _of_row(code: Code, argument: Argument, pointers: list[str]) -> Elements:
@@ -279,7 +253,9 @@ class Kernel:
         # Kept until the call is over: the program has pointers to them.
         arguments = [[np.ascontiguousarray(v) for v in part] for part in (stays, stored, carry)]
         results = [np.empty((*r.shape, count), r.dtype) for r in self._results]
-        kinds = (self._run.stays, whole(self._run.stored), self._run.carry)
+        # Those of vehicles' own are read sample by sample too: one pointer each.
+        stored_kinds = [argument._replace(shared=True) for argument in self._run.stored]
+        kinds = (self._run.stays, stored_kinds, self._run.carry)
         tables = [_pointers(v, count, kind) for v, kind in zip(arguments, kinds, strict=True)]
         ends = _pointers(results, count, self._results)
         blocks = count // self.lanes
@@ -307,18 +283,30 @@ def _pointers(arrays: Sequence[np.ndarray], count: int, arguments: Sequence[Argu
     return (ctypes.c_void_p * max(1, len(table)))(*table)
 
 
+# Any: llvmlite is an extra, and has no types.
+def _llvm() -> Any:
+    """llvmlite's binding of LLVM.
+
+    Raises:
+        UnsupportedError: it is not installed.
+    """
+    try:
+        import llvmlite.binding as llvm
+    except ImportError as e:
+        remedy = "pip install 'heli_jax[fused]'"
+        raise UnsupportedError(f"any model: llvmlite is not installed ({remedy})") from e
+    return llvm
+
+
 @functools.cache
 def _features() -> frozenset[str]:
     """Return the features of this processor."""
-    import llvmlite.binding as llvm
-
-    return frozenset(name for name, has in llvm.get_host_cpu_features().items() if has)
+    return frozenset(name for name, has in _llvm().get_host_cpu_features().items() if has)
 
 
 def _machine() -> Any:
     """The processor at hand, for LLVM."""
-    import llvmlite.binding as llvm
-
+    llvm = _llvm()
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     return llvm.Target.from_default_triple().create_target_machine(
@@ -328,9 +316,7 @@ def _machine() -> Any:
 
 def _compiled(assembly: str) -> Any:
     """The engine that holds the machine code, which goes with it."""
-    import llvmlite.binding as llvm
-
-    target = _machine()
+    llvm, target = _llvm(), _machine()
     for name in re.findall(r"^declare .*@(?!llvm\.)(\w+)\(", assembly, re.MULTILINE):
         # LLVM would end the process where it does not find one.
         llvm.add_symbol(name, _address(name))

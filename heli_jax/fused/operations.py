@@ -1,6 +1,7 @@
 """JAX primitives in LLVM, for one number of each vehicle at a time."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -28,31 +29,19 @@ def _arithmetic(of_floats: str, of_integers: str) -> Operation:
 def _quotient(code: Code, a: Value, b: Value, **_: Any) -> Value:
     if a.dtype.kind == "f":
         return code.operation(f"fdiv {_F}", a, b)
-    return _of_integers(code, "div", a, b, constant(-1, b.dtype))
+    if a.dtype.kind != "u":
+        raise UnsupportedError("a quotient of signed integers")
+    # The processor stops at a quotient by zero, of which XLA makes the largest number.
+    none = code.compare("icmp eq", b, constant(0, b.dtype))
+    result = code.operation("udiv", a, code.choose(none, constant(1, b.dtype), b))
+    return code.choose(none, constant(-1, b.dtype), result)
 
 
 def _remainder(code: Code, a: Value, b: Value, **_: Any) -> Value:
     """Return the remainder with the sign of the dividend."""
-    if a.dtype.kind == "f":
-        return code.library("fmod", a, b)
-    return _of_integers(code, "rem", a, b, a)
-
-
-def _of_integers(code: Code, name: str, a: Value, b: Value, by_zero: Value) -> Value:
-    """A quotient or a remainder, toward zero; of zero what XLA makes of it."""
-    if a.dtype.kind not in "iu":
-        raise UnsupportedError("a quotient of truth values")
-    zero, one = constant(0, b.dtype), constant(1, b.dtype)
-    none = code.compare("icmp eq", b, zero)
-    # The processor stops at a quotient by zero, and at the least integer by -1, which has none.
-    divisor = code.choose(none, one, b)
-    if a.dtype.kind == "u":
-        return code.choose(none, by_zero, code.operation(f"u{name}", a, divisor))
-    negated = code.compare("icmp eq", b, constant(-1, b.dtype))
-    result = code.operation(f"s{name}", a, code.choose(negated, one, divisor))
-    if name == "div":
-        result = code.choose(negated, code.operation("sub", zero, a), result)
-    return code.choose(none, by_zero, result)
+    if a.dtype.kind != "f":
+        raise UnsupportedError("a remainder of integers")
+    return code.operation("frem", a, b)
 
 
 def _extreme(of_floats: str, signed: str, unsigned: str) -> Operation:
@@ -75,20 +64,11 @@ def _comparison(of_floats: str, signed: str, unsigned: str) -> Operation:
     return made
 
 
-def _function(name: str) -> Operation:
+def _function(name: str, how: Callable[..., Value]) -> Operation:
     def made(code: Code, *values: Value, **_: Any) -> Value:
         if values[0].dtype.kind != "f":
             raise UnsupportedError(f"{name} of integers")
-        return code.intrinsic(name, *values)
-
-    return made
-
-
-def _library(name: str) -> Operation:
-    def made(code: Code, a: Value, **_: Any) -> Value:
-        if a.dtype.kind != "f":
-            raise UnsupportedError(f"{name} of integers")
-        return code.library(name, a)
+        return how(code, name, *values)
 
     return made
 
@@ -167,6 +147,17 @@ def _finite(code: Code, a: Value, **_: Any) -> Value:
     return code.compare("fcmp olt", code.intrinsic("fabs", a), constant(np.inf, a.dtype))
 
 
+def _less_in_order(code: Code, a: Value, b: Value, **_: Any) -> Value:
+    """a < b, where what is not a number is greater than all others."""
+    if a.dtype.kind != "f":
+        return OPERATIONS["lt"](code, a, b)
+    return code.operation("and", code.compare("fcmp ult", a, b), code.compare("fcmp ord", a, a))
+
+
+def _not_greater_in_order(code: Code, a: Value, b: Value, **_: Any) -> Value:
+    return _not(code, _less_in_order(code, b, a))
+
+
 def _logic(name: str) -> Operation:
     return lambda code, *values, **_: code.operation(name, *values)
 
@@ -176,26 +167,13 @@ def _not(code: Code, a: Value, **_: Any) -> Value:
     return code.operation("xor", a, ones)
 
 
-def _shifted(name: str) -> Operation:
-    def made(code: Code, a: Value, by: Value, **_: Any) -> Value:
-        if a.dtype.kind not in "iu":
-            raise UnsupportedError("a shift of truth values")
-        bits = 8 * a.dtype.itemsize
-        # Further than the number is long LLVM has no result; JAX has what is then left of it.
-        within = code.compare("icmp ult", by, constant(bits, by.dtype))
-        shifted = code.operation(name, a, code.choose(within, by, constant(bits - 1, by.dtype)))
-        return shifted if name == "ashr" else code.choose(within, shifted, constant(0, a.dtype))
-
-    return made
-
-
 def _same_bits(code: Code, a: Value, *, new_dtype: Any, **_: Any) -> Value:
     """The same bits read as a number of another type."""
     target = np.dtype(new_dtype)
     if target.itemsize != a.dtype.itemsize or "b" in (target.kind, a.dtype.kind):
         raise UnsupportedError(f"the bits of {a.dtype} as {target}")
     if type_of(target) == type_of(a.dtype):
-        return a._replace(dtype=target)
+        return replace(a, dtype=target)
     return code.cast("bitcast", a, target)
 
 
@@ -241,7 +219,7 @@ def converted(code: Code, a: Value, *, new_dtype: Any, **_: Any) -> Value:
     if source == "b":
         return code.cast("zext", a, target)
     if type_of(a.dtype) == type_of(target):
-        return a._replace(dtype=target)
+        return replace(a, dtype=target)
     if target.itemsize < a.dtype.itemsize:
         return code.cast("trunc", a, target)
     return code.cast("sext" if source == "i" else "zext", a, target)
@@ -269,7 +247,14 @@ def _power_of(code: Code, a: Value, b: Value, **_: Any) -> Value:
     return code.intrinsic("pow", a, b)
 
 
+_INTRINSICS = (
+    *("sqrt", "floor", "ceil", "exp", "exp2", "log", "log2", "sin", "cos", "tan", "asin", "acos"),
+    *("atan", "atan2", "sinh", "cosh", "tanh"),
+)
+_LIBRARY = ("log1p", "expm1", "cbrt", "asinh", "acosh", "atanh", "erf", "erfc")
 OPERATIONS: dict[str, Operation] = {
+    **{name: _function(name, Code.intrinsic) for name in _INTRINSICS},
+    **{name: _function(name, Code.library) for name in _LIBRARY},
     "add": _arithmetic("fadd", "add"),
     "add_any": _arithmetic("fadd", "add"),
     "sub": _arithmetic("fsub", "sub"),
@@ -281,42 +266,19 @@ OPERATIONS: dict[str, Operation] = {
     "max": _extreme("maximum", "smax", "umax"),
     "min": _extreme("minimum", "smin", "umin"),
     "clamp": _clamped,
-    "sqrt": _function("sqrt"),
     "rsqrt": _inverse_root,
     "square": _square,
     "one_minus_square": _one_minus_square,
     "polynomial": _polynomial,
     "integer_pow": _power,
     "pow": _power_of,
-    "floor": _function("floor"),
-    "ceil": _function("ceil"),
     "round": _rounded,
     "sign": _sign,
     "is_finite": _finite,
-    "exp": _function("exp"),
-    "exp2": _function("exp2"),
-    "log": _function("log"),
-    "log2": _function("log2"),
-    "log1p": _library("log1p"),
-    "expm1": _library("expm1"),
-    "cbrt": _library("cbrt"),
-    "asinh": _library("asinh"),
-    "acosh": _library("acosh"),
-    "atanh": _library("atanh"),
-    "erf": _library("erf"),
-    "erfc": _library("erfc"),
     "logistic": _logistic,
-    "sin": _function("sin"),
-    "cos": _function("cos"),
-    "tan": _function("tan"),
-    "asin": _function("asin"),
-    "acos": _function("acos"),
-    "atan": _function("atan"),
-    "atan2": _function("atan2"),
-    "sinh": _function("sinh"),
-    "cosh": _function("cosh"),
-    "tanh": _function("tanh"),
     "lt": _comparison("olt", "slt", "ult"),
+    "lt_to": _less_in_order,
+    "le_to": _not_greater_in_order,
     "le": _comparison("ole", "sle", "ule"),
     "gt": _comparison("ogt", "sgt", "ugt"),
     "ge": _comparison("oge", "sge", "uge"),
@@ -327,29 +289,7 @@ OPERATIONS: dict[str, Operation] = {
     "xor": _logic("xor"),
     "not": _not,
     "select_n": _selected,
-    "shift_left": _shifted("shl"),
-    "shift_right_logical": _shifted("lshr"),
-    "shift_right_arithmetic": _shifted("ashr"),
     "bitcast_convert_type": _same_bits,
     "convert_element_type": converted,
 }
 """by the primitive's name; numbers of equal shape, element by element"""
-
-
-def within(code: Code, index: Value, most: int) -> Value:
-    """An index between 0 and the most, whatever it was."""
-    # A short type may not have the most; then none of its numbers is beyond.
-    high = min(most, int(np.iinfo(index.dtype).max))
-    return _clamped(code, constant(0, index.dtype), index, constant(high, index.dtype))
-
-
-def in_type(code: Code, values: np.ndarray[Any, Any], dtype: Any) -> np.ndarray[Any, Any]:
-    """An array of Values in another type; as they are where it is None."""
-    if dtype is None:
-        return values
-    result = np.empty(values.shape, object)
-    for at in np.ndindex(values.shape):
-        # Any: an element, of which NumPy's types make an array as well.
-        value: Any = values[at]
-        result[at] = converted(code, value, new_dtype=dtype)
-    return result

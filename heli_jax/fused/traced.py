@@ -4,13 +4,11 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
 from heli_jax.fused.code import UnsupportedError
-from heli_jax.fused.kernel import Argument, Run
-from heli_jax.fused.translate import place_of
+from heli_jax.fused.kernel import Argument, Kernel, Run
 from heli_jax.numerics.hoist import hoisted
 
 # `Any` below: trees of arrays, and jaxprs.
@@ -50,10 +48,30 @@ class Traced(NamedTuple):
         _, stay = self._before(shared, records, element)
         return [v for v, varying in zip(stay, self.varies, strict=True) if not varying]
 
-    def stays(self, own: list[Any], common: list[Any]) -> list[Any]:
-        """Both in their order."""
-        of_own, of_common = iter(own), iter(common)
-        return [next(of_own) if varying else next(of_common) for varying in self.varies]
+    def compute(
+        self,
+        kernel: Kernel,
+        begun: tuple[list[Any], list[Any]],
+        common: Any,
+        records: Any,
+        threads: int,
+    ) -> Any:
+        """Compute the runs of elements.
+
+        Args:
+            kernel: of `run`.
+            begun: what `own` gives, with the elements first.
+            common: what `common` gives.
+            records: as they were traced; each element's own have the elements last.
+
+        Returns:
+            The results, with the elements last.
+        """
+        carry, own = jax.tree.map(lambda v: np.moveaxis(np.asarray(v), 0, -1), begun)
+        of_own, of_common = iter(own), iter(map(np.asarray, common))
+        stays = [next(of_own) if varying else next(of_common) for varying in self.varies]
+        stored = [np.asarray(v) for v in jax.tree.leaves(records)]
+        return jax.tree.unflatten(self.results, kernel(stays, stored, carry, threads))
 
 
 def traced(
@@ -104,7 +122,6 @@ def traced(
 
     closed, shape = jax.make_jaxpr(begin, return_shape=True)(shared, records, element)
     carried, stay = (jax.tree.leaves(part) for part in shape)
-    _check_numbers(closed.jaxpr, [*carried, *stay])
     rows = [np.asarray(v) for v in jax.tree.leaves(records)]
     own_records = [False] * len(rows) if own_records is None else list(own_records)
     n_shared = len(jax.tree.leaves(shared))
@@ -126,19 +143,6 @@ def traced(
         parts["steps"],
     )
     return Traced(run, parts["results"], closed)
-
-
-def _check_numbers(jaxpr: Any, results: Sequence[Any]) -> None:
-    """Refuse what is no number, such as a key of random ones, with the line that makes it."""
-    made = {v: equation for equation in jaxpr.eqns for v in equation.outvars}
-    for variable, result in zip(jaxpr.outvars, results, strict=True):
-        if not jnp.issubdtype(result.dtype, jax.dtypes.extended):
-            continue
-        equation = None if hasattr(variable, "val") else made.get(variable)
-        name = "random_seed" if equation is None else equation.primitive.name
-        error = UnsupportedError(f"the operation {name}, whose key is no number")
-        error.place = None if equation is None else place_of(equation)
-        raise error
 
 
 def _vary(jaxpr: Any, arguments: Sequence[Any]) -> list[bool]:

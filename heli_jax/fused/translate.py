@@ -7,16 +7,17 @@ What loops carry is kept in registers, one of LLVM's phi nodes each.
 """
 
 import functools
+import math
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
+from heli_jax.fused.arrays import MOVED, SHAPED, at_compile_time, moved
 from heli_jax.fused.code import (
     INDEX,
     MOST,
@@ -26,6 +27,7 @@ from heli_jax.fused.code import (
     Stored,
     UnsupportedError,
     Value,
+    applied,
     at_place,
     constant,
     dtype_of,
@@ -33,9 +35,7 @@ from heli_jax.fused.code import (
     said,
     scalar,
 )
-from heli_jax.fused.lookups import COMBINED, Combined, in_order, scattered
 from heli_jax.fused.operations import OPERATIONS
-from heli_jax.fused.shapes import SHAPED
 
 _UNROLLED = 16
 """Passes of a loop that are written out where it cannot stay a loop."""
@@ -66,7 +66,7 @@ def translate(code: Code, jaxpr: Any, consts: Sequence[Any], operands: Sequence[
     """
     known: dict[Any, Operand] = {}
     for variable, value in zip(jaxpr.constvars, consts, strict=True):
-        known[variable] = value if isinstance(value, Stored) else _at_hand(value)
+        known[variable] = value if isinstance(value, Stored) else np.asarray(value)
     known |= dict(zip(jaxpr.invars, operands, strict=True))
 
     def read(atom: Any) -> Operand:
@@ -86,14 +86,6 @@ def translate(code: Code, jaxpr: Any, consts: Sequence[Any], operands: Sequence[
             raise error from e
         known |= dict(zip(equation.outvars, outputs, strict=True))
     return [read(v) for v in jaxpr.outvars]
-
-
-def _at_hand(value: Any) -> Any:
-    """Return a value that is known at compile time, as NumPy has it; random keys are JAX's
-    alone."""
-    if jnp.issubdtype(getattr(value, "dtype", np.float64), jax.dtypes.extended):
-        return value
-    return np.asarray(value)
 
 
 def _named(equation: Any) -> tuple[str, dict[str, Any]]:
@@ -137,24 +129,13 @@ def _equation(code: Code, equation: Any, inputs: list[Operand]) -> list[Operand]
         raise UnsupportedError(f"the operation {name}")
     known = not any(isinstance(v, Stored) or v.dtype == object for v in inputs)
     if known and not (name in OPERATIONS and all(v.shape == () for v in inputs)):
-        # Known now: JAX itself computes it, whatever it is; single numbers LLVM folds as well.
-        with jax.ensure_compile_time_eval():
-            results = equation.primitive.bind(*inputs, **params)
-        results = results if equation.primitive.multiple_results else [results]
-        return [_at_hand(r) for r in results]
+        # Whatever it is; single numbers LLVM folds as well.
+        return at_compile_time(equation, inputs)
     if name in OPERATIONS:
         dtype = np.dtype(equation.outvars[0].aval.dtype)
         return [_elementwise(code, name, params, inputs, dtype)]
-    if name == "sort":
-        return in_order(code, inputs, params)
-    if name == "split":
-        cuts = np.cumsum(params["sizes"])[:-1]
-        return list(np.split(elements(code, inputs[0]), cuts, params["axis"]))
-    if name == "unstack":
-        rows = np.moveaxis(elements(code, inputs[0]), params["axis"], 0)
-        return [rows[k, ...] for k in range(len(rows))]
-    if name in COMBINED:
-        return [scattered(code, inputs, params, _combined(name, params))]
+    if name in MOVED:
+        return moved(code, equation, name, inputs)
     if name in SHAPED:
         return [SHAPED[name](code, inputs, params)]
     if hasattr(params.get("_prim"), "expand"):
@@ -163,42 +144,21 @@ def _equation(code: Code, equation: Any, inputs: list[Operand]) -> list[Operand]
     raise UnsupportedError(f"the operation {name}")
 
 
-def _combined(name: str, params: dict[str, Any]) -> Combined:
-    """Return how an update combines with the array's element."""
-    function, consts = params.get("update_jaxpr"), params.get("update_consts", ())
-    if name != "scatter" or function is None:
-        return COMBINED[name]
-
-    # `.at[i].apply(f)`: what is given to be written does not count.
-    def applied(code: Code, old: Value, new: Value) -> Value:
-        operands = [_filled(v, np.empty(())) for v in (old, new)]
-        (made,) = translate(code, function, consts, operands)
-        return scalar(code, made)
-
-    return applied
-
-
 def _elementwise(
     code: Code, name: str, params: dict[str, Any], inputs: list[Operand], dtype: np.dtype
 ) -> Operand:
     """Arrays of one shape, single numbers, and arrays with axes of length 1 that are repeated."""
-    operation = OPERATIONS[name]
+    operation = functools.partial(OPERATIONS[name], code, **params)
     shape = np.broadcast_shapes(*(v.shape for v in inputs))
-    size = int(np.prod(shape))
     if any(isinstance(v, Stored) for v in inputs):
 
         def element(at: tuple[Value, ...]) -> Value:
-            values = (at_place(code, v, _repeated(v.shape, shape, at)) for v in inputs)
-            return operation(code, *values, **params)
+            return operation(*(at_place(code, v, _repeated(v.shape, shape, at)) for v in inputs))
 
         return Stored(shape, dtype, element)
-    if size > MOST:
+    if math.prod(shape) > MOST:
         raise UnsupportedError(f"an array of {shape} as a whole")
-    arrays = [np.broadcast_to(elements(code, v), shape) for v in inputs]
-    result = np.empty(shape, object)
-    for at in np.ndindex(shape):
-        result[at] = operation(code, *(a[at] for a in arrays), **params)
-    return result
+    return applied(operation, *(elements(v) for v in inputs))
 
 
 def _repeated(
@@ -217,7 +177,7 @@ def _branches(code: Code, params: dict[str, Any], inputs: list[Operand]) -> list
     if not isinstance(which, Stored) and which.dtype != object:
         branch = branches[int(np.clip(which, 0, len(branches) - 1))]
         return translate(code, branch.jaxpr, branch.consts, operands)
-    which, outside, results = scalar(code, which), code.taken, []
+    which, outside, results = scalar(which), code.taken, []
     for i, branch in enumerate(branches):
         # A loop of a branch that nobody takes need not have an end.
         taken = code.any(_takes(code, which, i, len(branches)))
@@ -225,7 +185,7 @@ def _branches(code: Code, params: dict[str, Any], inputs: list[Operand]) -> list
         results.append(translate(code, branch.jaxpr, branch.consts, operands))
     code.taken = outside
     return [
-        _elementwise(code, "select_n", {}, [_filled(which, case[0]), *case], dtype_of(case[0]))
+        _elementwise(code, "select_n", {}, [np.asarray(which, object), *case], dtype_of(case[0]))
         for case in zip(*results, strict=True)
     ]
 
@@ -236,13 +196,6 @@ def _takes(code: Code, which: Value, i: int, count: int) -> Value:
         return which if i else code.operation("xor", which, constant(True, which.dtype))
     order = "sle" if i == 0 else "sge" if i == count - 1 else "eq"
     return code.compare(f"icmp {order}", which, constant(i, which.dtype))
-
-
-def _filled(which: Value, like: Operand) -> Elements:
-    filled = np.empty(like.shape, object)
-    for at in np.ndindex(*like.shape):
-        filled[at] = which
-    return filled
 
 
 def _scan(code: Code, params: dict[str, Any], inputs: list[Operand]) -> list[Operand]:
@@ -285,7 +238,7 @@ def _row(code: Code, operand: Operand, index: Value) -> Operand:
     """operand[index]"""
     shape = operand.shape[1:]
     view = Stored(shape, dtype_of(operand), lambda at: at_place(code, operand, (index, *at)))
-    return view if int(np.prod(shape)) > MOST else elements(code, view)
+    return view if int(np.prod(shape)) > MOST else elements(view)
 
 
 def _written_out(
@@ -305,7 +258,7 @@ def _written_out(
         outputs = translate(code, body.jaxpr, body.consts, [*consts, *carry, *now])
         carry = outputs[: len(carry)]
         for column, value in zip(kept, outputs[len(carry) :], strict=True):
-            column.append(elements(code, value))
+            column.append(elements(value))
     if params["reverse"]:
         kept = [column[::-1] for column in kept]
     return [*carry, *(np.stack(column) for column in kept)]
@@ -319,7 +272,7 @@ def _while(code: Code, params: dict[str, Any], inputs: list[Operand]) -> list[Op
 
     def holds(carried: list[Operand]) -> Elements:
         (going,) = translate(code, test.jaxpr, test.consts, [*of_test, *carried])
-        return elements(code, going)
+        return elements(going)
 
     def some(carried: list[Operand]) -> Value:
         # Of vmap the loop has an answer for each of what it maps over.
@@ -344,7 +297,7 @@ def _while(code: Code, params: dict[str, Any], inputs: list[Operand]) -> list[Op
         carry,
         once,
     )
-    return _where(code, _filled(entered, np.empty(())), results, carry)
+    return _where(code, np.asarray(entered, object), results, carry)
 
 
 def _where(code: Code, which: Elements, yes: list[Operand], no: list[Operand]) -> list[Operand]:
@@ -369,7 +322,7 @@ def loop(
         until: how many passes (int32), or of what is carried whether there is another.
         body: of the pass's number (int32) and what is carried, what is carried on.
     """
-    starts = [elements(code, v) for v in carry]
+    starts = [elements(v) for v in carry]
     varies = [_vary(v) for v in starts]
     # What starts the same for all vehicles may not stay so: tried until nothing changes.
     while True:
@@ -384,7 +337,7 @@ def loop(
 
 def _vary(values: Elements) -> np.ndarray:
     """Return for each value whether it differs between vehicles."""
-    return np.vectorize(lambda v: not v.shared, otypes=[bool])(values)
+    return applied(lambda v: not v.shared, values).astype(bool)
 
 
 def _tried(
@@ -406,11 +359,8 @@ def _tried(
     index = Value(code.register(), INDEX, True)
     carried = []
     for s, each in zip(starts, varies, strict=True):
-        values = np.empty(s.shape, object)
-        for at in np.ndindex(s.shape):
-            values[at] = Value(code.register(), s[at].dtype, not bool(each[at]))
-        carried.append(values)
-    results = [elements(code, v) for v in body(index, list(carried))]
+        carried.append(applied(lambda v, w: Value(code.register(), v.dtype, not w), s, each))
+    results = [elements(v) for v in body(index, list(carried))]
     around = [
         [code.of(v, not bool(w) and v.shared) for v, w in zip(r.ravel(), e.ravel(), strict=True)]
         for r, e in zip(results, varies, strict=True)

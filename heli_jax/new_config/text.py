@@ -27,6 +27,7 @@ _GUSTS = (
 _NO_AXIS = (
     "  # output-error: the model names no axis on which gusts could act (axes in its file).",
 )
+_PRIOR_OF_A = "    # a: {prior: {mean: 5.5, sd: 0.3}} # else taken as exact: Ixx and If go with it"
 _SMOOTH = (
     "  # GUESS: output-error, since the outputs have no sensor's noise: the log was smoothed or",
     "  # simulated, and filter-error needs the noise as the sensors gave it.",
@@ -165,6 +166,8 @@ def configuration(
     ]
     stays = "# stays at this, another vehicle's; found without the first #"
     lines += [f"    # {n}: {{start: {_number(v)}}}".ljust(33) + stays for n, v in held.items()]
+    if not chosen.linear and "a" in naming.names(chosen.model.Params) and "a" not in free:
+        lines.append(_PRIOR_OF_A)
     guess, sure = late
     why = f"GUESS: {_comment(guess)}" if guess else "where the stick was logged late or early"
     lines += [

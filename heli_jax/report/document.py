@@ -426,7 +426,7 @@ class FitFile(TypedDict):
     """predicted one sample ahead, of the flights that were fitted"""
     one_step_validation: Annotated[dict[str, Metrics], "fit.one_step_validation"]
     """the same of flights held out"""
-    acceptance: Annotated[list[Gate], lambda a: card(a.problem, a.fit)]
+    acceptance: Annotated[list[Gate], lambda a: card(a.problem, a.fit, a.supplementary.responses)]
     """the lines of the acceptance card"""
     models: Annotated[CandidatesCompared | None, "supplementary.choice"]
     methods: Annotated[MethodsCompared | None, "supplementary.methods"]

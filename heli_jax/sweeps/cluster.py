@@ -1,7 +1,7 @@
-"""Chunks of a sweep computed by dask.distributed: on more processes or more machines.
+"""Chunks of a sweep, or fits of a study, by dask.distributed: on more processes or hosts.
 
 Workers give their results back, and the process that was started writes them: they need no disk in
-common. A worker that dies has its chunks computed by another.
+common. A worker that dies has its tasks done by another.
 """
 
 import contextlib
@@ -11,7 +11,7 @@ import signal
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import dask
@@ -58,34 +58,47 @@ class Prepared(WorkerPlugin):
     # dask keeps one plugin of a name: a second sweep on the same scheduler replaces the first's.
     name: Any = "heli_jax"
 
-    def __init__(self, x64: bool, folders: tuple[str, ...], cache: str | None) -> None:
-        self.x64, self.folders, self.cache = x64, folders, cache
+    def __init__(self, settings: dict[str, Any], folders: tuple[str, ...]) -> None:
+        self.settings, self.folders = settings, folders
 
     def setup(self, worker: distributed.Worker) -> None:
         """Called by dask in every worker, later ones too."""
-        # JAX's setting is of a process and is not sent with the job: float32 would come back.
-        jax.config.update("jax_enable_x64", self.x64)
-        if self.cache:
-            jax.config.update("jax_compilation_cache_dir", self.cache)
+        # JAX's settings are of a process and are not sent with the job: float32 would come back.
+        for name, value in self.settings.items():
+            jax.config.update(name, value)
         import_path.search(self.folders)
+        import_path.pass_over_style_of_folder()
+
+
+_SETTINGS = (
+    "jax_enable_x64",
+    "jax_compilation_cache_dir",
+    "jax_persistent_cache_min_compile_time_secs",
+    "jax_persistent_cache_min_entry_size_bytes",
+)
 
 
 @contextlib.contextmanager
 def connected(
     scheduler: str | None = None,
     workers: int | None = None,
+    x64: bool | None = None,
 ) -> Iterator[Client]:
     """A client of a scheduler at an address, or of a cluster on this machine that ends with it.
 
     Args:
         scheduler: address, as tcp://HOST:8786; a cluster of one's own unless given.
         workers: processes of that cluster; as many as dask thinks fit unless given.
+        x64: whether workers compute in float64; as this process unless given.
 
     Raises:
         InputError: nothing answers there, workers have other versions than this process, or a
             cluster of one's own cannot be protected.
     """
-    cache: Any = jax.config.jax_compilation_cache_dir  # pyright: ignore
+    # pyright knows none of JAX's settings by their names.
+    settings: dict[str, Any] = {name: getattr(jax.config, name) for name in _SETTINGS}
+    if x64 is not None:
+        settings["jax_enable_x64"] = x64
     with contextlib.ExitStack() as stack:
         stack.enter_context(_quiet())
         if scheduler is not None:
@@ -96,12 +109,12 @@ def connected(
                     f"--scheduler {scheduler}: no scheduler answers there ({e or type(e).__name__})"
                     ", expected the address that `dask scheduler` printed, as tcp://HOST:8786"
                 ) from e
-            cache = None  # a folder of this machine; theirs may have none of that name
+            # A folder of this machine; theirs may have none of that name.
+            del settings["jax_compilation_cache_dir"]
         else:
             client = stack.enter_context(Client(stack.enter_context(_local_cluster(workers))))
-        x64 = bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
         _check_versions(client, scheduler or "--workers")
-        client.register_plugin(Prepared(x64, import_path.searched(), cache))
+        client.register_plugin(Prepared(settings, import_path.searched()))
         yield client
 
 
@@ -226,13 +239,9 @@ def _check_versions(client: Client, where: str) -> None:
 def split_there(client: Client, job: Job, **options: Any) -> Split:
     """Divide a sweep as a worker would, with `options` of `split_for`: its devices may be others
     than this process's."""
-    options["shares"] = _threads(client)
-    with _answering():
-        # Not pure: dask would give the answer that it remembers of an equal job, which may be of
-        # other workers.
-        running = _gathered([client.submit(_split, job, options, pure=False)])
-        ((_, split),) = _as_they_end(client, running)
-        return Split(*split())
+    divide = functools.partial(split_for, shares=_threads(client), **options)
+    ((_, split),) = mapped(client, divide, [job])
+    return split
 
 
 def _threads(client: Client) -> int:
@@ -241,13 +250,9 @@ def _threads(client: Client) -> int:
     return max(1, sum(by_worker.values()))
 
 
-def _split(job: Job, options: dict[str, Any]) -> tuple[int, int]:
-    return tuple(split_for(job, **options))  # pyright: ignore[reportReturnType]
-
-
 def computed(
-    client: Client, job: Job, split: Split, todo: list[int]
-) -> Iterable[tuple[int, dict[str, np.ndarray]]]:
+    client: Client, job: Job, split: Split, todo: Sequence[int]
+) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     """The chunks as they are done, in any order.
 
     Yields:
@@ -256,17 +261,11 @@ def computed(
     Raises:
         InputError: the scheduler or too many workers are gone.
     """
-    # Keys of this run alone: a scheduler remembers results by key, and one that still holds the
-    # chunks of an earlier run would give those.
     token = uuid.uuid4().hex
     # A task and no scattered data: where its copies die with their workers, dask makes it again.
     shipped = client.submit(_received, job, key=f"job-{token}")
-
-    def submit(chunk: int) -> Any:
-        key = f"chunk-{chunk}-{token}"
-        return client.submit(_chunk, shipped, tuple(split), chunk, token, key=key, retries=_RETRIES)
-
-    return _each(client, submit, todo)
+    for k, results in mapped(client, _chunk, todo, shipped, split, token):
+        yield todo[k], results
 
 
 # Any: dask's futures and as_completed have no types.
@@ -318,39 +317,37 @@ def _works(worker: Mapping[str, Any]) -> bool:
     return worker.get("status") != "paused" or bool(counts.get("executing"))
 
 
-def mapped[T, R](
-    client: Client, function: Callable[[T], R], items: Sequence[T]
-) -> Iterator[tuple[int, R | None]]:
-    """A function of each item as they are done, in any order.
+def mapped(
+    client: Client,
+    function: Callable[..., Any],
+    items: Sequence[Any],
+    *shared: Any,
+    may_die: bool = False,
+) -> Iterator[tuple[int, Any]]:
+    """A function of each item, and of what they share, as they are done, in any order.
 
     Yields:
-        The place of an item, and what the function gave; None where workers died over it.
+        The place of an item, and what the function gave; None where workers died over it and
+        it `may_die`.
 
     Raises:
         InputError: the scheduler or its workers are gone.
     """
-    token = uuid.uuid4().hex  # as in `computed`
+    # Keys of this run alone: a scheduler remembers results by key, and one that still holds those
+    # of an earlier run would give them.
+    token = uuid.uuid4().hex
+    waiting, place = iter(range(len(items))), {}
 
-    def submit(k: int) -> Any:
-        return client.submit(function, items[k], key=f"item-{k}-{token}", pure=False)
-
-    return _each(client, submit, range(len(items)), may_die=True)
-
-
-def _each(
-    client: Client, submit: Callable[[int], Any], numbers: Iterable[int], *, may_die: bool = False
-) -> Iterator[tuple[int, Any]]:
-    """Submit tasks, a few ahead of those that end, and give the result of each by its number; None
-    of a task that workers died over, where such a one `may_die`."""
-    waiting, of = iter(numbers), {}
-
-    def submitted(number: int) -> Any:
-        future = submit(number)
-        of[future.key] = number
+    def submitted(k: int) -> Any:
+        future = client.submit(
+            function, items[k], *shared, key=f"item-{k}-{token}", retries=_RETRIES, pure=False
+        )
+        place[future.key] = k
         return future
 
+    # A few ahead of those that end.
     ahead = zip(range(_AHEAD * _threads(client)), waiting, strict=False)
-    running = _gathered([submitted(number) for _, number in ahead])
+    running = _gathered([submitted(k) for _, k in ahead])
     for future, result in _as_they_end(client, running):
         with _answering():
             try:
@@ -365,7 +362,7 @@ def _each(
         following = next(waiting, None)
         if following is not None:
             running.add(submitted(following))
-        yield of.pop(future.key), value
+        yield place.pop(future.key), value
 
 
 def _received(job: Job) -> Job:
@@ -373,11 +370,11 @@ def _received(job: Job) -> Job:
     return job
 
 
-def _chunk(job: Job, split: tuple[int, int], chunk: int, token: str) -> dict[str, np.ndarray]:
+def _chunk(chunk: int, job: Job, split: Split, token: str) -> dict[str, np.ndarray]:
     """Compute a chunk in a worker process; the first one compiles the program."""
     with _building:
         if token not in _workers:
             _workers.clear()  # of an earlier sweep: its programs would stay in memory
-            _workers[token] = Worker(job, Split(*split))
+            _workers[token] = Worker(job, split)
         worker = _workers[token]
     return worker.run(chunk)

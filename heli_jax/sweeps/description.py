@@ -47,7 +47,7 @@ def described(job: Job) -> dict[str, Any]:
         # neither.
         "vehicle": {n: v for n, v in job.params.items() if np.isfinite(v)},
         "flights": flights,
-        "design": job.design.describe(),
+        "design": job.design.description,
         "reduce": {n: _reducer(r) for n, r in job.reduce.items()},
         "solver": job.solver,
         "substeps": job.substeps,

@@ -10,8 +10,8 @@ import functools
 import hashlib
 import math
 import threading
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -129,123 +129,20 @@ def whole_seeds(values: np.ndarray) -> np.ndarray:
     return values.astype(np.int64)
 
 
-@runtime_checkable
-class Design(Protocol):
-    """Interface of a design for `sweep`."""
+@dataclasses.dataclass(frozen=True)
+class Design:
+    """Which values the axes of a sweep take."""
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The axes."""
-        ...
-
-    @property
-    def size(self) -> int:
-        """Number of elements."""
-        ...
-
-    def values(self, start: int, stop: int) -> Columns:
-        """The values of the elements from start to stop: an array (stop - start,) for each axis."""
-        ...
-
-    def describe(self) -> dict[str, Any]:
-        """All that fixes the values, as plain data: two designs with the same are the same."""
-        ...
-
-
-class _Paired(NamedTuple):
-    """Columns that are held whole, the k-th of each for element k."""
-
-    columns: Columns
-    kind: str
-    """list or table: the word that stores have for it"""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(self.columns)
-
-    @property
-    def size(self) -> int:
-        return next(iter(self.columns.values())).size
-
-    def values(self, start: int, stop: int) -> Columns:
-        return {n: v[start:stop] for n, v in self.columns.items()}
-
-    def describe(self) -> dict[str, Any]:
-        # A digest in place of the values: a table may be larger than all results.
-        words = {"design": self.kind, "axes": list(self.columns), "n": self.size}
-        return {**words, "sha256": digest(self.columns)}
-
-
-class _Grid(NamedTuple):
-    """Every combination of the axes' values."""
-
-    axes: Columns
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(self.axes)
-
-    @property
-    def size(self) -> int:
-        return math.prod(v.size for v in self.axes.values())
-
-    def values(self, start: int, stop: int) -> Columns:
-        # An element's number in mixed radix, a digit for each axis, the last one least: no product
-        # of the axes has to be held.
-        k = np.arange(start, stop)
-        columns = {}
-        for name, v in reversed(self.axes.items()):
-            columns[name] = v[k % v.size]
-            k = k // v.size
-        return {n: columns[n] for n in self.axes}
-
-    def describe(self) -> dict[str, Any]:
-        return {"design": "grid", "axes": {n: v.tolist() for n, v in self.axes.items()}}
-
-
-class _Sampled:
-    """Points of the unit cube, mapped to the axes."""
-
-    def __init__(self, axes: Mapping[str, Range], n: int, seed: int, kind: str) -> None:
-        # At once and not with the first points: a sweep may run for a while before it asks for
-        # these.
-        check_axes(axes)
-        for name, axis in axes.items():
-            if not isinstance(axis, Range):
-                raise ValueError(f"axes.{name}: expected lower and upper, for {kind}")
-            check_range(name, axis)
-        if n < 1:
-            raise ValueError(f"n must be at least 1, got {n}")
-        if kind == "sobol" and n > _MOST_SOBOL:
-            raise ValueError(f"n must be at most {_MOST_SOBOL} in a Sobol sequence, got {n}")
-        self.axes, self._n, self.seed, self.kind = dict(axes), n, seed, kind
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(self.axes)
-
-    @property
-    def size(self) -> int:
-        return self._n
-
-    @functools.cached_property
-    def _hypercube(self) -> np.ndarray:
-        import scipy.stats.qmc  # not before it is needed: slow
-
-        # Whole, since where a point lies depends on all others: a slice cannot be drawn alone.
-        rng = np.random.default_rng(self.seed)
-        return scipy.stats.qmc.LatinHypercube(len(self.axes), rng=rng).random(self._n)
-
-    def values(self, start: int, stop: int) -> Columns:
-        if self.kind == "lhs":
-            points = self._hypercube[start:stop]
-        else:
-            points = _sobol_points(len(self.axes), self.seed, start, stop)
-        return {n: axis.at(points[:, i]) for i, (n, axis) in enumerate(self.axes.items())}
-
-    def describe(self) -> dict[str, Any]:
-        axes = {n: [a.lower, a.upper, a.scale] for n, a in self.axes.items()}
-        return {"design": self.kind, "axes": axes, "n": self._n, "seed": self.seed}
+    names: tuple[str, ...]
+    """the axes"""
+    size: int
+    """number of elements"""
+    values: Callable[[int, int], Columns]
+    """of (start, stop): by axis the values (stop - start,) of these elements"""
+    description: dict[str, Any]
+    """all that fixes the values, as plain data: two designs with the same are the same"""
+    logarithmic: frozenset[str] = frozenset()
+    """the axes that are even in the logarithm"""
 
 
 @functools.lru_cache(maxsize=8)
@@ -271,53 +168,6 @@ def _sobol_points(axes: int, seed: int, start: int, stop: int) -> np.ndarray:
         return np.concatenate([*first, engine.random(stop - start - len(first))])
 
 
-@dataclasses.dataclass(frozen=True)
-class _Combined:
-    """Designs that together are one, each with axes of its own."""
-
-    parts: tuple[Design, ...]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(n for part in self.parts for n in part.names)
-
-
-class _Product(_Combined):
-    @property
-    def size(self) -> int:
-        return math.prod(part.size for part in self.parts)
-
-    def values(self, start: int, stop: int) -> Columns:
-        k = np.arange(start, stop)
-        columns: Columns = {}
-        for part in reversed(self.parts):
-            index = k % part.size
-            k = k // part.size
-            # Only the rows of the part that the slice touches: the part may be as large as a sweep.
-            # An empty slice has no least row; it still has its axes, with no values.
-            low, high = (int(index.min()), int(index.max()) + 1) if index.size else (0, 0)
-            rows = part.values(low, high)
-            columns = {**{n: v[index - low] for n, v in rows.items()}, **columns}
-        return columns
-
-    def describe(self) -> dict[str, Any]:
-        return {"design": "product", "of": [part.describe() for part in self.parts]}
-
-
-class _Zipped(_Combined):
-    @property
-    def size(self) -> int:
-        # `zipped` has checked that all parts are of one size.
-        return self.parts[0].size
-
-    def values(self, start: int, stop: int) -> Columns:
-        # No axis is in two parts, so none is lost here.
-        return {n: v for part in self.parts for n, v in part.values(start, stop).items()}
-
-    def describe(self) -> dict[str, Any]:
-        return {"design": "zip", "of": [part.describe() for part in self.parts]}
-
-
 def grid(axes: Mapping[str, Range | Sequence[float]]) -> Design:
     """Every combination of the axes' values, the last axis fastest.
 
@@ -325,7 +175,30 @@ def grid(axes: Mapping[str, Range | Sequence[float]]) -> Design:
         ValueError: no axis, one without points, or ends that do not fit.
     """
     check_axes(axes)
-    return _Grid({n: axis_values(n, a) for n, a in axes.items()})
+    points = {n: axis_values(n, a) for n, a in axes.items()}
+
+    def values(start: int, stop: int) -> Columns:
+        # An element's number in mixed radix, a digit for each axis, the last one least: no product
+        # of the axes has to be held.
+        k = np.arange(start, stop)
+        columns = {}
+        for name, v in reversed(points.items()):
+            columns[name] = v[k % v.size]
+            k = k // v.size
+        return {n: columns[n] for n in points}
+
+    size = math.prod(v.size for v in points.values())
+    description = {"design": "grid", "axes": {n: v.tolist() for n, v in points.items()}}
+    logarithmic = frozenset(n for n, v in points.items() if _geometric(v))
+    return Design(tuple(points), size, values, description, logarithmic)
+
+
+def _geometric(values: np.ndarray) -> bool:
+    """True if each value is the one before times the same factor."""
+    if values.size < 3 or not (np.all(values > 0) or np.all(values < 0)):
+        return False
+    steps = np.diff(np.log(np.abs(values)))
+    return bool(steps[0]) and bool(np.allclose(steps, steps[0], rtol=1e-6, atol=0.0))
 
 
 def paired(axes: Mapping[str, Range | Sequence[float]]) -> Design:
@@ -334,14 +207,7 @@ def paired(axes: Mapping[str, Range | Sequence[float]]) -> Design:
     Raises:
         ValueError: no axis, one without values, or axes of different length.
     """
-    check_axes(axes)
-    columns = {n: axis_values(n, a) for n, a in axes.items()}
-    lengths = {n: v.size for n, v in columns.items()}
-    if len(set(lengths.values())) > 1:
-        words = ", ".join(f"{n} has {k}" for n, k in lengths.items())
-        # Told with all lengths: which of the axes is the wrong one only the user knows.
-        raise ValueError(f"axes: {words} values, expected the same number in a list")
-    return _Paired(columns, "list")
+    return _columns(axes, "list")
 
 
 def table(columns: Mapping[str, np.ndarray]) -> Design:
@@ -350,12 +216,25 @@ def table(columns: Mapping[str, np.ndarray]) -> Design:
     Raises:
         ValueError: no column, no row, or columns of different length.
     """
-    check_axes(columns)
-    axes = {n: axis_values(n, v) for n, v in columns.items()}
-    if len({v.size for v in axes.values()}) > 1:
-        words = ", ".join(f"{n} has {v.size}" for n, v in axes.items())
-        raise ValueError(f"the table's columns differ in length: {words}, expected one length")
-    return _Paired(axes, "table")
+    return _columns(columns, "table")
+
+
+def _columns(axes: Mapping[str, Any], kind: str) -> Design:
+    """Columns that are held whole, the k-th of each for element k."""
+    check_axes(axes)
+    columns = {n: axis_values(n, a) for n, a in axes.items()}
+    if len({v.size for v in columns.values()}) > 1:
+        # Told with all lengths: which of the axes is the wrong one only the user knows.
+        words = ", ".join(f"{n} has {v.size}" for n, v in columns.items())
+        raise ValueError(f"axes: {words} values, expected the same number in a {kind}")
+    size = next(iter(columns.values())).size
+    # A digest in place of the values: a table may be larger than all results.
+    description = {"design": kind, "axes": list(columns), "n": size, "sha256": digest(columns)}
+
+    def values(start: int, stop: int) -> Columns:
+        return {n: v[start:stop] for n, v in columns.items()}
+
+    return Design(tuple(columns), size, values, description)
 
 
 def lhs(axes: Mapping[str, Range], n: int, seed: int = 0) -> Design:
@@ -368,7 +247,7 @@ def lhs(axes: Mapping[str, Range], n: int, seed: int = 0) -> Design:
     Raises:
         ValueError: no axis, ends that do not fit, or no points.
     """
-    return _Sampled(axes, n, seed, "lhs")
+    return _sampled(axes, n, seed, "lhs", functools.partial(_hypercube, len(axes), n, seed))
 
 
 def sobol(axes: Mapping[str, Range], n: int, seed: int = 0) -> Design:
@@ -382,38 +261,47 @@ def sobol(axes: Mapping[str, Range], n: int, seed: int = 0) -> Design:
     Raises:
         ValueError: no axis, ends that do not fit, or no points.
     """
-    return _Sampled(axes, n, seed, "sobol")
+    if n > _MOST_SOBOL:
+        raise ValueError(f"n must be at most {_MOST_SOBOL} in a Sobol sequence, got {n}")
+    return _sampled(axes, n, seed, "sobol", functools.partial(_sobol_points, len(axes), seed))
 
 
-def log_axes(design: Design) -> set[str]:
-    """The axes that a design fills evenly in the logarithm."""
-    # Designs nest to any depth, and each axis is in one of them.
-    if isinstance(design, _Combined):
-        return set().union(*map(log_axes, design.parts))
-    if isinstance(design, _Sampled):
-        return {n for n, axis in design.axes.items() if axis.scale == "log"}
-    if isinstance(design, _Grid):
-        return {n for n, values in design.axes.items() if _geometric(values)}
-    return set()
+def _sampled(
+    axes: Mapping[str, Range],
+    n: int,
+    seed: int,
+    kind: str,
+    points: Callable[[int, int], np.ndarray],
+) -> Design:
+    """Points (stop - start, axes) of the unit cube, mapped to the axes."""
+    check_axes(axes)
+    for name, axis in axes.items():
+        if not isinstance(axis, Range):
+            raise ValueError(f"axes.{name}: expected lower and upper, for {kind}")
+        check_range(name, axis)
+    if n < 1:
+        raise ValueError(f"n must be at least 1, got {n}")
+    ends = {name: [a.lower, a.upper, a.scale] for name, a in axes.items()}
+
+    def values(start: int, stop: int) -> Columns:
+        cube = points(start, stop)
+        return {name: axis.at(cube[:, i]) for i, (name, axis) in enumerate(axes.items())}
+
+    description = {"design": kind, "axes": ends, "n": n, "seed": seed}
+    logarithmic = frozenset(name for name, axis in axes.items() if axis.scale == "log")
+    return Design(tuple(axes), n, values, description, logarithmic)
 
 
-def _geometric(values: np.ndarray) -> bool:
-    """True if each value is the one before times the same factor."""
-    if values.size < 3 or not (np.all(values > 0) or np.all(values < 0)):
-        return False
-    steps = np.diff(np.log(np.abs(values)))
-    return bool(steps[0]) and bool(np.allclose(steps, steps[0], rtol=1e-6, atol=0.0))
+@functools.lru_cache(maxsize=8)
+def _whole_hypercube(axes: int, n: int, seed: int) -> np.ndarray:
+    import scipy.stats.qmc  # not before it is needed: slow
+
+    # Whole, since where a point lies depends on all others: a slice cannot be drawn alone.
+    return scipy.stats.qmc.LatinHypercube(axes, rng=np.random.default_rng(seed)).random(n)
 
 
-def _check_parts(parts: tuple[Design, ...]) -> None:
-    if not parts:
-        raise ValueError("of: no designs, expected at least one")
-    seen: set[str] = set()
-    for name in (n for part in parts for n in part.names):
-        # Which of two designs sets the axis would depend on their order.
-        if name in seen:
-            raise ValueError(f"the axis {name!r} is in two designs, expected one")
-        seen.add(name)
+def _hypercube(axes: int, n: int, seed: int, start: int, stop: int) -> np.ndarray:
+    return _whole_hypercube(axes, n, seed)[start:stop]
 
 
 def product(*parts: Design) -> Design:
@@ -422,8 +310,21 @@ def product(*parts: Design) -> Design:
     Raises:
         ValueError: no design, or an axis in two of them.
     """
-    _check_parts(parts)
-    return _Product(parts)
+
+    def values(start: int, stop: int) -> Columns:
+        k = np.arange(start, stop)
+        columns: Columns = {}
+        for part in reversed(parts):
+            index = k % part.size
+            k = k // part.size
+            # Only the rows of the part that the slice touches: the part may be as large as a sweep.
+            # An empty slice has no least row; it still has its axes, with no values.
+            low, high = (int(index.min()), int(index.max()) + 1) if index.size else (0, 0)
+            rows = part.values(low, high)
+            columns = {**{n: v[index - low] for n, v in rows.items()}, **columns}
+        return columns
+
+    return _combined(parts, math.prod(part.size for part in parts), values, "product")
 
 
 def zipped(*parts: Design) -> Design:
@@ -432,9 +333,27 @@ def zipped(*parts: Design) -> Design:
     Raises:
         ValueError: no design, an axis in two of them, or designs of different sizes.
     """
-    _check_parts(parts)
     sizes = [part.size for part in parts]
     if len(set(sizes)) > 1:
         words = " and ".join(str(s) for s in sizes)
         raise ValueError(f"the designs have {words} elements, expected the same number in a zip")
-    return _Zipped(parts)
+
+    def values(start: int, stop: int) -> Columns:
+        return {n: v for part in parts for n, v in part.values(start, stop).items()}
+
+    return _combined(parts, max(sizes, default=0), values, "zip")
+
+
+def _combined(
+    parts: tuple[Design, ...], size: int, values: Callable[[int, int], Columns], kind: str
+) -> Design:
+    """Designs that together are one, each with axes of its own."""
+    if not parts:
+        raise ValueError("of: no designs, expected at least one")
+    names = tuple(n for part in parts for n in part.names)
+    # Which of two designs sets the axis would depend on their order.
+    if twice := [n for n in names if names.count(n) > 1]:
+        raise ValueError(f"the axis {twice[0]!r} is in two designs, expected one")
+    description = {"design": kind, "of": [part.description for part in parts]}
+    logarithmic = frozenset().union(*(part.logarithmic for part in parts))
+    return Design(names, size, values, description, logarithmic)

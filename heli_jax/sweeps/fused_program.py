@@ -1,7 +1,6 @@
 """A chunk whose runs are one program of machine code, with XLA before and behind it."""
 
 import functools
-import importlib.util
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -53,8 +52,6 @@ def refusal(job: Job, devices: Sequence[Any], lanes: int) -> str | None:
         return "its runs are kept whole, or none is made"
     if job.solver not in _SOLVERS:
         return f"there is no translation of the solver {job.solver}"
-    if importlib.util.find_spec("llvmlite") is None:
-        return "llvmlite is not installed"
     try:
         # What it compiles is remembered, for the sweep that follows.
         for index in range(len(job.flights)):
@@ -82,15 +79,10 @@ class FusedProgram:
         filled = filled_up(values, size, self._step)
         trims = None if parts.trims is None else parts.trims(numbers, filled)
         mapped = jax.device_put((filled, trims), parts.split)
-        carry, own = parts.begin(numbers, mapped)
+        begun = parts.begin(numbers, mapped)
         first = jax.tree.map(lambda v: v[0], (filled, trims))
-        # With the elements as the last dimension, where it takes no copy.
-        carry, own = jax.tree.map(lambda v: np.moveaxis(np.asarray(v), 0, -1), (carry, own))
-        stays = parts.run.stays(own, parts.common(numbers, *first))
-        stored = jax.tree.leaves(_records(numbers))
-        stays, stored, carry = ([np.asarray(v) for v in p] for p in (stays, stored, carry))
-        results = parts.kernel(stays, stored, carry, self._threads)
-        reduced = jax.tree.unflatten(parts.run.results, results)
+        common = parts.common(numbers, *first)
+        reduced = parts.run.compute(parts.kernel, begun, common, _records(numbers), self._threads)
         return parts.conclude(numbers, (*mapped, jax.device_put(reduced, parts.split)))
 
 

@@ -12,7 +12,6 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.analysis.margins import margins
 from heli_jax.sweeps import reducers
-from heli_jax.sweeps.design import log_axes
 from heli_jax.sweeps.design_point import DIVERGED, MEANINGS, OUT_OF_RANGE, ElementResults
 from heli_jax.sweeps.program import Program, arguments, shapes
 from heli_jax.sweeps.spec import Job, axis_unit
@@ -164,7 +163,7 @@ def _axis_words(job: Job, name: str) -> dict[str, Any]:
             "seed": "seed of the disturbance",
         }[kind]
     words = _words(axis_unit(job.model, name), meaning)
-    return words | ({"scale": "log"} if name in log_axes(job.design) else {})
+    return words | ({"scale": "log"} if name in job.design.logarithmic else {})
 
 
 def _result_words(job: Job, name: str) -> dict[str, Any]:

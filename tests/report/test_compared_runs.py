@@ -59,7 +59,7 @@ def test_differences_are_in_the_joint_sd(tmp_path: Path) -> None:
     compared = compare_runs([a, b])
     rows = {row[0]: row[1:] for row in compared.estimates.rows}
     # 0.005 over hypot(0.003, 0.004)
-    assert rows["Ixx"] == ("0.0200 ± 0.0030", "0.0250 ± 0.0040", "+1.0", "kg m^2")
+    assert rows["Ixx"] == ("0.0200 ± 0.0030", "0.0250 ± 0.0040", "+1.0", "kg m²")
     assert rows["If"][1:3] == ("–", "–")
     assert rows["a"][0] == "not determined"
     assert rows["a"][2] == "–"
@@ -118,7 +118,7 @@ def test_what_flights_share_is_compared_too(tmp_path: Path) -> None:
         for name, nuisance in (("a", a), ("b", b))
     ]
     rows = {row[0]: row[1:] for row in compare_runs(runs).estimates.rows}
-    assert rows["sigma_w"] == ("2.00 ± 0.30", "0", "–", "rad/s^2")
+    assert rows["sigma_w"] == ("2.00 ± 0.30", "0", "–", "rad/s²")
     assert rows["time_shift"] == ("–", "0.050 ± 0.010", "–", "s")
     assert set(rows) == {"Ixx", "sigma_w", "time_shift"}
 

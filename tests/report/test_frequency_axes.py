@@ -19,8 +19,7 @@ def _pair() -> FittedPair:
     relative = np.where(lucky, 0.4, np.where(chance, 2.0, 0.05))
     coherence = np.where(lucky, 0.5, np.where(chance, 0.05, 0.95))
     zero = np.zeros((hz.size, 1))
-    slopes = np.zeros(hz.size)
-    model = Point(np.log(np.abs(H)), np.angle(H), slopes, slopes, zero, zero)
+    model = Point(np.log(np.abs(H)), np.angle(H), zero, zero)
     return FittedPair("lat", "p", OMEGA, H, relative * np.abs(H), coherence, model)
 
 

@@ -421,8 +421,9 @@ class CsvTable:
     def _parsed(self, name: str, texts: "pa.ChunkedArray") -> "_Column":
         """A column of texts."""
         import pyarrow as pa
-        import pyarrow.compute as pc
+        from pyarrow import compute
 
+        pc: Any = compute  # whose functions are made when it is imported
         cells: Any = pc.utf8_trim(texts, ' \t"')
         nothing = pc.is_in(cells, pa.array(["", *MISSING]))
         cells = pc.if_else(nothing, pa.scalar(None, pa.string()), cells)

@@ -205,11 +205,11 @@ def _indexed(name: str, count: int) -> list[str]:
 
 def _hdf5(path: Path, sets: DataSets, between: str = "/") -> None:
     """The numbers of a file by the path of groups that leads to them, `log/roll`."""
-    import h5py  # pyright: ignore[reportMissingImports]
+    import h5py as library  # pyright: ignore[reportMissingImports]
 
+    h5py: Any = library  # whose classes have no annotations
     seen: set[int] = set()
 
-    # Any: h5py's classes have no annotations.
     def visit(item: Any, name: str, depth: int) -> None:
         """A group with all that is in it, or a data set; each object once, whatever leads to it."""
         address = h5py.h5o.get_info(item.id).addr

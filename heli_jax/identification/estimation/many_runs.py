@@ -124,12 +124,9 @@ class FusedRuns:
             jax.tree.map(lambda v: v[:, 0], of) if own else of
             for own, of in zip(self._own, records, strict=True)
         )
-        carry, own = part.begin(self._shared, one, z)
+        begun = part.begin(self._shared, one, z)
         common = part.common(self._shared, one, z[0])
-        carry, own = ([np.moveaxis(np.asarray(v), 0, -1) for v in p] for p in (carry, own))
-        stays = part.run.stays(own, common)
-        stored = [np.asarray(v) for v in jax.tree.leaves(records)]
-        (triangle,) = part.kernel([np.asarray(v) for v in stays], stored, carry, cores())
+        triangle = part.run.compute(part.kernel, begun, common, records, cores())
         return full(np.asarray(triangle))
 
 

@@ -14,7 +14,6 @@ from heli_jax.report.charts import Chart, Series, panel
 from heli_jax.report.style import subtitle
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -131,7 +130,7 @@ def _pairs(
     grid = drawing.subplots(n, n, squeeze=False, sharex="col")
     shown = slice(None, None, max(1, -(-next(iter(samples.values())).size // _DOTS)))
     for i, below in enumerate(names):
-        _histogram(grid[i, i], samples[below], fit.estimates[below], color)
+        grid[i, i].hist(samples[below], bins="auto", color=color)
         for j, left in enumerate(names[:i]):
             ax = grid[i, j]
             x, y = samples[left], samples[below]
@@ -183,20 +182,6 @@ def _interval_lines(draw: Callable[..., object], e: Estimate) -> None:
             draw(end, color=style.BLUE, lw=0.8, ls=":")
 
 
-def _histogram(ax: "Axes", values: np.ndarray, e: Estimate, color: str) -> None:
-    ax.hist(values, bins=min(40, max(8, round(values.size**0.5))), density=True, color=color)
-    x = np.linspace(*ax.get_xlim(), 200)
-    sd = e.sd
-    if sd is None or not sd > 0:
-        return
-    # By the coordinate in which the interval is symmetric, as the ellipses are.
-    at, slope = coordinate(x, e), 1.0
-    if logarithmic(e):
-        sd, slope = sd / abs(e.value), 1.0 / np.abs(x)
-    density = np.exp(-0.5 * (at / sd) ** 2) / (sd * np.sqrt(2.0 * np.pi)) * slope
-    ax.plot(x, np.where(np.isfinite(density), density, 0.0), color=style.BLUE, lw=1.2)
-
-
 def logarithmic(e: Estimate) -> bool:
     """True if an estimate's interval reaches by equal factors and not by equal amounts."""
     if e.lower95 is None or e.upper95 is None or not min(e.lower95, e.upper95) * e.value > 0:
@@ -207,59 +192,26 @@ def logarithmic(e: Estimate) -> bool:
     return bool(by_factors < abs(e.upper95 + e.lower95 - 2.0 * e.value) / abs(e.value))
 
 
-def coordinate(values: np.ndarray, e: Estimate) -> np.ndarray:
-    """Values less the estimate, in the coordinate in which the interval is symmetric: log |value|
-    or the value itself."""
-    if not logarithmic(e):
-        return values - e.value
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.log(values / e.value)
-
-
-def _factor(fit: Fit, x: str, y: str) -> Float[np.ndarray, "2 2"] | None:
-    """Cholesky factor of the covariance of two estimates in those coordinates; None where there is
-    none."""
-    names = fit.verdict.names
-    if x not in names or y not in names:
-        return None
-    sds = []
-    for e in (fit.estimates[x], fit.estimates[y]):
-        if e.sd is None or not (np.isfinite(e.sd) and e.sd > 0):
-            return None
-        sds.append(e.sd / abs(e.value) if logarithmic(e) else e.sd)
-    r = float(fit.verdict.correlation[names.index(x), names.index(y)])
-    if not abs(r) < 1.0:
-        return None
-    return np.array([[sds[0], 0.0], [r * sds[1], np.sqrt(1.0 - r**2) * sds[1]]])
-
-
 def gaussian_ellipse(fit: Fit, x: str, y: str) -> Float[np.ndarray, "2 n"] | None:
     """The curve within which 95 % of the fit's Gaussian approximation lie, of two parameters.
 
     It is an ellipse in the coordinates in which their intervals are symmetric. None where the data
     do not determine both.
     """
-    factor = _factor(fit, x, y)
-    if factor is None:
+    names, pair = fit.verdict.names, (fit.estimates[x], fit.estimates[y])
+    if not {x, y} <= set(names) or not all(e.sd and np.isfinite(e.sd) for e in pair):
+        return None
+    r = float(fit.verdict.correlation[names.index(x), names.index(y)])
+    if not abs(r) < 1.0:
         return None
     angle = np.linspace(0.0, 2.0 * np.pi, 181)
-    away = _RADIUS * factor @ np.array([np.cos(angle), np.sin(angle)])
+    # The Cholesky factor of a correlation matrix, times a circle.
+    unit = np.cos(angle), r * np.cos(angle) + np.sqrt(1.0 - r**2) * np.sin(angle)
     curve = []
-    for d, e in zip(away, (fit.estimates[x], fit.estimates[y]), strict=True):
-        curve.append(e.value * np.exp(d) if logarithmic(e) else e.value + d)
+    for away, e in zip(unit, pair, strict=True):
+        reach = _RADIUS * float(e.sd or 0.0) * away
+        curve.append(e.value * np.exp(reach / abs(e.value)) if logarithmic(e) else e.value + reach)
     return np.array(curve)
-
-
-def share_within(fit: Fit, samples: Mapping[str, np.ndarray], x: str, y: str) -> float | None:
-    """The share of the samples within the ellipse of two parameters; 0.95 where the Gaussian
-    approximation holds."""
-    factor = _factor(fit, x, y)
-    if factor is None:
-        return None
-    away = np.array([coordinate(np.ravel(samples[n]), fit.estimates[n]) for n in (x, y)])
-    white = np.linalg.solve(factor, away)
-    # A sample of the other sign has no logarithm, and lies outside.
-    return float(np.mean(np.sum(white**2, axis=0) < _RADIUS**2))
 
 
 def _left_out(count: int) -> str:
