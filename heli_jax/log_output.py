@@ -137,8 +137,7 @@ def _clock_lines(clock: TimeInfo | None) -> Iterator[str]:
         unit = f" [{clock.unit}]"
         name = clock.column if clock.column.endswith(unit) else f"{clock.column}{unit}"
         if clock.counted is not None:
-            by = f" (by {clock.said})" if clock.said else ""
-            name = f"{'rows' if clock.column == ROWS else clock.column}{by}"
+            name = "rows" if clock.column == ROWS else clock.column
         yield (
             f"time: {name}, {terse(clock.duration, 6)} s at {terse(clock.rate, 6)} Hz, {uniform}"
         )

@@ -15,8 +15,8 @@ from heli_jax.flights.flight import Signal
 from heli_jax.flights.log import column, shown, wrong
 from heli_jax.flights.marks import (
     at_marks,
-    counted,
     mark_words,
+    marks_note,
     stray_words,
     strays,
     without_marks,
@@ -25,6 +25,7 @@ from heli_jax.flights.request import FEWEST, Key, Request
 from heli_jax.flights.resample import Timed
 from heli_jax.flights.signal_facts import SignalFacts, facts_of_all
 
+_MISSING = "taken as missing"
 _JUMP = (0.75, 1.001)
 """of a turn: by how much a wrapped angle jumps from a sample to the next, at least and at most"""
 _STEP = 0.125
@@ -63,12 +64,11 @@ def as_logged(request: Request, signals: Mapping[Key, Timed]) -> AsLogged:
             notes.append(note("samples.missing-as-stated", f"{name} {words}", key[0], value=count))
             numbers = signal.from_si(values)
         if (at := at_marks(numbers)).any():
-            words = mark_words(counted(numbers[at]), int(np.sum(~np.isnan(numbers))))
             if key[1] == "input":
-                problem = f"has {words}, first at {seconds[np.argmax(at)]:.6g} s"
+                problem = f"has {mark_words(numbers, at)}, first at {seconds[np.argmax(at)]:.6g} s"
                 remedy = "expected an input that is known all the time; give a window without them"
                 raise wrong(request.path, f"{problem}; {remedy}", column(signal.name))
-            notes.append(_marks_note(name, words, at, key[0]))
+            notes.append(marks_note(name, numbers, at, _MISSING, key[0]))
             values = np.where(at, np.nan, values)
         turn = units.turn(signal.si)
         if turn is not None and is_wrapped(values, turn):
@@ -84,11 +84,6 @@ def as_logged(request: Request, signals: Mapping[Key, Timed]) -> AsLogged:
     facts = facts_of_all({key: (t.seconds, t.values) for key, t in made.items()}, outputs)
     facts = {key: replace(f, strays=odd[key]) for key, f in facts.items()}
     return AsLogged(made, facts, tuple(notes))
-
-
-def _marks_note(name: str, words: str, at: np.ndarray, *subjects: str) -> Finding:
-    count = int(np.count_nonzero(at))
-    return note("samples.marks", f"{name} has {words}: taken as missing", *subjects, value=count)
 
 
 def _at_stated(signal: Signal, numbers: np.ndarray) -> np.ndarray:
@@ -126,8 +121,7 @@ def without_marks_and_turns(name: str, numbers: np.ndarray) -> tuple[np.ndarray,
     that are surely some, and what was done; `name` is the channel's, as it is shown."""
     notes = []
     if (at := at_marks(numbers)).any():
-        words = mark_words(counted(numbers[at]), int(np.sum(~np.isnan(numbers))))
-        notes.append(_marks_note(name, words, at))
+        notes.append(marks_note(name, numbers, at, _MISSING))
         numbers = np.where(at, np.nan, numbers)
     for turn in _TURNS:
         if is_wrapped(numbers, turn):

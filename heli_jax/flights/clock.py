@@ -30,20 +30,6 @@ from heli_jax.flights.log import (
 
 ROWS = "row number"
 """what the numbers of rows are called, from 0, as a column"""
-_PACKETS = {"frame", "frames", "seq", "sequence", "index", "idx", "packet", "row", "iteration"}
-"""counts of which only each second or tenth may be of the samples at hand, as where packets of
-several sensors are counted together"""
-_COUNTERS = {
-    *("sample", "samples", "count", "counter", "id", "no", "nr", "number", "n", "tick", "axis"),
-    *("line", *_PACKETS),
-}
-_OTHERS = {"freq", "freqs", "frequency", "frequencies", "hz", "distance", "dist", "address"}
-"""what may increase along a table all the same, as the frequencies of a response"""
-_STEPS, _RATES = {"ts", "dt", "tsample", "tsamp", "tsampling"}, {"fs", "hz"}
-_OF_SAMPLES = {"sample", "samples", "sampling", "time"}
-_STEP_WORDS, _RATE_WORDS = {"time", "step", "period", "interval"}, {"rate", "freq", "frequency"}
-_FASTEST, _SLOWEST = 1e5, 0.2
-"""Hz: no record of a flight is outside of these"""
 _BETWEEN = 10.0
 """s between two runs, which no gap that is bridged is long"""
 _SHORTEST = 20
@@ -201,110 +187,55 @@ def table_clock(
     time: str | Signal | None,
     unit: str | None,
     rate: float | None,
-) -> tuple[Signal | None, bool, str]:
-    """The clock, None without one, True if its unit or rate is a guess, and what the file says of
-    its rate.
+) -> tuple[Signal | None, bool]:
+    """The clock, None without one, and True if its unit is a guess.
 
     Args:
         time: the column of time stamps, where it is stated.
         rate: samples a second [Hz], of rows or of what `time` counts.
     """
-    said = ""
     if rate is not None:
         if not (rate > 0 and np.isfinite(rate)):
             raise wrong(table.path, f"expected a positive number of samples a second, got {rate:g}")
         name = time.name if isinstance(time, Signal) else time
-        name = counter_of(surveys) if name is None else _asked(table, surveys, name).name
-        return by_rate(rate, name), False, said
-    if time is None:
-        # A rate in the file goes before what merely increases, as a distance may.
-        stated = stated_rate(surveys)
-        signal, guessed = guess_clock(table, surveys, by_name=stated is not None)
-        if signal is None and stated is not None:
-            return by_rate(stated[0], counter_of(surveys)), True, stated[1]
-    else:
+        return by_rate(rate, name and _asked(table, surveys, name).name), False
+    signal, guessed = guess_clock(table, surveys)
+    if time is not None:
         signal, guessed = _asked(table, surveys, time), False
     # A stated unit goes with whatever column is the clock, the guessed one too.
     if signal is not None and unit is not None:
         signal, guessed = _asked(table, surveys, Signal(signal.name, unit, "s")), False
-    return signal, guessed, said
+    return signal, guessed
 
 
-def guess_clock(
-    table: Table, surveys: Sequence[Survey], by_name: bool = False
-) -> tuple[Signal | None, bool]:
-    """The clock, and True if its unit is a guess.
-
-    Args:
-        by_name: True if only a column that is called so is taken.
-    """
+def guess_clock(table: Table, surveys: Sequence[Survey]) -> tuple[Signal | None, bool]:
+    """The clock by the names of columns, and True if its unit is a guess."""
     values = {s.name: s.values for s in reversed(surveys) if s.values is not None}
     numeric = [s.name for s in surveys if s.values is not None]
-    increasing = [n for n in numeric if _increases(values[n])]
-    # A name decides before the numbers do: a counter or a distance may increase all along too.
     found = [n for n in numeric if is_called_time(n) or table.time_unit(n)]
     # Those whose last word is one of time: flight_time could be a parameter, but for its steps.
-    found += [n for n in increasing if TIME_NAMES & set(words_in(split_unit(n)[0])[-1:])]
-    if not by_name:
-        # Else the first column that increases all along is taken, but for numbers of rows. Of
-        # arrays beside one another two limits are no clock of the hundreds of samples.
-        increasing += [n for n in numeric if n not in increasing and restarts(values[n]).size]
-        longest = max((x.size for x in values.values()), default=0)
-        found += [
-            n
-            for n in increasing
-            if values[n].size == longest
-            and not (_counts(n, values[n]) or _OTHERS & set(words_in(n)))
-        ]
+    found += [
+        n
+        for n in numeric
+        if TIME_NAMES & set(words_in(split_unit(n)[0])[-1:])
+        and values[n].size > 1
+        and np.all(values[n][1:] > values[n][:-1])
+    ]
     if not found:
         return None, False
     name = found[0]
     unit = table.time_unit(name) or split_unit(name)[1]
     # `ms` and `minutes` alone are names too; seconds are what clocks of any unit are called.
-    alone = "" if name.casefold() in LETTERS else time_unit(name) or ""
+    alone = time_unit(name) or ""
     unit = unit or ("" if alone == "s" else alone)
     return Signal(name, unit or likely_unit(values[name]), "s"), not unit
 
 
 def is_called_time(name: str) -> bool:
-    """True for a column's name that is one of a clock."""
-    stem, _ = split_unit(name)
+    """True for a column's name that is one of a clock, or a unit of time."""
     # Of a path, log.roll.time, the last part is the name; %time and __time are names of tools.
-    return re.split(r"[./]", stem)[-1].strip("%_ ").casefold() in TIME_NAMES
-
-
-def _increases(values: np.ndarray) -> bool:
-    return values.size > 1 and bool(np.all(values[1:] > values[:-1]))
-
-
-def _counts(name: str, values: np.ndarray) -> bool:
-    """True for whole numbers that count rows or frames, one by one, by name too: a log at a sample
-    a second has such times. Numbers of packets do so whatever their steps."""
-    if not _is_counter_name(name) or not np.all(values == np.rint(values)):
-        return False
-    return bool(_PACKETS & set(words_in(name))) or bool(np.all(np.diff(values) == 1.0))
-
-
-def _is_counter_name(name: str) -> bool:
-    """True for the name of a counter, or none: of a matrix, or of a text without names."""
-    is_numbered = not name or name.endswith("]") or re.fullmatch(r"column\d+", name) is not None
-    return is_numbered or bool(_COUNTERS & set(words_in(name)))
-
-
-def counter_of(surveys: Sequence[Survey]) -> str | None:
-    """The column that counts rows or frames, some of which may be lost; None without one."""
-    return next(
-        (
-            s.name
-            for s in surveys
-            if s.values is not None
-            and _is_counter_name(s.name)
-            and _increases(s.values)
-            and np.all(s.values == np.rint(s.values))
-            and float(np.median(np.diff(s.values))) == 1.0
-        ),
-        None,
-    )
+    leaf = re.split(r"[./]", split_unit(name)[0])[-1].strip("%_ ").casefold()
+    return leaf in TIME_NAMES or (len(leaf) > 1 and time_unit(leaf) is not None)
 
 
 def _asked(table: Table, surveys: Sequence[Survey], time: str | Signal) -> Signal:
@@ -369,25 +300,19 @@ def require_increasing(table: Table, name: str, stamps: np.ndarray) -> None:
     raise wrong(table.path, f"{problem}; {remedy}", table.place(row), column(name))
 
 
-def require_likely(
-    path: str, name: str, unit: str, stamps: np.ndarray, assumed: bool = False
-) -> tuple[Finding, ...]:
-    """Refuse stamps in seconds that are a flight's in another unit alone, where their name says
-    that one or nobody stated seconds; a caution where somebody did.
-    """
-    named, likely = split_unit(name)[1], likely_unit(stamps)
-    if unit != "s" or likely == "s":
-        return ()
+def require_likely(path: str, time: Signal, stamps: np.ndarray) -> None:
+    """Refuse stamps (N,) in seconds that are a flight's in another unit alone, where their name
+    says that one or nobody stated seconds."""
+    named, likely = split_unit(time.name)[1], likely_unit(stamps)
+    if time.unit != "s" or likely == "s" or not (named == likely or time.assumed):
+        return
     step, length = float(np.median(np.diff(stamps))), float(stamps[-1] - stamps[0])
     problem = f"in s its stamps are {step:.4g} s apart over {length:.4g} s: they look like {likely}"
-    if named != likely and not assumed:
-        words = f"time: {shown(name)}: {problem}."
-        return (Finding("units.unlikely", "doubt", words, step, "seconds between stamps", (name,)),)
     why = f", as its name says {named}" if named == likely else ""
-    remedy = f"expected its unit: {{signal: {name}, unit: {likely}}}"
+    remedy = f"expected its unit: {{signal: {time.name}, unit: {likely}}}"
     if named != likely:
         remedy += ", or unit: s where it is so slow"
-    raise wrong(path, f"{problem}{why}; {remedy}", column(name))
+    raise wrong(path, f"{problem}{why}; {remedy}", column(time.name))
 
 
 # Rates in place of times.
@@ -404,44 +329,6 @@ def columns_of(table: Table, names: Sequence[str]) -> dict[str, np.ndarray]:
     columns = table.numbers(list(dict.fromkeys(own)))
     columns[ROWS] = np.arange(columns[own[0]].size, dtype=np.float64)
     return {name: columns[name] for name in names}
-
-
-def stated_rate(surveys: Sequence[Survey]) -> tuple[float, str] | None:
-    """The rate [Hz] that a file states in a single number beside its samples (`Ts`, `dt`, `fs`),
-    and what says so; None where there is none, or are several."""
-    rates: dict[float, str] = {}
-    for each in surveys:
-        if each.values is not None:
-            for rate, words in _rate_of(each.name, each.values).items():
-                rates.setdefault(rate, words)
-    if len(rates) != 1:
-        return None
-    rate, words = next(iter(rates.items()))
-    # 1/0.02 is 50 in numbers of the vehicle, 1/0.033 is what it is.
-    near = round(rate, 6)
-    return (near if math.isclose(rate, near, rel_tol=1e-9) else rate), words
-
-
-def _rate_of(name: str, values: np.ndarray) -> dict[float, str]:
-    """The rate [Hz] that a column (N,) of a single number states, one that stands in the first row
-    alone or in each, and what says so; empty of others."""
-    step, values = _is_step(name), values[np.isfinite(values)]
-    if step is None or not values.size or np.ptp(values) > 0 or values[0] <= 0:
-        return {}
-    rate = 1.0 / float(values[0]) if step else float(values[0])
-    return {rate: f"{shown(name)} = {values[0]:g}"} if _SLOWEST <= rate <= _FASTEST else {}
-
-
-def _is_step(name: str) -> bool | None:
-    """True for the name of a time step, False of a rate, None of anything else."""
-    words = words_in(name.rpartition(".")[2].rpartition("/")[2])
-    joined, first, last = "".join(words), words[:1], words[-1:]
-    if len(words) == 2:
-        if first[0] in (*_OF_SAMPLES, "delta") and last[0] in _STEP_WORDS:
-            return True
-        if first[0] in _OF_SAMPLES and last[0] in _RATE_WORDS:
-            return False
-    return True if joined in _STEPS else False if joined in _RATES else None
 
 
 # Several runs in one table.

@@ -19,7 +19,7 @@ from heli_jax.flights.derived import (
 from heli_jax.flights.formats.arrays import ArrayTable, by_clocks
 from heli_jax.flights.holds import decide
 from heli_jax.flights.log import ChannelLog, listed, require_few_columns, shown, wrong
-from heli_jax.flights.marks import at_marks, counted, mark_words
+from heli_jax.flights.marks import at_marks, marks_note
 from heli_jax.flights.onto_grid import TopicClock, common_times, topic_clock, window_note
 from heli_jax.flights.open_log import open_log
 from heli_jax.flights.preset import NamedBy
@@ -247,10 +247,8 @@ def _as_logged(
     for name in names:
         values = _finite(log.channel(name).values[clock.rows])
         if (at := at_marks(values)).any():
-            words = mark_words(counted(values[at]), int(np.sum(~np.isnan(values))))
             done = "taken as missing" if converted else "kept; with --rate they are missing"
-            words = f"{shown(name)} has {words}: {done}"
-            notes.append(note("samples.marks", words, name, value=int(np.count_nonzero(at))))
+            notes.append(marks_note(shown(name), values, at, done, name))
         columns[name] = np.where(at, np.nan, values) if converted else values
     return columns
 

@@ -92,7 +92,7 @@ class TimeInfo:
     the stamps are no uniform grid what 95 % of the steps keep to, gaps apart; `problem` says why
     they are no clock at all, otherwise empty; `guessed` says that nothing states the unit.
     `counted` [Hz] is how many samples a second has, where `column` counts them, or no column is a
-    clock and the rows do (`heli_jax.flights.clock.ROWS`); `said` where the file says so.
+    clock and the rows do (`heli_jax.flights.clock.ROWS`).
     Where the time begins anew the table holds several `runs`, put one after another.
     """
 
@@ -106,7 +106,6 @@ class TimeInfo:
     problem: str = ""
     guessed: bool = False
     counted: float | None = None
-    said: str = ""
     runs: int = 1
 
     @property
@@ -173,7 +172,7 @@ def describe_flights(
         path: the log, in a format that `read_flight` reads.
         time: the column of time stamps, in seconds where only its name is given; by default a
             column with a usual name (its unit from an ending such as `_ms`, or guessed from the
-            steps), or the first that increases from row to row.
+            steps).
         number: of the one flight to describe, from 1.
         rate: samples a second [Hz] of a table without times: of its rows, or of a column that
             counts them.
@@ -237,7 +236,7 @@ def describe_table(
             clock, or a column that counts them, unless `time` names one.
     """
     surveys = table.survey()
-    signal, guessed, said = table_clock(table, surveys, time, unit, rate)
+    signal, guessed = table_clock(table, surveys, time, unit, rate)
     clock = None
     if signal is not None:
         rows = np.arange(_n_rows(surveys), dtype=np.float64)
@@ -246,7 +245,7 @@ def describe_table(
         if runs > 1:
             scale = clock_scale(table, signal)
             stamps = with_runs(table, signal.name, {signal.name: stamps}, scale)[0][signal.name]
-        clock = replace(_describe_time(table, signal, stamps, guessed), said=said, runs=runs)
+        clock = replace(_describe_time(table, signal, stamps, guessed), runs=runs)
     # A stamp is never taken as missing: a wrong one is refused with its row.
     measured = [s for s in surveys if signal is None or s.name != signal.name]
     marks = mark_notes((s.name, s.values) for s in measured if s.values is not None)

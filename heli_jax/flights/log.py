@@ -229,7 +229,6 @@ class ChannelLog:
         parameters: the firmware's settings, by name.
         notes: what was lost or assumed when it was read.
         flight: which flight of the file it is, from 1, and of how many.
-        cautions: what speaks against its times, which every fit repeats.
         start: when the logger began [s], where the log says so.
         origin: from which times count [s], in the log's own count.
     """
@@ -244,7 +243,6 @@ class ChannelLog:
     notes: tuple[Finding, ...] = ()
     flight: tuple[int, int] = (1, 1)
     start: float | None = None
-    cautions: tuple[Finding, ...] = ()
     origin: float = 0.0
 
     @classmethod

@@ -34,10 +34,6 @@ _APART = 1.0
 """times the range of all other values, by which a mark lies outside of it"""
 _LEVELS = 4
 """distinct values that a signal has beside its marks, at least"""
-_MOST_NOTES = 6
-
-Counts = tuple[tuple[float, int], ...]
-"""values, as the log has them, and how many of each there are"""
 
 
 def at_marks(numbers: np.ndarray) -> np.ndarray:
@@ -101,46 +97,38 @@ def mark_notes(channels: Iterable[tuple[str, np.ndarray]]) -> list[Finding]:
     """Notes on the marks that channels have, each of a name and numbers (N,) of any kind."""
     notes = []
     for name, numbers in channels:
-        x = np.asarray(numbers)
-        # A damaged log may hold NaNs that signal when they are converted.
-        with np.errstate(invalid="ignore"):
-            x = x.astype(np.float64) if x.dtype.kind in "biuf" else x
-        # Of what was never logged nothing else is there, and a switch may have any value.
-        if x.dtype.kind == "f" and (at := at_marks(x)).any():
-            # What counts first: a terminal shows the beginning.
-            stand = "stands" if np.count_nonzero(at) == 1 else "stand"
-            words = f"{listed(counted(x[at]))} {stand} for no value in {shown(name)}"
-            words += ": a fit takes them as missing"
-            notes.append(note("samples.marks", words, name, value=int(np.count_nonzero(at))))
-    more = len(notes) - _MOST_NOTES
-    if more <= 0:
-        return notes
-    return [*notes[:_MOST_NOTES], note("samples.marks", f"{more} more channels have such samples")]
+        # Of what was never logged nothing else is there, and a switch may have any value. A damaged
+        # log may hold NaNs that signal when they are converted.
+        if (x := np.asarray(numbers)).dtype.kind in "biuf":
+            with np.errstate(invalid="ignore"):
+                x = x.astype(np.float64)
+            if (at := at_marks(x)).any():
+                done = "a fit takes them as missing"
+                notes.append(marks_note(shown(name), x, at, done, name))
+    return notes
 
 
-def counted(values: np.ndarray) -> Counts:
-    """Each of the values (K,) of a log once, and how often it is there."""
-    numbers, counts = np.unique(values, return_counts=True)
-    return tuple((float(f"{v:.7g}"), int(n)) for v, n in zip(numbers, counts, strict=True))
+def marks_note(
+    name: str, numbers: np.ndarray, at: np.ndarray, done: str, *subjects: str
+) -> Finding:
+    """A note on the marks of a channel, a mask of its numbers (N,), and on what is done of them."""
+    words = f"{name} has {mark_words(numbers, at)}: {done}"
+    return note("samples.marks", words, *subjects, value=int(np.count_nonzero(at)))
 
 
-def mark_words(marks: Counts, size: int | None = None) -> str:
-    """`10 samples of -9999 and 1 of 1e+10, far outside of all others`.
-
-    Args:
-        marks: at least one.
-        size: of all samples, theirs among them; a large share is said.
-    """
-    share = sum(n for _, n in marks) / max(size, 1) if size is not None else 0.0
+def mark_words(numbers: np.ndarray, at: np.ndarray) -> str:
+    """`10 samples of -9999 and 1 of 1e+10, far outside of all others`; a large share is said."""
+    share = np.count_nonzero(at) / np.count_nonzero(~np.isnan(numbers))
     often = f" ({100 * share:.0f} % of all)" if share > _MOST else ""
-    return f"{listed(marks)}{often}, far outside of all others"
+    return f"{value_words(numbers[at])}{often}, far outside of all others"
 
 
-def listed(counts: Counts) -> str:
-    """`10 samples of -9999 and 1 of 1e+10`; of at least one value."""
-    words = [f"{n} of {v:.7g}" for v, n in counts[:3]]
-    words[0] = words[0].replace(" of", " sample of" if counts[0][1] == 1 else " samples of", 1)
-    more = f" and {len(counts) - 3} more such values" if len(counts) > 3 else ""
+def value_words(values: np.ndarray) -> str:
+    """`10 samples of -9999 and 1 of 1e+10`; of at least one value (K,)."""
+    numbers, counts = np.unique(values, return_counts=True)
+    words = [f"{n} of {v:.7g}" for v, n in zip(numbers[:3], counts[:3], strict=True)]
+    words[0] = words[0].replace(" of", " sample of" if counts[0] == 1 else " samples of", 1)
+    more = f" and {numbers.size - 3} more such values" if numbers.size > 3 else ""
     return " and ".join(words) + more
 
 
@@ -189,9 +177,8 @@ def strays(seconds: np.ndarray, numbers: np.ndarray, kind: str) -> tuple[Strays,
 
 def stray_words(strays: Strays) -> str:
     """`3 samples of -99, the first at 12.3 s, which ...`."""
-    counts = counted(strays.values)
-    words = listed(counts)
-    if len(counts) > 3:
+    words = value_words(strays.values)
+    if np.unique(strays.values).size > 3:
         low, high = strays.values.min(), strays.values.max()
         words = f"{strays.values.size} samples from {low:.4g} to {high:.4g}"
     at = "at" if strays.times.size == 1 else "the first at"

@@ -44,7 +44,6 @@ from heli_jax.flights.resample import (
     own_clock,
     rate_notes,
     resampled,
-    slower_words,
     usual_step,
 )
 
@@ -460,10 +459,14 @@ def at_times(
                 # A low-pass filter would turn a stick that jumps into one that rings.
                 samples[key, kind] = held_mean(*signal, times)
         elif is_slower(signal, rate):
-            placed = at_nearest(signal, times)
-            samples[key, kind] = placed.samples
-            words = slower_words(shown(request.signals[key, kind].name), placed, signal, rate)
-            count = int(np.count_nonzero(np.isfinite(placed.samples)))
+            samples[key, kind] = at_nearest(signal, times)
+            count = int(np.count_nonzero(np.isfinite(samples[key, kind])))
+            words = (
+                f"{shown(request.signals[key, kind].name)} at about "
+                f"{1 / usual_step(own_clock(signal).seconds):.4g} Hz is slower than the grid of "
+                f"{rate:.6g} Hz: {count} samples at the instants nearest to their own; between "
+                "them it is missing"
+            )
             notes.append(note("resampling.slower", words, key, value=count))
         else:
             own = own_clock(signal)

@@ -264,15 +264,7 @@ def _flight(logs: _Opened, request: Request) -> Flight:
         flight = flight_of_signals(
             _clocked(logs, request),
             request,
-            Source(
-                log.path,
-                log.sha256,
-                notes,
-                log.firmware,
-                log.parameters,
-                cautions=log.cautions,
-                first_time=log.begin,
-            ),
+            Source(log.path, log.sha256, notes, log.firmware, log.parameters, first_time=log.begin),
         )
     except InputError as e:
         # A wrong unit of the clock makes errors of other kinds.

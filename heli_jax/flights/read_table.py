@@ -25,7 +25,7 @@ from heli_jax.flights.clock import (
     with_runs,
 )
 from heli_jax.flights.derived import sources, with_derived
-from heli_jax.flights.describe import TimeInfo, describe_table
+from heli_jax.flights.describe import describe_table
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.formats.arrays import SEGMENT, ArrayTable
 from heli_jax.flights.grid import LATEST, without_overflow
@@ -71,22 +71,18 @@ def load_table(table: Table, request: Request) -> ChannelLog:
     said: tuple[Finding, ...] = ()
     if request.options.split:
         numbers, said = with_runs(table, time.name, numbers, clock_scale(table, time), runs)
+    log = with_derived(_with_clock(table, numbers, time), request.options.swashplate)
     stamps = numbers[time.name]
     # Stamps that are no clock are refused with their line.
-    is_clock = stamps.size and np.isfinite(stamps).all() and np.all(np.diff(stamps) >= 0)
-    log = None
-    if is_clock:
-        log = with_derived(_with_clock(table, numbers, time), request.options.swashplate)
+    if stamps.size and np.isfinite(stamps).all() and np.all(np.diff(stamps) >= 0):
         columns = {s.name: log.channel(s.name).values for s in request.signals.values()}
         inputs = {s.name for (_, kind), s in request.signals.items() if kind == "input"}
         if is_joined(stamps * clock_scale(table, time), columns, inputs):
             return without_joins(replace(log, notes=(*log.notes, *said)), joined=True)
-    units_said, cautions = _checked(table, time, stamps)
-    # A counter that began anew is a clock once it goes on.
-    log = log or with_derived(_with_clock(table, numbers, time), request.options.swashplate)
-    return replace(log, notes=(*log.notes, *said, *units_said), cautions=cautions)
+    return replace(log, notes=(*log.notes, *said, *_checked(table, time, stamps)))
 
 
+@np.errstate(over="ignore", invalid="ignore")  # stamps that are no clock are refused later
 def _with_clock(
     table: Table, numbers: Mapping[str, np.ndarray], time: Signal, name: str = ""
 ) -> ChannelLog:
@@ -102,10 +98,8 @@ def _with_clock(
     return ChannelLog.of_table(table, (topic,), notes=table.notes, origin=first * scale)
 
 
-def _checked(
-    table: Table, time: Signal, stamps: np.ndarray
-) -> tuple[tuple[Finding, ...], tuple[Finding, ...]]:
-    """Refuse stamps (N,) that are no clock; return notes on their unit, and cautions."""
+def _checked(table: Table, time: Signal, stamps: np.ndarray) -> tuple[Finding, ...]:
+    """Refuse stamps (N,) that are no clock; return notes on their unit."""
     stated = None if time.name == ROWS else table.time_unit(time.name)
     scale = clock_scale(table, time)
     # A type is unmistakable; only words may be meant for something else.
@@ -119,20 +113,12 @@ def _checked(
         raise wrong(table.path, problem, table.place(row), column(time.name))
     stamps = without_overflow(stamps)
     require_increasing(table, time.name, stamps)
-    cautions: tuple[Finding, ...] = ()
     if not stated and time.scale == 1.0:
-        cautions = require_likely(table.path, time.name, time.unit, stamps, time.assumed)
-    return said, cautions
+        require_likely(table.path, time, stamps)
+    return said
 
 
 # Without a request: the clock is guessed, and all columns are taken.
-
-
-def rate_note(clock: TimeInfo) -> Finding:
-    """Return a note on a clock whose rate the file states."""
-    what = "rows" if clock.column == ROWS else shown(clock.column)
-    words = f"{what} are taken as samples at {clock.counted:g} Hz, as the file says: {clock.said}"
-    return note("clock.rate-of-file", words, value=clock.counted)
 
 
 def guessed_log(table: Table, time: str | None, unit: str | None, rate: float | None) -> ChannelLog:
@@ -154,9 +140,7 @@ def guessed_log(table: Table, time: str | None, unit: str | None, rate: float | 
         if not clock and texts:
             why += f" ({shown(texts[0].name)} is text{texts[0].strays and ': ' + texts[0].strays})"
         raise wrong(table.path, f"{why}, {remedy}")
-    if clock.said:
-        notes.append(rate_note(clock))
-    elif clock.guessed:
+    if clock.guessed:
         words = f"column {shown(clock.column)} is taken for a clock in {clock.unit}"
         notes.append(note("clock.guessed", words, clock.column))
     rows = next((c.count for c in info.columns if c.name == clock.column), info.n_rows)

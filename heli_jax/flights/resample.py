@@ -167,17 +167,6 @@ class Timed(NamedTuple):
     values: np.ndarray
 
 
-class Placed(NamedTuple):
-    """A slow signal on a fast grid."""
-
-    samples: np.ndarray
-    """(M,), NaN where there is none"""
-    moved: float
-    """[s] by how much a sample was moved at most"""
-    left_out: int
-    """samples to whose instant another was nearer"""
-
-
 def usual_step(seconds: np.ndarray) -> float:
     """Return the usual step of stamps (N,) [s]; infinite for fewer than two."""
     return float(np.median(np.diff(seconds))) if seconds.size > 1 else float("inf")
@@ -199,8 +188,8 @@ def is_slower(signal: Timed, rate: float) -> bool:
     return usual_step(own_clock(signal).seconds) * rate > SLOWER * (1 + 1e-6)
 
 
-def at_nearest(signal: Timed, times: np.ndarray) -> Placed:
-    """Each sample at the instant nearest to its own, and nothing between.
+def at_nearest(signal: Timed, times: np.ndarray) -> np.ndarray:
+    """Each sample at the one of the times (M,) nearest to its own; NaN between.
 
     It is moved there, by half a grid step at most, along the slope between its neighbours (second
     order, also where steps are uneven). So its value is right to that order, and its noise stays
@@ -213,7 +202,7 @@ def at_nearest(signal: Timed, times: np.ndarray) -> Placed:
     nearest = np.rint((seconds - times[0]) / step).astype(np.int64)
     inside = (nearest >= 0) & (nearest < times.size)
     if not inside.any():
-        return Placed(samples, 0.0, 0)
+        return samples
     few = seconds.size < 3
     away = times[np.clip(nearest, 0, times.size - 1)] - seconds
     with np.errstate(over="ignore", invalid="ignore"):
@@ -224,10 +213,7 @@ def at_nearest(signal: Timed, times: np.ndarray) -> Placed:
     order = np.argsort(-np.abs(away), kind="stable")
     order = order[inside[order]]
     samples[nearest[order]] = moved[order]
-    # Of stamps that are multiples of the grid's step the rest is rounding.
-    largest = float(np.abs(away[inside]).max())
-    left_out = int(inside.sum()) - int(np.count_nonzero(~np.isnan(samples)))
-    return Placed(samples, largest if largest > 1e-6 * step else 0.0, left_out)
+    return samples
 
 
 def at_own_rate(signal: Timed, times: np.ndarray) -> np.ndarray:
@@ -262,20 +248,6 @@ def at_own_rate(signal: Timed, times: np.ndarray) -> np.ndarray:
     with np.errstate(over="ignore", invalid="ignore"):
         moved = signal.values[nearest] + whole[nearest] * away
     return np.where(np.isfinite(moved) & (np.abs(away) <= _NEAR * step), moved, lines)
-
-
-def slower_words(name: str, placed: Placed, signal: Timed, rate: float) -> str:
-    """Describe the treatment of a slow output, in one sentence."""
-    there = int(np.count_nonzero(~np.isnan(placed.samples)))
-    words = (
-        f"{name} at about {1 / usual_step(own_clock(signal).seconds):.4g} Hz is slower than the "
-        f"grid of {rate:.6g} Hz: {there} samples at the instants nearest to their own"
-    )
-    if placed.moved:
-        words += f", moved there by up to {1e3 * placed.moved:.2g} ms along the slope"
-    if placed.left_out:
-        words += f", {placed.left_out} left out that fell on the instant of another"
-    return f"{words}; between them it is missing"
 
 
 # Fewer samples a second, without folding what the new rate cannot hold onto what it can.

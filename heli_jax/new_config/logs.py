@@ -23,7 +23,6 @@ from heli_jax.flights.formats.arrays import ArrayTable, by_clocks
 from heli_jax.flights.log import ChannelLog, Table, as_floats, shown, wrong
 from heli_jax.flights.marks import without_marks
 from heli_jax.flights.open_log import chosen_flights, open_flights
-from heli_jax.flights.read_table import rate_note
 from heli_jax.new_config.guess import Series
 
 _ASSUMED = 100.0
@@ -115,8 +114,6 @@ def _read_table(table: Table, rate: float | None) -> Log:
             require_increasing(table, time.column, table.numbers([time.column])[time.column])
         problem = "expected a column of increasing times, got none"
         raise wrong(table.path, f"{problem}: {time.problem}")
-    if time.said:
-        notes = (rate_note(time),)
     clock = time.column
     names = [c.name for c in info.columns if c.kind == "number"]
     # Of two columns of one name neither can be asked for.

@@ -278,8 +278,7 @@ def _time(time: TimeInfo) -> str:
         return (
             f"      time: {{{counter}rate: {EDIT}}}   # Hz, samples a second: no column is a time"
         )
-    said = f"   # GUESS: the file says {_comment(time.said)}" if time.said else ""
-    return f"      time: {{{counter}rate: {time.counted:.10g}}}{said}"
+    return f"      time: {{{counter}rate: {time.counted:.10g}}}"
 
 
 def _preset(preset: str, outputs: Sequence[str], filtered: Mapping[str, Filtered]) -> list[str]:

@@ -41,8 +41,6 @@ FIELDS: dict[str, tuple[str, float | None]] = {
 }  # fmt: skip
 _APART = 1.0
 """s before and after the board's time that a message may have some"""
-_FEWEST_ROWS = 10
-"""of a message, from which on a time that is out of order stands out"""
 # New firmware counts microseconds, old firmware milliseconds.
 # In old firmware's message GPS TimeMS is the time of the week, and T the board's.
 _CLOCKS = {"TimeUS": 1e-6, "TimeMS": 1e-3, "T": 1e-3}
@@ -252,10 +250,7 @@ def make_log(
     topics = []
     for messages in topics_of:
         clock = _clock(messages, board)
-        for of_instance in _by_instance(messages):
-            kept = _in_order(clock, of_instance)
-            damaged += of_instance.at.size - kept.at.size
-            topics.append(_topic(kept, clock))
+        topics += [_topic(each, clock) for each in _by_instance(messages)]
     require_samples(path, topics)
     notes = []
     if damaged:
@@ -342,25 +337,6 @@ def _by_instance(messages: _Messages) -> list[_Messages]:
         return [messages]
     name = messages.name
     return [messages.rows(numbers == i)._replace(name=f"{name}[{i}]") for i in counts]
-
-
-def _in_order(clock: str, messages: _Messages) -> _Messages:
-    """The messages without single ones whose time lies outside of those around them, as where a
-    log was cut off in a message: where the others are in order, and these are few."""
-    if not clock or messages.at.size < _FEWEST_ROWS:
-        return messages
-    times = messages.columns[clock].astype(np.float64)
-    back = np.flatnonzero(np.diff(times) < 0) + 1
-    if not 0 < back.size <= max(1, times.size // 1000):
-        return messages
-    # A row before which the times go back is the wrong one, or the one before it is: whichever
-    # leaves the others in order.
-    wrong_rows = [
-        row if row + 1 == times.size or times[row + 1] >= times[row - 1] else row - 1
-        for row in back
-    ]
-    kept = np.delete(np.arange(times.size), wrong_rows)
-    return messages.rows(kept) if np.all(np.diff(times[kept]) >= 0) else messages
 
 
 def _clocks(form: Format) -> tuple[str, ...]:
