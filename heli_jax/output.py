@@ -131,9 +131,7 @@ def print_compatibility(result: Compatibility) -> None:
 
 def _print_first_guess(guess: EquationErrorStart | FrequencyErrorStart) -> None:
     tell(f"Where the fit began, by {report_tables.start_method(guess)} (no result):")
-    for table in (report_tables.first_guess(guess), report_tables.selection_steps(guess)):
-        if table.rows:
-            tell_table(table)
+    tell_table(report_tables.first_guess(guess))
 
 
 _MOST_OFFSETS = 4

@@ -131,9 +131,7 @@ GROUPS = {
     "1980).",
     "held": "The same of all flights held out together: gain and phase of model and data with 95 % "
     "intervals, partial coherence of the data, and data over model.",
-    "starts": "The misfit that each start of the optimiser reached, best first.",
     "rls": "Each coefficient while the record goes by: one to be trusted settles.",
-    "trace": "Each colour is a chain. Chains to be trusted cannot be told apart and do not drift.",
     "pairs": "Dots and bars: the samples. Blue: the fit's Gaussian approximation with its "
     "intervals' sd; 95 % of it lie within a curve. Where the dots do not follow it, neither do "
     "intervals and correlations.",
@@ -164,7 +162,6 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
     model, drawings = problem.model, dict[str, Draw]()
     if (comparison := supplementary.intervals) is not None:
         if comparison.posterior is not None:
-            drawings["trace"] = later(figures.trace, comparison.posterior, fit)
             drawings["pairs_posterior"] = later(figures.posterior_pairs, comparison.posterior, fit)
         if comparison.bootstrap is not None:
             drawings["pairs_bootstrap"] = later(figures.bootstrap_pairs, comparison.bootstrap, fit)
@@ -196,7 +193,6 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
                 name = f"{group}_{pair.output}-{pair.input}"
                 rls = baseline if group == "match" and _of(baseline, pair) else None
                 drawings[name] = later(figures.match, pair, unit, note, rls)
-    drawings["starts"] = later(figures.waterfall, fit.starts)
     if baseline is not None:
         # Time in the log of its flight's first sample [s].
         start = next((s.log_start for s in fit.signals if s.flight == baseline.flight), None)

@@ -513,21 +513,6 @@ def first_guess(start: Start) -> Table:
     return Table(("parameter", "start", "unit", "from", "F-ratio"), rows)
 
 
-def selection_steps(start: Start) -> Table:
-    """The steps of a stepwise selection of terms; no rows where there was none."""
-    steps = () if start.selection is None else start.selection.steps
-    rows = [
-        (
-            str(i + 1),
-            f"{s.parameter} {'in' if s.entered else 'out'}",
-            number(s.f_ratio, 3),
-            percent(s.r_squared),
-        )
-        for i, s in enumerate(steps)
-    ]
-    return Table(("step", "term", "F-ratio", "explained"), rows)
-
-
 def methods(comparison: MethodComparison) -> Table:
     """Estimates with 95 % intervals by parameter and method, differences in joint sd."""
     main, *others = comparison.results

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from heli_jax.identification.fit import Signals, StartRow
+from heli_jax.identification.fit import Signals
 from heli_jax.identification.validation.metrics import lags_for
 from heli_jax.report import figures, style
 from heli_jax.report.charts import thinned
@@ -73,7 +73,6 @@ def test_every_figure_has_something_in_it(sound, tmp_path):
     drawn = {
         "response": figures.response(s, "roll", problem.model),
         "residual": figures.residual_correlation(s, "roll"),
-        "starts": figures.waterfall(fit.starts),
         "rls": figures.rls_history(baseline),
     }
     for name, made in drawn.items():
@@ -83,24 +82,6 @@ def test_every_figure_has_something_in_it(sound, tmp_path):
         assert len(svg) < 400_000
         pixels = matplotlib.image.imread(tmp_path / f"{name}.png")[..., :3]
         assert pixels.std() > 0.02
-
-
-def test_waterfall_marks_failures_and_spans_decades():
-    rows = tuple(
-        StartRow({}, {}, cost, 1, ok, k)
-        for cost, ok, k in [(1e3, False, 0), (1.0, True, 1), (np.inf, False, 0), (9.0, True, 2)]
-    )
-    [panel] = figures.waterfall(rows).panels
-    assert panel.logarithmic
-    joined, converged, failed = (s.y for s in panel.series)
-    assert joined.tolist() == [1.0, 9.0, 1e3]
-    assert converged.tolist() == [1.0, 9.0]
-    assert failed[0] == 1e3
-    assert np.isfinite(failed).all()
-    assert figures.waterfall(rows[:1]) is None
-    # A search that overflowed may end just below infinity, which no axis holds.
-    [panel] = figures.waterfall((*rows, StartRow({}, {}, 1e308, 1, True, 3))).panels
-    assert 1e3 < panel.limits[1] < 1e6
 
 
 def test_the_baseline_s_response_is_drawn_without_its_hold(sound):

@@ -109,7 +109,7 @@ def test_nothing_is_written_or_drawn_where_nothing_was_sampled(white, sampled, t
     write_samples(tmp_path, white[0], none, MADE, "bench.yaml")
     assert list(tmp_path.iterdir()) == []
     drawn = drawings(Analysis(*white, SupplementaryAnalyses(intervals=none)))
-    assert not {"trace", "pairs_posterior", "pairs_bootstrap"} & set(drawn)
+    assert not {"pairs_posterior", "pairs_bootstrap"} & set(drawn)
     # No record could be fitted: no file that would be empty.
     failed = dataclasses.replace(none, bootstrap=Bootstrap({"Ixx": np.array([])}, 5))
     assert sample_files(failed) == ()
@@ -135,7 +135,7 @@ def test_the_page_shows_chains_pairs_and_their_diagnostics(white, sampled, tmp_p
     files = sample_files(sampled)
     assert files == ("posterior.nc", "bootstrap.nc")
     names = write_report(tmp_path, analysis, "bench", {}, MADE._replace(files=files))
-    assert {"trace", "pairs_posterior", "pairs_bootstrap"} <= set(names)
+    assert {"pairs_posterior", "pairs_bootstrap"} <= set(names)
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert 'href="posterior.nc"' in page
     assert 'href="bootstrap.nc"' in page

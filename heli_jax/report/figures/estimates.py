@@ -6,61 +6,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from heli_jax.identification.result import Estimate, Fit, StartRow
+from heli_jax.identification.result import Estimate, Fit
 from heli_jax.identification.uncertainty.bootstrap import Bootstrap
 from heli_jax.identification.uncertainty.nuts import Posterior
 from heli_jax.report import style
-from heli_jax.report.charts import Chart, Series, panel
 from heli_jax.report.style import subtitle
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-_DRAWN = 1e100
-"""cost up to which a start is drawn at its own height"""
-
-
-def waterfall(starts: tuple[StartRow, ...]) -> Chart | None:
-    """The cost that each start reached, best first; None where there is one start or none."""
-    if len(starts) < 2:
-        return None
-    rows = sorted(starts, key=lambda s: s.cost if np.isfinite(s.cost) else np.inf)
-    cost, x = np.array([s.cost for s in rows]), np.arange(1.0, len(rows) + 1.0)
-    # A cost that is next to infinite leaves an axis no room.
-    finite, ok = cost < _DRAWN, np.array([s.converged for s in rows])
-    low, top = (cost[finite].min(), cost[finite].max()) if finite.any() else (1.0, 1.0)
-    logarithmic = bool(low > 0 and top > 30 * low)
-    # Where all starts agree to rounding, 2 % of the cost: an axis over rounding errors would show
-    # differences where there are none.
-    span = max(top - low, 0.02 * abs(top), 1e-300)
-    shown = np.where(finite, cost, 3.0 * top if logarithmic else top + 0.4 * span)
-    middle = 0.5 * (top + low)
-    series = [
-        Series("", x[finite], shown[finite], style.PALE, width=0.8),
-        Series("converged", x[ok], shown[ok], style.BLUE, "points", width=6.0),
-        Series("failed", x[~ok], shown[~ok], style.VERMILLION, "points", width=6.0),
-    ]
-    limits = (0.5 * low, 5.0 * top) if logarithmic else (middle - 0.9 * span, middle + 1.1 * span)
-    best, failed = sum(r.optimum == 1 for r in rows), np.count_nonzero(~ok)
-    title = f"{best} of {len(rows)} starts reached the best optimum"
-    return Chart(
-        f"{title}, {failed} failed" if failed else title,
-        "start, sorted by cost",
-        (0.4, len(rows) + 0.6),
-        (
-            panel(
-                "cost",
-                [s for s in series if s.x.size],
-                1.9,
-                limits=(float(limits[0]), float(limits[1])),
-                logarithmic=logarithmic,
-            ),
-        ),
-        ""
-        if finite.all()
-        else f"starts that ended without a cost below {_DRAWN:g} are drawn on top",
-    )
 
 
 MOST = 6
@@ -72,29 +25,6 @@ _DOTS = 1500
 """samples of which dots are drawn: of more they hide one another"""
 _MARKS = 200
 """divergent steps that are marked"""
-
-
-def trace(posterior: Posterior, fit: Fit) -> Chart:
-    """The chains by draw, one panel for each of the first parameters."""
-    panels, count = [], next(iter(posterior.draws.values())).shape[1]
-    draw = np.arange(float(count))
-    diverging = posterior.statistics.get("diverging")
-    marks = np.flatnonzero(np.any(diverging, axis=0)) if diverging is not None else ()
-    for name in list(posterior.draws)[:MOST]:
-        series = [
-            Series(f"chain {i + 1}", draw, np.asarray(chain), style.CYCLE[i % 8], width=0.5)
-            for i, chain in enumerate(posterior.draws[name])
-        ]
-        words, estimate = style.label(name, fit.estimates[name].unit), fit.estimates[name].value
-        panels.append(panel(words, series, 0.9, levels=(float(estimate),)))
-    # At most as many as can be told apart.
-    divergent = tuple(float(m) for m in marks[:_MARKS])
-    panels[-1] = panels[-1]._replace(marks=divergent)
-    note = f"dotted: the estimate{_left_out(len(posterior.draws))}"
-    note += "; upright lines: divergent steps" if divergent else ""
-    return Chart(
-        "Draws of the chains", "draw", (0.0, float(max(count - 1, 1))), tuple(panels), note
-    )
 
 
 def posterior_pairs(posterior: Posterior, fit: Fit) -> "Figure":
