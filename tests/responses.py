@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from heli_jax import naming
-from heli_jax.analysis.linear import linearize
+from heli_jax import linearize, naming
 from heli_jax.analysis.operating_point import EVERYWHERE, OperatingPoint
 
 
@@ -24,3 +23,13 @@ def continuous(
         return (np.array(points) + D[i, j]) * np.exp(-1j * omega * late)
 
     return response
+
+
+def polynomials(model: Any, params: Any) -> tuple[np.ndarray, np.ndarray]:
+    """num and den of the first output by the only input of a linear model: Leverrier."""
+    A, B, C, _ = (np.asarray(M) for M in linearize(model, params).matrices)
+    den, v, num = np.poly(A), B[:, 0], []
+    for k in range(len(A)):
+        num.append(C[0] @ v)
+        v = A @ v + den[k + 1] * B[:, 0]
+    return np.array(num), den

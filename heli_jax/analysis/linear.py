@@ -1,15 +1,11 @@
-"""Linearised models: named matrices, modes, frequency response."""
+"""Linearised models: named matrices and modes."""
 
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-from jaxtyping import Array, Complex, Float
 
 from heli_jax import naming
-from heli_jax.analysis.lti import siso_polynomials
 from heli_jax.dynamics.jacobians import StateSpace, jacobians
 from heli_jax.dynamics.model import Model, axes_of
 from heli_jax.dynamics.onboard.delays import require_past
@@ -180,54 +176,3 @@ def _known(part: list[str]) -> list[str]:
         if {axis, f"{axis} flapping"} <= set(part):
             part = [m for m in part if m != axis]
     return part
-
-
-def transfer_function(
-    model: Model, params: Any, output: str, input: str
-) -> tuple[np.ndarray, np.ndarray]:
-    """Numerator and denominator in s, highest power first, from the linearisation about zero.
-
-    The denominator has n + 1 numbers and begins with 1; leading zeros of the numerator are cut.
-    A delay of the input (`Model.delays`) is no ratio of polynomials and is left out.
-
-    Raises:
-        ValueError: the model has no such output or input.
-    """
-    lin = linearize(model, params)
-    for name, known, what in ((output, lin.outputs, "output"), (input, lin.inputs, "input")):
-        if name not in known:
-            raise ValueError(
-                f"model {model.name} has no {what} {name!r}: expected one of {', '.join(known)}"
-            )
-    A, B, C, D = (np.asarray(M, dtype=np.float64) for M in lin.matrices)
-    i, j = lin.outputs.index(output), lin.inputs.index(input)
-    return siso_polynomials(A, B[:, j], C[i], float(D[i, j]))
-
-
-def frequency_response(
-    model: Model, params: Any, omega: Float[Array, " k"]
-) -> Complex[Array, "k p m"]:
-    """H(i omega) = C (i omega - A)^-1 B + D of the linearisation about zero.
-
-    An input that acts late by d [s] (`Model.delays`) has the factor exp(-i omega d).
-
-    Args:
-        omega: (k,) [rad/s].
-    """
-    A, B, C, D = jacobians(model, params)
-    w = jnp.asarray(omega, A.dtype)
-    s = jax.lax.complex(jnp.zeros_like(w), w)
-    eye = jnp.eye(A.shape[0], dtype=s.dtype)
-
-    # A solution for each frequency: with eigenvectors it would be one, and none for a double mode.
-    def at(s_: Array) -> Array:
-        inner = jnp.linalg.solve(s_ * eye - A.astype(s.dtype), B.astype(s.dtype))
-        return C.astype(s.dtype) @ inner + D.astype(s.dtype)
-
-    late = dict(model.delays)
-    if not late:
-        return jax.vmap(at)(s)
-    names = naming.names(model.Inputs)
-    d = [getattr(params, late[n]) if n in late else 0.0 for n in names]
-    factors = jnp.exp(-s[:, None] * jnp.stack([jnp.asarray(v, A.dtype) for v in d])[None, :])
-    return jax.vmap(at)(s) * factors[:, None, :]

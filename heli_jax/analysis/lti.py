@@ -4,7 +4,6 @@ from typing import Literal
 
 import numpy as np
 import scipy.linalg
-from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 Polynomials = tuple[np.ndarray, np.ndarray]
@@ -109,22 +108,6 @@ def _polynomials(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> 
     # differences of large ones.
     num = D[0, 0] * den + _numerator(A, B[:, 0], C[0])
     return num, den
-
-
-def siso_polynomials(
-    A: Float[np.ndarray, "n n"], b: Float[np.ndarray, " n"], c: Float[np.ndarray, " n"], d: float
-) -> Polynomials:
-    """num and den of c (s - A)^-1 b + d; leading zeros of num are cut, zero stays one number."""
-    den = np.real(np.poly(A))
-    proper = _numerator(A, b, c)
-    # What rounding leaves of a coefficient that is zero. The Markov parameters c A^k b set its
-    # scale, and norms bound them.
-    size = np.linalg.norm(c) * np.linalg.norm(b)
-    norm = np.linalg.norm(A, 2) if A.size else 0.0
-    limit = 1e-12 * size * np.array([max(norm, 1.0) ** max(k - 1, 0) for k in range(den.size)])
-    num = d * den + np.where(np.abs(proper) <= limit, 0.0, proper)
-    kept = np.flatnonzero(num)
-    return (num[kept[0] :] if kept.size else np.zeros(1)), den
 
 
 def _numerator(A: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:

@@ -12,9 +12,6 @@ USUAL_J = 100.0
 """at most, where a response is usually called acceptable (Tischler and Remple, 2012, chapter 11)"""
 _POINTS = 20
 """frequencies, equally spaced in the logarithm, that J is usually taken over"""
-_TOO_SMALL = 0.7
-"""times the lower limit, below which squared errors are smaller than the noise that they are of,
-and no chance makes it"""
 _MISFIT = 2.0
 """times what random errors let expect, from which on squared errors speak against the model"""
 
@@ -68,14 +65,14 @@ class ResponseAgreement(NamedTuple):
     notes: tuple[str, ...]
 
     @property
-    def doubt(self) -> str:
-        """Reason in a few words why the model does not explain the responses; empty if it does."""
-        if self.chi_squared > max(self.upper95, _MISFIT):
-            return (
-                f"squared errors of the responses are {self.chi_squared:.2g} times what their "
-                "random errors let expect"
-            )
-        return ""
+    def outside(self) -> bool:
+        """True if chi-squared lies outside its interval."""
+        return self.chi_squared < self.lower95 or self.chi_squared > self.upper95
+
+    @property
+    def doubted(self) -> bool:
+        """True if the model does not explain the responses."""
+        return self.chi_squared > max(self.upper95, _MISFIT)
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -92,31 +89,6 @@ class ResponseAgreement(NamedTuple):
                 "below a coherence."
             )
         return tuple(words)
-
-    @property
-    def misfit(self) -> str:
-        """Sentence if chi-squared lies outside its interval; else empty."""
-        if self.chi_squared < self.lower95:
-            chance = "chance makes as little in one of forty; or "
-            return (
-                f"Squared errors of the responses are {self.chi_squared:.3g} times what their "
-                f"random errors let expect (95 %: {self.lower95:.3g} to {self.upper95:.3g}): "
-                f"{'' if self.chi_squared < _TOO_SMALL * self.lower95 else chance}the "
-                "noise in the windows is taken for larger than it is in the responses, and the "
-                "intervals are too wide."
-            )
-        if not self.chi_squared > self.upper95:
-            return ""
-        why = (
-            "the model lacks something, the vehicle is not linear, or an input follows the outputs"
-            if self.doubt
-            else "chance makes as much in one of forty; the model lacks something, or its "
-            "intervals are too narrow"
-        )
-        return (
-            f"Squared errors of the responses are {self.chi_squared:.4g} times what their random "
-            f"errors let expect (95 %: {self.lower95:.4g} to {self.upper95:.4g}): {why}."
-        )
 
 
 def pair_agreements(

@@ -283,8 +283,6 @@ _UNKNOWN = 0.2
 _RESOLVES = 1.0
 """relative change of a response in a line of the window, beyond which none is resolved: what its
 derivative may be where responses do not tell"""
-_USUALLY = 2.0
-"""times the usual derivative, what one may be that is not known"""
 _ALONE = 2e-2
 """variance of the places that a straight line lies through, in its half-width squared, below which
 they have no slope"""
@@ -390,32 +388,8 @@ def _line(
         enough = known & (spread > _ALONE * S0**2)
         chance = variance / (spread / S0**2 * reach**2 * independent)
         alone = _Line(both, flat, S1, S0, np.where(enough, 1.0 / (spread * reach), 0.0), chance)
-        usual = _usual(omega, np.where(enough, alone.slope(H), np.nan) / H, chance / np.abs(H) ** 2)
-        before = np.minimum(usual, 0.5 * (_RESOLVES * seconds / (2.0 * np.pi)) ** 2)
-        before = before * np.abs(H) ** 2
-        # The mean of what the line says and of what is usual, by their errors.
+        before = 0.5 * (_RESOLVES * seconds / (2.0 * np.pi)) ** 2 * np.abs(H) ** 2
+        # The mean of what the line says and of what windows resolve, by their errors.
         part = np.where(enough, before / (before + chance), 0.0)
         left = np.where(enough, part * chance, np.where(known, before, 0.0))
     return alone._replace(part=part * alone.part, variance=left)
-
-
-def _usual(
-    omega: Float[np.ndarray, " k"],
-    slopes: Complex[np.ndarray, "k l"],
-    variances: Float[np.ndarray, "k l"],
-) -> Float[np.ndarray, "k l"]:
-    """Mean square of a real or imaginary part of relative derivatives within an octave to either
-    side, twice over, for where they are not known; infinite where none is.
-
-    Args:
-        omega: (k,) [rad/s]
-        slopes: (k, l) over the responses; NaN where they are not known.
-        variances: (k, l) of their real and of their imaginary parts.
-    """
-    near = (np.abs(np.log2(omega[:, None] / omega[None, :])) <= 1.0).astype(float)
-    known = np.isfinite(slopes) & np.isfinite(variances)
-    typical = np.nanmedian(np.where(known, variances, np.nan), axis=0)
-    weights = np.where(known, 1.0 / (variances + typical), 0.0)
-    squares = near @ np.where(known, weights * np.abs(slopes) ** 2, 0.0)
-    total = near @ weights
-    return np.where(total > 0, _USUALLY**2 * 0.5 * squares / total, np.inf)

@@ -173,16 +173,6 @@ def _reduction(operation: str) -> _Shaped:
     return made
 
 
-def _anywhere(operation: str) -> _Shaped:
-    """Over all axes. Equinox asks so whether any of a batch needs something; here each vehicle asks
-    for itself, and gets the same."""
-
-    def made(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
-        return _reduction(operation)(code, inputs, {"axes": range(len(inputs[0].shape))})
-
-    return made
-
-
 def _product(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
     """dot_general, of small arrays: sums of products written out."""
     (of_a, of_b), (batch_a, batch_b) = params["dimension_numbers"]
@@ -215,6 +205,4 @@ SHAPED: dict[str, _Shaped] = {
     "reduce_and": _reduction("and"),
     "reduce_or": _reduction("or"),
     "dot_general": _product,
-    "unvmap_any": _anywhere("or"),
-    "unvmap_all": _anywhere("and"),
 }

@@ -107,8 +107,6 @@ class Code:
         """vehicles in flight at once in one thread: vectors of so many; with one, plain numbers"""
         self.lines: list[str] = []
         self.block = "entry"
-        self.taken: Value | None = None
-        """whether any vehicle takes the branch that is being written; None outside of branches"""
         self.declared: dict[str, str] = {}
         self.globals: dict[str, str] = {}
         self._count = 0
@@ -205,20 +203,6 @@ class Code:
         operands = ", ".join(f"{kind} {self.of(v, shared)}" for v in values)
         return self.made(f"call {kind} {full}({operands})", values[0].dtype, shared)
 
-    def library(self, name: str, *values: Value) -> Value:
-        """A function that LLVM does not know and the C library has, such as `log1p`."""
-        dtype = values[0].dtype
-        kind = type_of(dtype)
-        own = f"{name}{'f' if kind == 'float' else ''}"
-        takes = ", ".join([kind] * len(values))
-        self.declared[f"@{own}"] = f"declare {kind} @{own}({takes}) nounwind memory(none)"
-
-        def call(*scalars: Value) -> Value:
-            arguments = ", ".join(f"{kind} {v.operand}" for v in scalars)
-            return self.made(f"call {kind} @{own}({arguments})", dtype, True)
-
-        return self.by_lane(call, dtype, *values)
-
     def by_lane(self, function: Callable[..., Value], dtype: np.dtype, *values: Value) -> Value:
         """A function of scalars for each vehicle; once where all values are shared."""
         shared = all(v.shared for v in values)
@@ -243,14 +227,6 @@ class Code:
             )
             joined = self.made(right, dtype, False)
         return joined
-
-    def any(self, which: Value) -> Value:
-        """True if it is true of any of the vehicles that are computed together."""
-        if which.shared or self.lanes == 1:
-            return replace(which, shared=True)
-        name, vector = f"@llvm.vector.reduce.or.v{self.lanes}i1", self.vector("i1")
-        self.declared[name] = f"declare i1 {name}({vector})"
-        return self.made(f"call i1 {name}({vector} {which.operand})", which.dtype, True)
 
     def many(self, shared: bool) -> str:
         """Return the prefix of a type in an intrinsic's name."""

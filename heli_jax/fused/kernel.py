@@ -2,8 +2,6 @@
 
 import ctypes
 import functools
-import re
-import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -73,8 +71,6 @@ def write(run: Run, lanes: int) -> tuple[str, list[Argument]]:
     code.label("vehicles")
     code.write(f"%b = phi i64 [ %begin, %{entry} ], [ %following, %done ]")
     stays, carry = read_stays(), read_carry()
-    # How many there are is known: an index that cannot leave the record need not be clipped to it.
-    steps = constant(run.steps, INDEX)
 
     def step(index: Value, carried: list[Operand]) -> list[Operand]:
         return translate(
@@ -84,7 +80,7 @@ def write(run: Run, lanes: int) -> tuple[str, list[Argument]]:
             [*stays, *stored, *carried, np.asarray(index, object)],
         )
 
-    carried = loop(code, steps, carry, step)
+    carried = loop(code, run.steps, carry, step)
     results = translate(code, run.last.jaxpr, run.last.consts, [*stays, *stored, *carried])
     arrays = [elements(v) for v in results]
     kinds = [Argument(v.shape, v.ravel()[0].dtype, False) for v in arrays]
@@ -317,9 +313,6 @@ def _machine() -> Any:
 def _compiled(assembly: str) -> Any:
     """The engine that holds the machine code, which goes with it."""
     llvm, target = _llvm(), _machine()
-    for name in re.findall(r"^declare .*@(?!llvm\.)(\w+)\(", assembly, re.MULTILINE):
-        # LLVM would end the process where it does not find one.
-        llvm.add_symbol(name, _address(name))
     module = llvm.parse_assembly(assembly)
     module.verify()
     builder = llvm.create_pass_builder(target, llvm.create_pipeline_tuning_options(speed_level=3))
@@ -328,19 +321,3 @@ def _compiled(assembly: str) -> Any:
     engine = llvm.create_mcjit_compiler(module, _machine())
     engine.finalize_object()
     return engine
-
-
-def _address(name: str) -> int:
-    """Return the address of a function of the C library.
-
-    Raises:
-        UnsupportedError: it has none of this name.
-    """
-    # Elsewhere it is part of what every process of Python has loaded.
-    library = ctypes.CDLL("ucrtbase" if sys.platform == "win32" else None)
-    try:
-        address = ctypes.cast(getattr(library, name), ctypes.c_void_p).value
-    except AttributeError as e:
-        raise UnsupportedError(f"{name}, which this machine's C library does not have") from e
-    assert address is not None
-    return address

@@ -64,11 +64,11 @@ def _comparison(of_floats: str, signed: str, unsigned: str) -> Operation:
     return made
 
 
-def _function(name: str, how: Callable[..., Value]) -> Operation:
+def _function(name: str) -> Operation:
     def made(code: Code, *values: Value, **_: Any) -> Value:
         if values[0].dtype.kind != "f":
             raise UnsupportedError(f"{name} of integers")
-        return how(code, name, *values)
+        return code.intrinsic(name, *values)
 
     return made
 
@@ -251,10 +251,8 @@ _INTRINSICS = (
     *("sqrt", "floor", "ceil", "exp", "exp2", "log", "log2", "sin", "cos", "tan", "asin", "acos"),
     *("atan", "atan2", "sinh", "cosh", "tanh"),
 )
-_LIBRARY = ("log1p", "expm1", "cbrt", "asinh", "acosh", "atanh", "erf", "erfc")
 OPERATIONS: dict[str, Operation] = {
-    **{name: _function(name, Code.intrinsic) for name in _INTRINSICS},
-    **{name: _function(name, Code.library) for name in _LIBRARY},
+    **{name: _function(name) for name in _INTRINSICS},
     "add": _arithmetic("fadd", "add"),
     "add_any": _arithmetic("fadd", "add"),
     "sub": _arithmetic("fsub", "sub"),

@@ -33,13 +33,11 @@ from heli_jax.fused.code import (
     dtype_of,
     elements,
     said,
-    scalar,
 )
 from heli_jax.fused.operations import OPERATIONS
 
 _UNROLLED = 16
-"""Passes of a loop that are written out where it cannot stay a loop."""
-
+"""Passes of a loop that are written out, since derivatives ask for what each has computed."""
 
 _NESTED = {
     "jit": "jaxpr",
@@ -120,8 +118,6 @@ def _equation(code: Code, equation: Any, inputs: list[Operand]) -> list[Operand]
         return list(inputs)
     if name == "scan":
         return _scan(code, params, inputs)
-    if name == "while":
-        return _while(code, params, inputs)
     if name == "cond":
         return _branches(code, params, inputs)
     if "callback" in name:
@@ -177,25 +173,12 @@ def _branches(code: Code, params: dict[str, Any], inputs: list[Operand]) -> list
     if not isinstance(which, Stored) and which.dtype != object:
         branch = branches[int(np.clip(which, 0, len(branches) - 1))]
         return translate(code, branch.jaxpr, branch.consts, operands)
-    which, outside, results = scalar(which), code.taken, []
-    for i, branch in enumerate(branches):
-        # A loop of a branch that nobody takes need not have an end.
-        taken = code.any(_takes(code, which, i, len(branches)))
-        code.taken = taken if outside is None else code.operation("and", outside, taken)
-        results.append(translate(code, branch.jaxpr, branch.consts, operands))
-    code.taken = outside
+    results = [translate(code, b.jaxpr, b.consts, operands) for b in branches]
+    taken = elements(which)
     return [
-        _elementwise(code, "select_n", {}, [np.asarray(which, object), *case], dtype_of(case[0]))
+        _elementwise(code, "select_n", {}, [taken, *case], dtype_of(case[0]))
         for case in zip(*results, strict=True)
     ]
-
-
-def _takes(code: Code, which: Value, i: int, count: int) -> Value:
-    """True if a branch is selected; the first and the last also stand for indices beyond them."""
-    if which.dtype.kind == "b":
-        return which if i else code.operation("xor", which, constant(True, which.dtype))
-    order = "sle" if i == 0 else "sge" if i == count - 1 else "eq"
-    return code.compare(f"icmp {order}", which, constant(i, which.dtype))
 
 
 def _scan(code: Code, params: dict[str, Any], inputs: list[Operand]) -> list[Operand]:
@@ -203,26 +186,18 @@ def _scan(code: Code, params: dict[str, Any], inputs: list[Operand]) -> list[Ope
     body = params["jaxpr"]
     consts, carry = inputs[:n_consts], inputs[n_consts : n_consts + n_carry]
     rows = inputs[n_consts + n_carry :]
-    keeps = len(body.jaxpr.outvars) > n_carry
-    computed = any(not isinstance(v, Stored) and v.dtype == object for v in rows)
-    if length == 0 and not keeps:
-        return list(carry)
-    if length == 0:
-        raise UnsupportedError("a loop of no passes")
-    if keeps or computed:
+    if len(body.jaxpr.outvars) > n_carry:
         return _written_out(code, params, consts, carry, rows)
+    if length == 0:
+        return list(carry)
 
     def once(index: Value, carried: list[Operand]) -> list[Operand]:
         if params["reverse"]:
             index = code.operation("sub", constant(length - 1, INDEX), index)
-        return translate(
-            code,
-            body.jaxpr,
-            body.consts,
-            [*consts, *carried, *(_row(code, v, index) for v in rows)],
-        )
+        now = [_row(code, v, index) for v in rows]
+        return translate(code, body.jaxpr, body.consts, [*consts, *carried, *now])
 
-    return loop(code, constant(length, INDEX), carry, once)
+    return loop(code, length, carry, once)
 
 
 def _counts(params: dict[str, Any]) -> tuple[int, int]:
@@ -249,7 +224,7 @@ def _written_out(
     rows: list[Operand],
 ) -> list[Operand]:
     length, body = params["length"], params["jaxpr"]
-    if length > _UNROLLED:
+    if not 0 < length <= _UNROLLED:
         raise UnsupportedError(f"a loop of {length} passes whose results are all kept")
     order = range(length - 1, -1, -1) if params["reverse"] else range(length)
     kept: list[list[Elements]] = [[] for _ in body.jaxpr.outvars[len(carry) :]]
@@ -264,62 +239,15 @@ def _written_out(
     return [*carry, *(np.stack(column) for column in kept)]
 
 
-def _while(code: Code, params: dict[str, Any], inputs: list[Operand]) -> list[Operand]:
-    """A loop that goes on while any vehicle does; one that is done keeps what it has."""
-    n_test, n_body = params["cond_nconsts"], params["body_nconsts"]
-    of_test, of_body = inputs[:n_test], inputs[n_test : n_test + n_body]
-    carry, body, test = inputs[n_test + n_body :], params["body_jaxpr"], params["cond_jaxpr"]
-
-    def holds(carried: list[Operand]) -> Elements:
-        (going,) = translate(code, test.jaxpr, test.consts, [*of_test, *carried])
-        return elements(going)
-
-    def some(carried: list[Operand]) -> Value:
-        # Of vmap the loop has an answer for each of what it maps over.
-        each = [code.any(v) for v in holds(carried).ravel()]
-        return functools.reduce(lambda a, b: code.operation("or", a, b), each)
-
-    def once(_: Value, carried: list[Operand]) -> list[Operand]:
-        going = holds(carried)
-        new = translate(code, body.jaxpr, body.consts, [*of_body, *carried])
-        together = going.shape == () and going.item().shared
-        return new if together else _where(code, going, new, carried)
-
-    # Entered at least once, as all loops here: what it then carries is not taken if it should not
-    # have been.
-    entered = some(carry)
-    if code.taken is not None:
-        entered = code.operation("and", entered, code.taken)
-    results = loop(
-        code,
-        # Never again where it should not have been entered: such a loop may have no end.
-        lambda carried: code.operation("and", entered, some(carried)),
-        carry,
-        once,
-    )
-    return _where(code, np.asarray(entered, object), results, carry)
-
-
-def _where(code: Code, which: Elements, yes: list[Operand], no: list[Operand]) -> list[Operand]:
-    """One of two, by truth values of the first axes."""
-    results = []
-    for old, new in zip(no, yes, strict=True):
-        rest = (1,) * (len(new.shape) - which.ndim)
-        each = np.broadcast_to(which.reshape((*which.shape, *rest)), new.shape)
-        results.append(_elementwise(code, "select_n", {}, [each, old, new], dtype_of(old)))
-    return results
-
-
 def loop(
     code: Code,
-    until: Value | Callable[[list[Operand]], Value],
+    passes: int,
     carry: Sequence[Operand],
     body: Callable[[Value, list[Operand]], list[Operand]],
 ) -> list[Operand]:
     """A loop that is passed at least once.
 
     Args:
-        until: how many passes (int32), or of what is carried whether there is another.
         body: of the pass's number (int32) and what is carried, what is carried on.
     """
     starts = [elements(v) for v in carry]
@@ -327,10 +255,10 @@ def loop(
     # What starts the same for all vehicles may not stay so: tried until nothing changes.
     while True:
         mark = code.mark()
-        results = _tried(code, until, starts, varies, body)
-        changed = [old | _vary(new) for old, new in zip(varies, results[1], strict=True)]
+        results = _tried(code, passes, starts, varies, body)
+        changed = [old | _vary(new) for old, new in zip(varies, results, strict=True)]
         if all(np.array_equal(a, b) for a, b in zip(varies, changed, strict=True)):
-            return list(results[0])
+            return list(results)
         varies = changed
         code.back_to(mark)
 
@@ -342,11 +270,12 @@ def _vary(values: Elements) -> np.ndarray:
 
 def _tried(
     code: Code,
-    until: Value | Callable[[list[Operand]], Value],
+    passes: int,
     starts: list[Elements],
     varies: list[np.ndarray],
     body: Callable[[Value, list[Operand]], list[Operand]],
-) -> tuple[list[Elements], list[Elements]]:
+) -> list[Elements]:
+    """The loop, where what is carried differs between vehicles as `varies` says."""
     before = [
         [code.of(v, not bool(w)) for v, w in zip(s.ravel(), each.ravel(), strict=True)]
         for s, each in zip(starts, varies, strict=True)
@@ -366,10 +295,7 @@ def _tried(
         for r, e in zip(results, varies, strict=True)
     ]
     following = code.operation("add", index, constant(1, INDEX))
-    if isinstance(until, Value):
-        again = code.compare("icmp slt", following, until)
-    else:
-        again = until(list(results))
+    again = code.compare("icmp slt", following, constant(passes, INDEX))
     end = code.block
     after = code.new_label("after")
     phis = [f"{index.operand} = phi i32 [ 0, %{entry} ], [ {following.operand}, %{end} ]"]
@@ -380,7 +306,7 @@ def _tried(
     code.lines[place:place] = [f"  {p}" for p in phis]
     code.write(f"br i1 {again.operand}, label %{inside}, label %{after}")
     code.label(after)
-    return results, results
+    return results
 
 
 _OURS = str(Path(__file__).parents[1])

@@ -30,4 +30,4 @@ def test_what_lies_above_a_sweep_has_no_part_in_J():
 def test_squared_errors_outside_of_their_interval_are_said_on_either_side(chi_squared, said):
     """0.773 where 0.906 to 1.1 is expected stood in a table, and no sentence said so."""
     agreement = ResponseAgreement((), chi_squared, 0.906, 1.1, 800.0, 10.0, (), (), ())
-    assert bool(agreement.misfit) == said
+    assert agreement.outside == said

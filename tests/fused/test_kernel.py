@@ -93,31 +93,14 @@ UNARY = {
 }
 # Several in a program, which takes as long to compile as one.
 GROUPS = {
-    "of the C library": lambda x: (
-        jnp.log1p(x * x)
-        + jnp.expm1(-x)
-        + jnp.cbrt(x)
-        + jnp.arcsinh(x)
-        + jnp.arccosh(1.0 + x * x)
-        + jnp.arctanh(0.9 * jnp.tanh(x))
-        + jax.scipy.special.erf(x)
-        + jnp.log2(1.0 + x * x)
-        + jnp.sinc(x)
-    ),
     "slopes": lambda x: sum(
         jax.grad(f)(x)
         for f in (
             jnp.tanh,
             lambda v: jnp.arcsin(0.4 * v),
             lambda v: jnp.arccos(0.4 * v),
-            lambda v: jnp.log1p(v * v),
-            jnp.expm1,
-            jnp.arcsinh,
-            lambda v: jnp.arctanh(0.4 * v),
             lambda v: v * jax.lax.stop_gradient(v),
-            jax.nn.softplus,
             lambda v: v % 0.7,
-            jax.scipy.special.erf,
         )
     ),
     "remainders": lambda x: jnp.mod(x, 0.7) + jnp.fmod(x, -0.3) + jnp.remainder(x, -0.45),
@@ -195,13 +178,6 @@ LOOKUPS = {
             + jnp.sum(jax.lax.dynamic_slice(_TABLE, ((v / 0.0).astype(jnp.int64),), (2,)))
         )
     ),
-    "a loop of a batch": jax.jit(
-        lambda v, s, u: jnp.sum(
-            jax.vmap(lambda r: jax.lax.while_loop(lambda c: c < r * v, lambda c: c + 0.3, 0.0 * v))(
-                np.arange(4.0)
-            )
-        )
-    ),
     "counts": jax.jit(
         lambda v, s, u: jnp.dot(
             jnp.stack([_place(v), _place(v, 3)]), np.arange(2), preferred_element_type=v.dtype
@@ -215,14 +191,6 @@ LOOKUPS = {
     "batches of matrices": lambda v, s, u: (
         jnp.sum(jnp.einsum("bij,bj->bi", v * _PLANE[:8].reshape(2, 4, 9)[..., :3], _PLANE[:2, :3]))
         + jnp.sum(jnp.einsum("ijb,jb->bi", v * np.ones((2, 3, 4)), _LONGER[:12].reshape(3, 4)))
-    ),
-    "loops of each vehicle's own": lambda v, s, u: (
-        jax.lax.while_loop(lambda y: jnp.abs(y) > 1e-3, lambda y: 0.5 * y, v)
-        + jax.lax.while_loop(
-            lambda c: (jnp.abs(c[0] ** 2 - 2 - v * v) > 1e-9) & (c[1] < 50),
-            lambda c: (c[0] - (c[0] ** 2 - 2 - v * v) / (2 * c[0]), c[1] + 1),
-            (1.0 + jnp.abs(v), 0),
-        )[0]
     ),
 }
 
@@ -263,19 +231,6 @@ def test_axes_of_length_one_are_repeated():
         agree(step)
 
 
-@pytest.mark.parametrize("of", [lambda stays, u, k, x: u[k], lambda stays, u, k, x: x])
-def test_a_loop_without_end_in_a_branch_that_nobody_takes(of):
-    def step(stays, u, x, k):
-        def endless(v):
-            return jax.lax.while_loop(lambda c: c[1] < 1.0, lambda c: (c[0] + 1.0, c[1]), (v, 0.0))
-
-        return jax.lax.cond(
-            of(stays, u, k, x) > 90.0, lambda v: endless(v)[0], lambda v: 0.5 * v + u[k], x
-        )
-
-    agree(step)
-
-
 # Sweeps in single precision are compared in tests/sweeps/test_fused.py.
 @pytest.mark.slow
 def test_records_loops_and_small_arrays():
@@ -290,9 +245,8 @@ def test_records_loops_and_small_arrays():
         total, _ = jax.lax.scan(lambda c, r: (c + 0.1 * r * jnp.sin(c + a), None), v[0], reach)
         inner = jax.lax.fori_loop(0, 3, lambda i, y: 0.5 * y + 0.1 * i, v[1])
         inner = jax.lax.fori_loop(0, 0, lambda i, y: y + 1.0, inner)
-        kept = jax.lax.scan(lambda c, _: (0.5 * c, c + a), x, None, length=3)[1]
         chosen = jax.lax.cond(x > 0, lambda y: y, lambda y: -2.0 * y, total)
-        return 0.2 * (chosen + inner + late[k] + jnp.sum(kept) + jnp.max(v) + kept[::-1][0])
+        return 0.2 * (chosen + inner + late[k] + jnp.max(v))
 
     agree(step)
 
@@ -355,7 +309,6 @@ _NEWER = {
     "product": lambda v: jnp.sum(jnp.asarray(_M, v.dtype) @ jnp.stack([v, 0.3 * v])),
     "branch": lambda v: jax.lax.cond(v > 0, lambda y: 0.5 * y, lambda y: 2.0 * y, v),
     "remainder": lambda v: (v - 0.7 * jnp.floor(v / 0.7)) * (v - 0.7 * jnp.ceil(v / 0.7)),
-    "of the library": lambda v: jnp.arcsinh(v) + jax.scipy.special.erf(v),
 }
 
 
@@ -406,13 +359,3 @@ def test_a_random_expression(expression):
     near = [(np.nextafter(gain, 9.0), np.nextafter(carry, to)) for to in (9.0, -9.0)]
     spread = max(np.max(np.abs(at(*v) - at(gain, carry))) for v in near)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 + 30.0 * spread)
-
-
-def test_a_loop_that_is_not_entered_ends():
-    def step(stays, u, x, k):
-        # Counted down to zero, from which it would go on for ever.
-        return jax.lax.while_loop(
-            lambda c: c[1] != 0, lambda c: (0.5 * c[0], c[1] - 1), (x, jnp.where(k == 2, 0, 2))
-        )[0]
-
-    agree(step)

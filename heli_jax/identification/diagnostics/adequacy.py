@@ -131,15 +131,13 @@ def responses_explained(c: Context) -> Iterator[Finding]:
     """Squared errors of fitted responses over their variance, which gusts do not change."""
     if c.responses is None or c.unrelated:
         return
-    if c.responses.misfit:
-        doubted = bool(c.responses.doubt)
+    if c.responses.outside:
+        doubted = c.responses.doubted
         yield found(
             "adequacy.response-errors",
             "doubt" if doubted else "note",
             value=c.responses.chi_squared,
             denies=doubted,
-            misfit=c.responses.misfit,
-            doubt=c.responses.doubt,
             low=c.responses.lower95,
             high=c.responses.upper95,
         )
