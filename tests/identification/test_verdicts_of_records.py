@@ -93,6 +93,6 @@ def test_dropouts_that_hold_the_last_value_are_told_by_what_they_take_together()
 def test_an_output_of_which_nothing_is_explained_is_found():
     judged = [OutputAdequacy(n, True, v, v, True, 0.0) for n, v in (("p", 1e-5), ("phi", 0.99))]
     measured = dict.fromkeys(("p", "phi"), np.zeros(3000))
-    record = Record("one", 0.01, measured, measured)
+    record = Record("one", measured, measured)
     evidence = Evidence((record,), {}, {}, None, 5)
     assert [_of_noise(o, evidence) for o in judged] == [True, False]
