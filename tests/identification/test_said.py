@@ -155,21 +155,7 @@ def test_of_a_time_shift_at_its_end_is_not_said_that_it_has_no_effect():
     assert verdict.without_effect == ("time_shift",)
 
 
-<<<<<<< HEAD
-def test_an_input_whose_unit_is_in_doubt_takes_the_intervals_that_it_scales():
-=======
-def test_a_time_shift_up_to_the_end_of_its_search_is_known_only_roughly():
-    [parameter] = unknowns("L")
-    for sd, said in ((10.0, ("time_shift",)), (5.0, ())):
-        # 0.2 s in samples of 20 ms, searched up to 0.5 s: 15 samples further.
-        shift = Unknown("time_shift", 0.2, False, 1.0, 0.0, is_parameter=False, room=15.0)
-        verdict = analyse(np.diag([100.0, 1.0 / sd]), (parameter, shift))
-        assert verdict.identifiable
-        assert tuple(verdict.factors) == said
-
-
 def test_an_input_whose_unit_is_in_doubt_takes_the_intervals():
->>>>>>> s62-h2
     flight = record(1, 0.0, 0.02)
     percent = {"d": 100.0 * flight.inputs["d"] / np.max(np.abs(flight.inputs["d"]))}
     source = Source("log.csv", "", inputs={"d": Signal("stick", "1", "1")})
