@@ -204,12 +204,15 @@ def _stretches(seconds: np.ndarray, x: np.ndarray, facts: SignalFacts) -> list[S
     rails = [rail.value for rail in (facts.low, facts.high) if rail.times.size]
     lengths = np.where(np.isin(y[begins], rails), 0, lengths)
     usual = float(np.median(np.abs(moves[moves != 0])))
-    stuck = []
+    stuck, noisy = [], _turns(moves) >= _TURNS
     for i in np.flatnonzero(lengths >= _longest_by_itself(lengths, moves)):
         first, last = begins[i], begins[i] + lengths[i] - 1
+        one = Stuck(float(s[first]), float(s[last]), float(y[first]))
         # A simulated signal without noise comes to rest within the last digit.
-        if not first or abs(moves[first - 1]) >= _AT_REST * usual:
-            stuck.append(Stuck(float(s[first]), float(s[last]), float(y[first])))
+        rests = first > 0 and abs(moves[first - 1]) < _AT_REST * usual
+        # What has no noise may rest for a while without being stuck.
+        if not rests and (noisy or one.end - one.begin >= STUCK_SECONDS):
+            stuck.append(one)
     return stuck
 
 
@@ -236,6 +239,12 @@ def _that_count(stuck: Sequence[Stuck], duration: float) -> tuple[Stuck, ...]:
     return tuple(sorted(counted, key=lambda one: one.begin - one.end))
 
 
+def _turns(moves: np.ndarray) -> float:
+    """The part of a signal's moves that go back."""
+    ways = np.sign(moves[moves != 0])
+    return float(np.mean(ways[1:] != ways[:-1])) if ways.size > 1 else 0.0
+
+
 def _longest_by_itself(lengths: np.ndarray, moves: np.ndarray) -> float:
     """The number of samples in a row from which on a signal does not stay at one value by itself;
     inf where it may for any time."""
@@ -244,8 +253,7 @@ def _longest_by_itself(lengths: np.ndarray, moves: np.ndarray) -> float:
         return least
     # A slow motion in coarse steps has runs of any length; noise as large as the steps turns back
     # at every other one, and ends each run by chance.
-    ways = np.sign(moves[moves != 0])
-    if float(np.mean(ways[1:] != ways[:-1])) < _TURNS:
+    if _turns(moves) < _TURNS:
         return np.inf
     # The runs in which all but a hundredth of the time is spent, those that are stuck left out.
     ordered = np.sort(lengths[lengths < least])
