@@ -35,7 +35,7 @@ from heli_jax.flights.log import (
     wrong,
 )
 from heli_jax.flights.progress import Digest
-from heli_jax.regular_file import read_regular
+from heli_jax.regular_file import read_regular, size_words
 
 # Imported again within the functions that need it: it takes a quarter of a second, which
 # flights made in Python need not wait for.
@@ -44,6 +44,8 @@ if TYPE_CHECKING:
 
 _LARGEST = 8 * 10**9
 """bytes: the file is held in memory, and the columns that are asked for"""
+_LARGEST_TEXT = 10**9
+"""bytes of cells that are looked at as text"""
 _LOOKED_AT, _MOST_LINES = 1 << 20, 20_000
 """bytes and lines in which a table is sought"""
 _FEWEST = 3
@@ -413,6 +415,10 @@ class CsvTable:
         if table is not None:
             columns = [table.column(str(i)) for i in indices]
             return [(floats(c), len(c) - c.null_count, 0) for c in columns]
+        if len(self._rows) > _LARGEST_TEXT:
+            problem = "has quotes, a row of other than the header's number of cells, or a cell that"
+            problem += f" is no plain number, expected at most {size_words(_LARGEST_TEXT)} then"
+            raise wrong(self.path, f"{problem}, got {size_words(len(self._rows))}")
         table = self._arrow(indices, pa.string())
         if table is None:
             raise self._ragged()
