@@ -150,6 +150,8 @@ class Around(NamedTuple):
     """other values that fit as well"""
     valley: Valley | None = None
     """tells which combinations are the same far from the point; without it there are none"""
+    null: tuple[np.ndarray, ...] = ()
+    """directions (q,) in relative coordinates that are open at another point as likely"""
     one_sided: tuple[str, ...] = ()
     """the parameters that the likelihood does not bound within the factor of ten"""
     limits: Mapping[str, tuple[float, float]] = MappingProxyType({})
@@ -303,7 +305,7 @@ def _further(
     open_ = np.array([u.name in around.one_sided for u in unknowns])
     sds = np.sqrt(np.where(open_, np.diag(covariance), 1.0))
     one_sided = [np.where(open_, covariance[:, i] / sds, 0.0) for i in np.flatnonzero(open_)]
-    return [*weakly, *aliased, *one_sided]
+    return [*weakly, *aliased, *around.null, *one_sided]
 
 
 def _groups(

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.special
 
-from heli_jax.identification.estimation.evaluation import Evaluation, pseudoinverse
+from heli_jax.identification.estimation.evaluation import Evaluation, evaluate, pseudoinverse
 from heli_jax.identification.estimation.levenberg_marquardt import measured_count
-from heli_jax.identification.identifiability.analysis import Around, unknowns_of
+from heli_jax.identification.identifiability.analysis import Around, unknowns_of, verdict_of
 from heli_jax.identification.identifiability.equivalents import (
     Rows,
     descend,
@@ -27,7 +27,7 @@ from heli_jax.identification.identifiability.equivalents import (
 from heli_jax.identification.identifiability.verdict import FACTOR, Z95, Unknown, Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
-from heli_jax.identification.unknowns.layout import Solution, value_of
+from heli_jax.identification.unknowns.layout import Solution, flight_places, value_of
 
 _REACHES = (3.0, 9.0)
 """standard deviations to either side of a profile that is asked for; the second only where the
@@ -47,6 +47,10 @@ _VALLEY = 0.9
 _INFLATED = 1.5
 """factor by which autocorrelated residuals may make intervals wider: beyond, a disturbance does,
 and the likelihood of white residuals means little"""
+_BY_CHANCE = 1e-3
+"""probability that initial states which are those of rest gain as much of the likelihood"""
+_REST = 1e-6
+"""initial states below this, in sds of their weak priors, are those of rest already"""
 
 
 class Profile(NamedTuple):
@@ -170,6 +174,8 @@ def beyond_slopes(
     ]
     if not wide or not (np.isfinite(e.r).all() and np.isfinite(e.J).all()):
         return around
+    null = _open_at_rest(problem, at, e, lacking, reaches)
+    opened = {n for v in null for n, part in zip(verdict.names, v, strict=True) if abs(part) > 0.1}
     # What is open already goes along with anything, and tells nothing of where the others go.
     J = np.array(e.J, np.float64)
     J[:, [i for i, n in enumerate(verdict.names) if n in lacking]] = 0.0
@@ -178,6 +184,8 @@ def beyond_slopes(
     together = math.sqrt(scipy.special.chdtri(len(wide), 0.05)) / Z95
     limits, one_sided = {}, []
     for i, u in wide:
+        if u.name in opened:
+            continue
         line = _line(at, Rows(np.asarray(e.r), J), i)
         reach = together * float(reaches[i])
         ends = [_end(problem, line, e, u, side, reach) for side in (-1, 1)]
@@ -187,7 +195,7 @@ def beyond_slopes(
         elif any(abs(t) != reach * line.sd for t in bounded):
             low, high = sorted(line.value(t) for t in bounded)
             limits[u.name] = (low, high)
-    return around._replace(limits=limits, one_sided=tuple(one_sided))
+    return around._replace(limits=limits, one_sided=tuple(one_sided), null=tuple(null))
 
 
 def _is_wide(problem: Problem, u: Unknown, reach: float, least: float) -> bool:
@@ -240,3 +248,38 @@ def _furthest(problem: Problem, line: _Line, e: Evaluation, u: Unknown, side: in
     limits = (at.data.sign[i], at.data.low[i], at.data.high[i])
     z = float(transforms.to_coordinate(at.layout.kinds[i], target, *limits))
     return abs(z - float(at.z[i]))
+
+
+def _open_at_rest(
+    problem: Problem, at: Solution, e: Evaluation, lacking: frozenset[str], reaches: np.ndarray
+) -> list[np.ndarray]:
+    """Return directions that nothing but initial states of chance determine: open with the initial
+    states at rest, where the data cannot tell them from that.
+
+    A transient is as large as the initial states that the fit has found, and so is what it tells
+    of the parameters. Where the data do not tell these states from rest, it may as well be none.
+    """
+    layout = at.layout
+    if layout.noise_model == "spectrum" or any(count > 1 for count, _ in layout.windows):
+        return []
+    held = np.zeros(layout.size, bool)
+    for places in flight_places(layout):
+        held[places.states] = True
+    z = np.asarray(at.z, np.float64)
+    if not (np.abs(z[held]) > _REST).any():
+        return []
+    rest, squares = descend(lambda z: rows_at(at, z), np.where(held, 0.0, z), ~held)
+    deviance = deviance_of(at, squares_of(e.r), squares)
+    # Autocorrelated residuals let chance gain more.
+    wider = max(1.0, float(np.median(reaches[held])) / Z95)
+    if deviance > wider**2 * scipy.special.chdtri(int(held.sum()), _BY_CHANCE):
+        return []
+    e = evaluate(layout, at.data, at.noise, jnp.asarray(rest, at.z.dtype))
+    if not np.isfinite(e.J).all():
+        return []
+    there = verdict_of(problem, layout, e)
+    return [
+        np.array([v[n] for n in there.names])
+        for v in there.null_directions
+        if not lacking & {n for n, part in v.items() if abs(part) > 0.1}
+    ]
