@@ -1,10 +1,12 @@
 """Output of `simulate`, `sweep` and studies, which need no estimation."""
 
 import json
+import math
 import os
 import sys
+from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,20 +14,14 @@ from heli_jax import config as configuration
 from heli_jax import run_directory
 from heli_jax.finding import sentences
 from heli_jax.flights import write as tables
-from heli_jax.numbers import terse
+from heli_jax.numbers import rounded, terse
 from heli_jax.terminal import print_table, tell
 from heli_jax.yaml_file import as_yaml
 
 if TYPE_CHECKING:
-    from heli_jax.generate import Simulated
-import math
-from collections import Counter
-from typing import TYPE_CHECKING, Any
-
-from heli_jax.numbers import rounded
-
-if TYPE_CHECKING:
     import xarray as xr
+
+    from heli_jax.generate import Simulated
 
 
 def write_table(out: Path | None, columns: dict[str, np.ndarray]) -> None:
@@ -88,12 +84,13 @@ def print_sweep(out: Path) -> None:
     width = len(head) if "float32_error" in totals else len(head) - 1
     print_table(head[:width], [row[:width] for row in rows])
     for words in ("worst", "best"):
-        for name, elements in totals[words].items():
-            element = elements[0]
+        for name, [element, *_] in totals[words].items():
             at = ", ".join(f"{n} = {terse(v)}" for n, v in element["axes"].items())
-            unit = totals["results"].get(name, {}).get("unit", "")
-            value = f"{terse(element['value'])} {unit if unit != '1' else ''}".rstrip()
-            tell(f"{words} {name}: {value}, element {element['element']}, {at}")
+            value = f"{terse(element['value'])} {totals['results'].get(name, {}).get('unit', '')}"
+            tell(
+                f"{words} {name}: {value.removesuffix(' 1').rstrip()}, element "
+                f"{element['element']}, {at}"
+            )
     for found in totals["notes"]:
         tell(f"! {found['sentence']}")
     for name, result in totals["results"].items():
@@ -103,8 +100,6 @@ def print_sweep(out: Path) -> None:
             words = " and ".join(f"{k} {what}" for what, k in apart.items() if k)
             of = result["n"] + sum(apart.values())
             tell(f"! {name}: of {of} values {words}, which its line leaves out")
-    if not totals["status"].get("ok"):
-        tell("! no element is ok: see docs/sweeps.md for what each status means")
     timing = totals["timing"]
     # A sweep that was resumed when all was there has computed nothing, and has no rate.
     if timing["computed_elements"]:
@@ -121,9 +116,7 @@ DONE, NOT_DETERMINED, NOT_CONVERGED = 0, 3, 4  # as of a single fit
 _MOST_ROWS = 40
 _WIDEST = 24
 """characters of an axis's value"""
-_MOST_FAILURES = 10
-_NAMED = 3
-"""runs that are named of many"""
+_MOST_DOUBTS = 10
 
 
 def study_exit_code(result: "xr.Dataset") -> int:
@@ -164,17 +157,17 @@ def print_study(result: "xr.Dataset") -> None:
     if len(status) > _MOST_ROWS:
         tell(f"... and {len(status) - _MOST_ROWS} more")
     _print_scatter(flat, parameters)
-    for names, runs in _distrusted(flat).items():
-        more = f" and {len(runs) - _NAMED} more" if len(runs) > _NAMED else ""
-        tell(f"! Not trusted: {names} of {', '.join(runs[:_NAMED])}{more}")
-    pairs = zip(flat["run"].to_numpy(), flat["sentence"].to_numpy(), strict=True)
-    failures = [(str(run), str(words)) for run, words in pairs if words]
-    for run, sentence in failures[:_MOST_FAILURES]:
-        tell(f"! {run}: {sentence}")
-    if len(failures) > _MOST_FAILURES:
-        tell(
-            f"! ... and {len(failures) - _MOST_FAILURES} more that failed: `sentence` of study.zarr"
-        )
+    runs = [str(run) for run in flat["run"].to_numpy()]
+    untrusted, failed = (list(map(str, flat[n].to_numpy())) for n in ("untrusted", "sentence"))
+    doubts = [
+        f"{r}: not trusted: {names}" for r, names in zip(runs, untrusted, strict=True) if names
+    ]
+    doubts += [f"{run}: {words}" for run, words in zip(runs, failed, strict=True) if words]
+    for words in doubts[:_MOST_DOUBTS]:
+        tell(f"! {words}")
+    if len(doubts) > _MOST_DOUBTS:
+        more = len(doubts) - _MOST_DOUBTS
+        tell(f"! ... and {more} more: `untrusted` and `sentence` of study.zarr")
 
 
 def _axis(value: Any) -> str:
@@ -209,12 +202,3 @@ def _print_scatter(flat: "xr.Dataset", parameters: list[str]) -> None:
     if rows:
         head = ("parameter", "fits", "lowest", "median", "highest", "sd between fits")
         print_table((*head, "median sd of a fit", "unit"), rows)
-
-
-def _distrusted(flat: "xr.Dataset") -> dict[str, list[str]]:
-    """By the parameters whose intervals are not trusted the fits."""
-    by_names: dict[str, list[str]] = {}
-    for run, names in zip(flat["run"].to_numpy(), flat["untrusted"].to_numpy(), strict=True):
-        if names:
-            by_names.setdefault(str(names), []).append(str(run))
-    return by_names

@@ -25,11 +25,10 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Fit
 from heli_jax.identification.select import (
     Choice,
-    MethodComparison,
     choose,
     compare_methods,
 )
-from heli_jax.identification.uncertainty.comparison import Intervals, intervals
+from heli_jax.identification.uncertainty.comparison import intervals
 from heli_jax.report import files
 from heli_jax.report.files import SupplementaryAnalyses
 from heli_jax.stages import Note, recorded, stage
@@ -192,7 +191,8 @@ def _fit_run(
     with stage("recursive least squares", name="rls"):
         rls = _baseline(config, problem, fitted, progress)
     kept = None
-    if out is not None and _long_intervals(config):
+    asked = options.intervals
+    if out is not None and (asked.profile or asked.bootstrap or asked.nuts):
         kept = _keep(FitRun(config, problem, fitted, rls, began=began), Path(out), progress)
     try:
         further = _supplementary(config, problem, fitted, progress)
@@ -201,14 +201,6 @@ def _fit_run(
             shutil.rmtree(kept, ignore_errors=True)
         raise
     return FitRun(config, problem, fitted, rls, further, directory=kept, began=began)
-
-
-def _long_intervals(config: Experiment) -> bool:
-    """True if intervals are asked for that take longer than the fit."""
-    options = config.config.fit
-    assert options is not None
-    methods = options.intervals
-    return bool(methods.profile or methods.bootstrap or methods.nuts)
 
 
 def _keep(run: FitRun, out: Path, progress: Say) -> Path | None:
@@ -296,11 +288,9 @@ def _supplementary(
     """Further intervals and model selection, where the configuration asks for them."""
     options = config.config.fit
     assert options is not None
-    asked = options.intervals
-    further: Intervals | None = None
-    choice = methods = None
-    with located(f"{config.path}: fit"):
-        if asked.profile or asked.bootstrap or asked.nuts:
+    asked, further, choice, methods = options.intervals, None, None, None
+    if asked.profile or asked.bootstrap or asked.nuts:
+        with located(f"{config.path}: fit"):
             further = intervals(
                 fitted,
                 profiles=asked.profile,
@@ -315,24 +305,15 @@ def _supplementary(
             choice = compare_models(config, problem, progress=progress)
     if options.also:
         with stage("other methods"):
-            methods = _by_methods(config, problem, fitted, progress)
+            methods = compare_methods(
+                fitted,
+                configuration.by_other_methods(config, problem),
+                starts=options.starts,
+                seed=options.seed,
+                max_steps=options.max_steps,
+                progress=progress,
+            )
     return SupplementaryAnalyses(choice, further, methods=methods)
-
-
-def _by_methods(
-    config: Experiment, problem: Problem, fitted: Fit, progress: Say
-) -> MethodComparison:
-    """The same problem by the methods of `fit.also`."""
-    options = config.config.fit
-    assert options is not None
-    return compare_methods(
-        fitted,
-        configuration.by_other_methods(config, problem),
-        starts=options.starts,
-        seed=options.seed,
-        max_steps=options.max_steps,
-        progress=progress,
-    )
 
 
 def compare_models(

@@ -92,6 +92,7 @@ def test_a_directory_without_a_fit_is_refused_in_a_sentence(tmp_path):
         heli_jax.load_fit(tmp_path)
     for text in ("[]", "{", '{"status": "converged"}', '{"parameters": 1}'):
         (tmp_path / "fit.json").write_text(text)
+        (tmp_path / "signals.csv").write_text("t\n")
         with pytest.raises(InputError, match=r"fit\.json"):
             heli_jax.load_fit(tmp_path)
 

@@ -104,9 +104,12 @@ def load_fit(directory: str | Path) -> SavedFit:
         )
     data = read_regular(directory / "fit.json", "the fit.json of a run directory", _LIMIT_BYTES)
     table = directory / "signals.csv"
-    text = read_regular(table, "the signals.csv of a run directory", _LIMIT_BYTES)
     try:
-        return _saved(directory, checked(data), text.decode("utf-8"))
+        content = checked(data)
+        text = read_regular(table, "the signals.csv of a run directory", _LIMIT_BYTES)
+        return _saved(directory, content, text.decode("utf-8"))
+    except InputError:
+        raise
     # A key is missing or holds another kind, a row is cut off, a cell is no number.
     except (
         LookupError,

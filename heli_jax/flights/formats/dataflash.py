@@ -250,7 +250,10 @@ def make_log(
     topics = []
     for messages in topics_of:
         clock = _clock(messages, board)
-        topics += [_topic(each, clock) for each in _by_instance(messages)]
+        for each in _by_instance(messages):
+            kept = _in_order(each, clock)
+            damaged += each.at.size - kept.at.size
+            topics.append(_topic(kept, clock))
     require_samples(path, topics)
     notes = []
     if damaged:
@@ -337,6 +340,22 @@ def _by_instance(messages: _Messages) -> list[_Messages]:
         return [messages]
     name = messages.name
     return [messages.rows(numbers == i)._replace(name=f"{name}[{i}]") for i in counts]
+
+
+def _in_order(messages: _Messages, clock: str) -> _Messages:
+    """The messages without single ones whose time lies outside of those around them, as where a log
+    was cut off in a message: where the others are in order, and these are few."""
+    if not clock or messages.at.size < _FEWEST_ROWS:
+        return messages
+    times = messages.seconds(clock)
+    back = np.flatnonzero(np.diff(times) < 0) + 1
+    if not 0 < back.size <= max(1, times.size // 1000):
+        return messages
+    # A row before which the times go back is the wrong one, or the one before it is: whichever
+    # leaves the others in order.
+    wrong = [r if r + 1 == times.size or times[r + 1] >= times[r - 1] else r - 1 for r in back]
+    kept = np.delete(np.arange(times.size), wrong)
+    return messages.rows(kept) if np.all(np.diff(times[kept]) >= 0) else messages
 
 
 def _clocks(form: Format) -> tuple[str, ...]:

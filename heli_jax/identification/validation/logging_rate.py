@@ -72,6 +72,8 @@ class Modes(NamedTuple):
     B: np.ndarray
     C: np.ndarray
 
+    # An integrator has no end of its response to a step.
+    @np.errstate(divide="ignore", invalid="ignore")
     def strongest(
         self, k: int, problem: Problem, flight: Flight, noise: Mapping[str, Any]
     ) -> tuple[float, str, str]:
