@@ -123,7 +123,7 @@ def identifiability(records: int, seconds: float) -> str:
     flights = [record(100 + i, seconds) for i in range(records)]
     of = prepared(flights, fixed=tuple(n for n in FIXED if n != "Kr"))
     verdict = verdict_of(of.problem, of.layout, evaluate(of.layout, of.data, of.noise, of.z))
-    return "\n".join(f"- {sentence}" for sentence in verdict.sentences)
+    return verdict.text
 
 
 def main(fits: int, records: int, seconds: float, out: Path) -> None:

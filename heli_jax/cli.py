@@ -21,7 +21,7 @@ from heli_jax.interrupts import resumable
 from heli_jax.numbers import ADEQUATE
 from heli_jax.regular_file import read_regular
 from heli_jax.stages import Note
-from heli_jax.terminal import print_table, tell
+from heli_jax.terminal import print_table, tell, tell_table
 from heli_jax.versions import version
 
 if TYPE_CHECKING:
@@ -662,9 +662,9 @@ def _compare(options: argparse.Namespace) -> int:
     for number, row in zip(numbered.labels, compared.verdicts.rows, strict=True):
         label, model, method, status, verdict, adequate = row
         tell(f"{number}: {label}: {model} by {method}, {status}. {verdict} adequate: {adequate}")
-    print_table(numbered.estimates.head, list(numbered.estimates.rows))
+    tell_table(numbered.estimates)
     # Output, flights and metric are a row's name, where a narrow terminal parts the table too.
-    print_table(numbered.agreement.head, list(numbered.agreement.rows), keys=3)
+    tell_table(numbered.agreement, keys=3)
     for found in numbered.notes:
         tell(f"! {found.sentence}")
     if place is None:

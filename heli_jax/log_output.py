@@ -14,7 +14,6 @@ from heli_jax.finding import as_data
 from heli_jax.flights.clock import ROWS
 from heli_jax.flights.describe import ColumnInfo, LogInfo, TimeInfo, TopicInfo
 from heli_jax.flights.preset import fitting_presets
-from heli_jax.flights.vibration import LEAST, SMALLEST, RotorLines, line_words
 from heli_jax.numbers import terse
 from heli_jax.terminal import print_table, tell
 
@@ -27,8 +26,6 @@ _MOST_LINES = 10
 _MOST_FILTERS = 40
 _MOST_OF_BURST, _BURST = 200, 0.02
 """messages, and seconds within which they came, that are no signal with a rate"""
-_MOST_VIBRATIONS = 3
-"""of a channel"""
 
 
 def print_flights(
@@ -85,7 +82,6 @@ def _flight_content(flight: LogInfo) -> dict[str, Any]:
     whole |= {"duration": flight.duration, "notes": [as_data(n) for n in flight.notes]}
     # A table of rows is shown as a log of one topic, so that a script needs to know one shape.
     topics = flight.topics or (TopicInfo("", flight.n_rows, flight.time, flight.columns),)
-    whole["vibration"] = _vibration_content(flight.vibration)
     whole["topics"] = [_topic_content(topic) for topic in topics]
     return whole | {"filters": dict(flight.filters), "parameters": dict(flight.parameters)}
 
@@ -124,7 +120,6 @@ def _flight_lines(flight: LogInfo, count: int) -> Iterator[str]:
     fitting = fitting_presets(flight.format, [column.name for column in flight.columns])
     if fitting:
         yield f"preset: {', '.join(fitting)} (docs/logs.md)"
-    yield from _vibration_lines(flight.vibration)
 
 
 def _clock_lines(clock: TimeInfo | None) -> Iterator[str]:
@@ -142,8 +137,7 @@ def _clock_lines(clock: TimeInfo | None) -> Iterator[str]:
         unit = f" [{clock.unit}]"
         name = clock.column if clock.column.endswith(unit) else f"{clock.column}{unit}"
         if clock.counted is not None:
-            by = f" (by {clock.said})" if clock.said else ""
-            name = f"{'rows' if clock.column == ROWS else clock.column}{by}"
+            name = "rows" if clock.column == ROWS else clock.column
         yield (
             f"time: {name}, {terse(clock.duration, 6)} s at {terse(clock.rate, 6)} Hz, {uniform}"
         )
@@ -164,38 +158,6 @@ def _gap_words(clock: TimeInfo) -> str:
     if len(clock.gaps) == 1:
         return f"one gap of {longest:.4g} s"
     return f"{len(clock.gaps)} gaps, the longest {longest:.4g} s"
-
-
-def _vibration_lines(rotor: RotorLines | None) -> Iterator[str]:
-    if rotor is None:
-        return
-    if not rotor.signals:
-        yield f"rotor: {rotor.channel} is not steady for {LEAST:g} s, no lines are named"
-        return
-    yield (
-        f"rotor: {terse(rotor.hz)} Hz by {rotor.channel}, steady from {rotor.start:.4g} s to "
-        f"{rotor.end:.4g} s"
-    )
-    quiet = [each.channel for each in rotor.signals if not each.lines]
-    for each in rotor.signals:
-        for line in each.lines[:_MOST_VIBRATIONS]:
-            yield f"  {each.channel}: {line_words(line, rotor.hz)}"
-    if quiet:
-        yield f"  no line above {100 * SMALLEST:g} % of the variance: {', '.join(quiet)}"
-
-
-def _vibration_content(rotor: RotorLines | None) -> dict[str, Any] | None:
-    if rotor is None:
-        return None
-    signals = [
-        {
-            "signal": each.signal,
-            "channel": each.channel,
-            "lines": [line._asdict() | {"aliased": line.aliased} for line in each.lines],
-        }
-        for each in rotor.signals
-    ]
-    return rotor._asdict() | {"signals": signals}
 
 
 def _print_topics(topics: Sequence[TopicInfo]) -> None:

@@ -22,7 +22,7 @@ from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import is_low_passed
 from heli_jax.numbers import plain_words
 from heli_jax.stages import Note
-from heli_jax.terminal import print_table, tell
+from heli_jax.terminal import print_table, tell, tell_table
 from heli_jax.yaml_file import as_yaml
 
 _HOLDS = {
@@ -160,7 +160,8 @@ def run_responses(
     transfer functions, those of fits.
     """
     from heli_jax.report.responses import transfer_status, write_responses
-    from heli_jax.report.tables import handling_lines, handling_sentences
+    from heli_jax.report.tables import handling as handling_table
+    from heli_jax.report.tables import handling_sentences
 
     responses = responses_of_log(experiment, log, say)
     # Of axes that did not move nobody asked by name, and nothing is to be said.
@@ -182,8 +183,8 @@ def run_responses(
     for found in responses.notes:
         say(Note(found.sentence))
     print_responses(responses)
-    for line in handling_lines(handling):
-        tell(plain_words(line))
+    if handling:
+        tell_table(handling_table(handling))
     for sentence in (*handling_sentences(handling), *sentences(gaps)):
         tell(f"! {sentence}")
     say(f"wrote {out / 'responses.html'}")

@@ -17,7 +17,6 @@ from heli_jax.identification.fit import Check, Estimate
 from heli_jax.identification.frequency_start import FrequencyErrorStart
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.numbers import (
-    measured,
     percent,
     plain_cell,
     plain_words,
@@ -28,9 +27,8 @@ from heli_jax.report import tables as report_tables
 from heli_jax.report.card import card, summary
 from heli_jax.report.fit_page import lines
 from heli_jax.report.fitted_responses import NO_RESPONSES
-from heli_jax.report.tables import handling_lines
-from heli_jax.summaries import of_estimates
-from heli_jax.terminal import print_table, tell
+from heli_jax.summaries import cells_of, of_estimates
+from heli_jax.terminal import print_table, tell, tell_table
 from heli_jax.workflow import FitRun
 
 
@@ -42,13 +40,8 @@ def print_fit(run: FitRun, *, verbose: bool = False) -> None:
         tell(f"{line.word}: {line.text}")
     stopped = fit.status == "not-converged"
     head, rows = of_estimates({**fit.estimates, **_shown_nuisances(fit.nuisance)}, stopped=stopped)
-    # Where no optimum was reached nothing is determined.
-    determined = [
-        (c.name, value, sd, f"{low} to {high}", "", "")
-        for c in (() if stopped else fit.verdict.combinations)
-        for value, low, high, sd in [measured(c.sd, c.value, c.lower95, c.upper95)]
-    ]
-    _tell_table(report_tables.Table((*head[:3], fit.interval, *head[4:]), [*rows, *determined]))
+    determined = [(c.name, *cells_of(c), "", "") for c in report_tables.determined(fit)]
+    tell_table(report_tables.Table((*head[:3], fit.interval, *head[4:]), [*rows, *determined]))
     print_findings(fit.findings, verbose=verbose)
     if verbose:
         _print_details(run)
@@ -60,30 +53,29 @@ def _print_details(run: FitRun) -> None:
     """Agreement by output, responses, acceptance card, and what the configuration asks for beside
     the fit."""
     problem, fit, supplementary = run.problem, run.fit, run.supplementary
-    if note := report_tables.prior_note(problem, fit):
-        tell(f"! {note}")
     if supplementary.intervals is not None:
         table = report_tables.intervals(supplementary.intervals, fit)
-        _tell_table(table)
+        tell_table(table)
         for sentence in supplementary.intervals.sentences:
             tell(f"! {sentence}")
     if supplementary.methods is not None:
         side_by_side = report_tables.methods(supplementary.methods)
-        _tell_table(side_by_side)
+        tell_table(side_by_side)
         for sentence in supplementary.methods.sentences:
             tell(f"! {sentence}")
-    _tell_table(report_tables.agreement(fit, None))
+    tell_table(report_tables.agreement(fit, None))
     if (held := report_tables.held_out_flights(fit.held_out_frequency)) is not None:
-        _tell_table(held)
+        tell_table(held)
     _print_handling(run)
     if (responses := report_tables.responses(fit.responses)) is not None:
-        _tell_table(responses)
+        tell_table(responses)
     if problem.first_guess is not None:
         _print_first_guess(problem.first_guess)
-    tell(plain_words(f"acceptance card: {summary(card(problem, fit), _GATES)}"))
+    gates = card(problem, fit, supplementary.responses)
+    tell(plain_words(f"acceptance card: {summary(gates, _GATES)}"))
     if supplementary.choice is not None:
         compared = report_tables.choice(supplementary.choice)
-        _tell_table(compared)
+        tell_table(compared)
         for sentence in supplementary.choice.sentences:
             tell(sentence)
     if run.baseline is not None:
@@ -116,8 +108,8 @@ def _print_handling(run: FitRun) -> None:
         for found in run.supplementary.responses.notes:
             if found.code == NO_RESPONSES:
                 tell(f"! {found.sentence}")
-    for line in handling_lines(run.supplementary.responses.handling):
-        tell(plain_words(line))
+    if handling := run.supplementary.responses.handling:
+        tell_table(report_tables.handling(handling))
     logged = {n for f in run.problem.training for n in f.outputs}
     for found in missing_handling(run.config, logged):
         tell(f"! {found.sentence}")
@@ -139,15 +131,7 @@ def print_compatibility(result: Compatibility) -> None:
 
 def _print_first_guess(guess: EquationErrorStart | FrequencyErrorStart) -> None:
     tell(f"Where the fit began, by {report_tables.start_method(guess)} (no result):")
-    for table in (report_tables.first_guess(guess), report_tables.selection_steps(guess)):
-        if table.rows:
-            _tell_table(table)
-
-
-def _tell_table(table: report_tables.Table) -> None:
-    """A table of the page, its numbers and units in ASCII as all of the terminal's."""
-    rows = [tuple(plain_cell(cell) for cell in row) for row in table.rows]
-    print_table(table.head, rows)
+    tell_table(report_tables.first_guess(guess))
 
 
 _MOST_OFFSETS = 4

@@ -105,19 +105,30 @@ def of_estimates(
     head = ("parameter", "estimate", "sd", "95 % interval", "unit", "prior share")
     rows = []
     for name, e in estimates.items():
-        # A parameter that is not identifiable keeps its value in fit.json; a number here would be
-        # read as an estimate.
-        cells = ("not determined", "", "")
-        if stopped and math.isfinite(e.value):
-            cells = (f"{number(e.value, 3)} (no result)", "", "")
-        elif not stopped and e.sd is not None and math.isfinite(e.sd):
-            # To the digits that the sd leaves, all four alike.
-            value, low, high, sd = measured(e.sd, e.value, e.lower95, e.upper95)
-            untrusted = e.lower95 is None or e.upper95 is None
-            interval = "not trusted" if untrusted else f"{low} to {high}"
-            cells = (f"{value}{' (at bound)' * e.at_bound}", sd, interval)
-        rows.append((name, *cells, e.unit, percent(e.prior_share, 0)))
+        value, *others = cells_of(e, stopped=stopped)
+        bound = " (at bound)" if e.at_bound and any(others) else ""
+        rows.append((name, value + bound, *others, e.unit, percent(e.prior_share, 0)))
     return head, tuple(rows)
+
+
+NOT_DETERMINED = "not determined"
+
+
+def cells_of(e: Any, *, stopped: bool = False) -> tuple[str, str, str]:
+    """Value, sd and 95 % interval of an estimate or a combination; the last two are empty where it
+    is not determined, or the fit stopped before an optimum.
+    """
+    if stopped:
+        known = math.isfinite(e.value)
+        return f"{number(e.value, 3)} (no result)" if known else NOT_DETERMINED, "", ""
+    # What is not identifiable keeps its value in fit.json; a number here would be read as an
+    # estimate.
+    if e.sd is None or not math.isfinite(e.sd):
+        return NOT_DETERMINED, "", ""
+    # To the digits that the sd leaves, all four alike.
+    value, low, high, sd = measured(e.sd, e.value, e.lower95, e.upper95)
+    untrusted = e.lower95 is None or e.upper95 is None
+    return value, sd, "not trusted" if untrusted else f"{low} to {high}"
 
 
 def of_fit(fit: Any) -> Summary:

@@ -77,7 +77,7 @@ def run_sweep(
         )
     if figures and out is not None:
         carrying.say("drawing figures")
-        _draw_sweep(out, dataset, job, carrying.say)
+        _draw_sweep(out, dataset, carrying.say)
     return dataset
 
 
@@ -89,13 +89,12 @@ def _sweep_job(config: Experiment) -> "Job":
     return sweep_job(*generate.drive(config)) if simulates(config) else sweep_job(config)
 
 
-def _draw_sweep(out: Path, dataset: "xr.Dataset", job: "Job", say: Callable[[str], None]) -> None:
+def _draw_sweep(out: Path, dataset: "xr.Dataset", say: Callable[[str], None]) -> None:
     """The figures of a sweep; what they leave out is said."""
     from heli_jax.report.sweeps import RESULTS, results, write_figures, write_page
-    from heli_jax.sweeps.summary import worst
 
     try:
-        write_figures(out / "figures", dataset, worst(dataset, job))
+        write_figures(out / "figures", dataset)
         with run_directory.whole_file(out / "report.html", f"--out {out}: report.html") as page:
             write_page(page, out, out.name)
     except OSError as e:  # the results are safe in the store by now

@@ -16,7 +16,7 @@ from typing import Any, TextIO
 
 from heli_jax import stages
 from heli_jax.errors import shortened
-from heli_jax.numbers import terminal_sentence
+from heli_jax.numbers import plain_cell, terminal_sentence
 from heli_jax.stages import Note, Stage
 
 type _Row = tuple[str, ...]
@@ -100,6 +100,13 @@ def print_table(head: _Row, rows: Sequence[_Row], *, keys: int = 1) -> None:
     )
     console.print(table)
     print("\n".join(line.rstrip() for line in text.getvalue().splitlines()))
+
+
+# Any: a table of the page, a NamedTuple of head and rows.
+def tell_table(table: Any, keys: int = 1) -> None:
+    """A table of the page, its numbers and units in ASCII as all of the terminal's; `keys` as of
+    `print_table`."""
+    print_table(table.head, [tuple(map(plain_cell, row)) for row in table.rows], keys=keys)
 
 
 def say(text: str) -> None:

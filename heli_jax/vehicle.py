@@ -222,6 +222,11 @@ def vehicle_from_mapping(
     known = naming.names(params)
     constants = {}
     require_known(content, known, where, "unknown constant")
+    values = {n: e.get("value") if isinstance(e, Mapping) else e for n, e in content.items()}
+    stands = [n for n, value in values.items() if value == EDIT]
+    if stands:
+        asked = ", ".join(f"{n} in {naming.unit(params, n) or '1'}" for n in stands)
+        raise InputError(f"{where}: is still {EDIT}, expected numbers of {asked}")
     for name, entry in content.items():
         constants[name] = constant(entry, name, naming.unit(params, name), where)
     lacking = [n for n in known if n not in constants and n not in naming.defaults(params)]
@@ -260,8 +265,6 @@ def constant(entry: Any, name: str, si: str | None, where: str) -> Constant:
             raise InputError(f"{place}: expected a number under value, got none")
         unit, source = str(entry.get("unit", unit)), str(entry.get("source", ""))
         entry = entry["value"]
-    if entry == EDIT:
-        raise InputError(f"{place}: is still {EDIT}, expected its value in {unit}")
     # YAML's true is a bool, which Python counts among the integers.
     if isinstance(entry, bool) or not isinstance(entry, int | float):
         raise InputError(f"{place}: expected a number, got {entry!r:.40}")

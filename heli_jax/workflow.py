@@ -65,7 +65,7 @@ class FitRun:
     # matplotlib's classes are named in `report` alone.
     def figure(self, name: str) -> Any:
         """A figure of the report, drawn anew, as a matplotlib Figure: `response_OUTPUT`,
-        `match_OUTPUT-INPUT`, `starts`, ...
+        `match_OUTPUT-INPUT`, `rls`, ...
 
         Raises:
             ValueError: the report has no figure of that name; the sentence lists those it has.

@@ -7,14 +7,13 @@ import numpy as np
 
 from heli_jax import linearize, naming
 from heli_jax.analysis.operating_point import EVERYWHERE, OperatingPoint
-from heli_jax.report.frequency import linear_matrices
 
 
 def continuous(
     model: Any, params: Any, output: str, input: str, at: OperatingPoint = EVERYWHERE
 ) -> Callable[[np.ndarray], np.ndarray]:
     """H(i omega) from an input to an output, with the input's delay."""
-    A, B, C, D = linear_matrices(model, params, at)
+    A, B, C, D = (np.asarray(M) for M in linearize(model, params, at.state, at.inputs).matrices)
     i, j = naming.names(model.Outputs).index(output), naming.names(model.Inputs).index(input)
     delay = dict(model.delays).get(input)
     late = 0.0 if delay is None else float(np.asarray(getattr(params, delay)))

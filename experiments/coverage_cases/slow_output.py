@@ -33,7 +33,7 @@ def _flight(seed: int, interpolated: bool) -> Flight:
     at = 200 * np.arange(1, 149) + rng.integers(-20, 21, 148)
     roll, grid = made[0][at] + NOISE * rng.standard_normal(at.size), DT * np.arange(N)
     slow = Timed(at * DT / FINE, roll)
-    samples = at_nearest(slow, grid).samples
+    samples = at_nearest(slow, grid)
     if interpolated:
         samples = np.interp(grid, *slow, left=np.nan, right=np.nan)
     rate = made[1][::FINE] + RATE_NOISE * rng.standard_normal(N)

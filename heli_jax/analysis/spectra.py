@@ -17,8 +17,6 @@ from jaxtyping import Array, Complex, Float
 
 from heli_jax.flights.flight import Flight
 
-_NO_POWER = 1e-20
-"""of a signal's power: less is what rounding leaves where others explain all of it"""
 OWN = 10.0
 """times what the window's sidelobes bring, from which on a spectrum is the signal's own"""
 OVERLAP = 2.0 / 3.0
@@ -94,45 +92,6 @@ def segment_transforms(signals: Float[np.ndarray, "c N"], dt: float, length: int
     omega = 2.0 * np.pi * np.fft.rfftfreq(length, dt)
     averages = _independent(window, length - length // 2, X.shape[1])
     return Spectra(omega, X, averages, length * dt)
-
-
-def partial_coherence(others: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Coherence (k,) of u and y where what the other inputs explain of both is taken out.
-
-    NaN where nothing is left of either. All are Fourier transforms of segments at k frequencies.
-
-    Args:
-        others: (k, segments, inputs); with no inputs the result is the ordinary coherence.
-        u: (k, segments)
-        y: (k, segments)
-
-    Source: Bendat and Piersol, Random Data (2010), chapter 7.
-    """
-    # A coherence with the other inputs left in would count theirs as noise, and as u's own where
-    # the pilot moves two sticks together.
-    # A coherence has no size, and the squares of a simulation that diverged have none in numbers.
-    u, y = u / size_of(u), y / size_of(y)
-    left_u, left_y = without(others, u), without(others, y)
-    uu, yy = np.sum(np.abs(left_u) ** 2, axis=1), np.sum(np.abs(left_y) ** 2, axis=1)
-    uy = np.abs(np.sum(np.conj(left_u) * left_y, axis=1)) ** 2
-    enough = uu > _NO_POWER * np.sum(np.abs(u) ** 2, axis=1)
-    enough &= yy > _NO_POWER * np.sum(np.abs(y) ** 2, axis=1)
-    return np.where(enough, uy / np.where(enough, uu * yy, 1.0), np.nan)
-
-
-def size_of(x: np.ndarray) -> float:
-    """The largest number, by which what hangs on no unit may be divided; 1 where there is none."""
-    size = float(np.max(np.abs(x), initial=0.0))
-    return size if size > 0 and np.isfinite(size) else 1.0
-
-
-def without(others: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """x (k, segments) less its projection on the others (k, segments, inputs)."""
-    if not others.shape[2]:
-        return x
-    # The pseudoinverse: two sticks that move as one have no unique gains, but a projection.
-    gains = np.linalg.pinv(others) @ x[:, :, None]
-    return x - (others @ gains)[:, :, 0]
 
 
 def octave_mean(

@@ -234,8 +234,10 @@ def _validated(content: dict[str, Any], where: str) -> Config:
         errors = sorted(e.errors(), key=_of_least_use)
         raise InputError(f"{where}: {_sentence(errors[0])}") from None
     # Where a text may stand it would be a channel's name, or a unit.
-    if place := next(_still_to_edit(content), None):
-        raise InputError(f"{where}: {_edit_words(place)}")
+    if places := list(_still_to_edit(content)):
+        others = ", ".join(map(_place, places[1:]))
+        more = f"; {EDIT} stands also at {others}" if others else ""
+        raise InputError(f"{where}: {_edit_words(places[0])}{more}")
     return config
 
 

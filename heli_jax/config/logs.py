@@ -34,10 +34,9 @@ from heli_jax.flights import Also, Flight, Signal, read_flight, read_parts
 from heli_jax.flights.clock import by_rate
 from heli_jax.flights.convert import Selection
 from heli_jax.flights.flight import Source
-from heli_jax.flights.log import ChannelLog
+from heli_jax.flights.log import ChannelLog, Table
 from heli_jax.flights.preset import Named, NamedBy
 from heli_jax.flights.request import taken_note
-from heli_jax.flights.table import Table
 from heli_jax.identification.methods import objective_of
 
 _PULSE = (800.0, 2200.0)

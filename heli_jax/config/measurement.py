@@ -17,10 +17,9 @@ from heli_jax.dynamics.onboard.filters import Filter, cutoff, gain, with_filters
 from heli_jax.errors import InputError, located, nearest
 from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight, Source
-from heli_jax.flights.log import ChannelLog
+from heli_jax.flights.log import ChannelLog, Table, shown
 from heli_jax.flights.open_log import open_log
 from heli_jax.flights.signal_facts import quantum
-from heli_jax.flights.table import Table, shown
 from heli_jax.identification.defaults import filtered_noise
 from heli_jax.numbers import percent
 

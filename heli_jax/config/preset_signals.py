@@ -11,7 +11,7 @@ from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, require_known
 from heli_jax.finding import Finding, note
 from heli_jax.flights.derived import CCPM
-from heli_jax.flights.log import ChannelLog
+from heli_jax.flights.log import ChannelLog, Table, shown, wrong
 from heli_jax.flights.preset import (
     Alternative,
     ModelSignal,
@@ -22,7 +22,6 @@ from heli_jax.flights.preset import (
     preset,
     presets,
 )
-from heli_jax.flights.table import Table, shown, wrong
 
 _STICKS = {"rate_loop": ("lat", "lon", "x_roll", "x_pitch"), "gyro": ("ped", "x_yaw")}
 """what a rate loop and a gyro stand behind unless the configuration names it"""

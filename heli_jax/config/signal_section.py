@@ -6,8 +6,7 @@ from pydantic import Field, model_validator
 
 from heli_jax.config.section import Section
 from heli_jax.flights.derived import Swashplate
-from heli_jax.flights.flight import Signal
-from heli_jax.flights.origins import scale_problem
+from heli_jax.flights.flight import Signal, scale_problem
 from heli_jax.flights.preset import preset, presets
 
 _Finite = Annotated[float, Field(allow_inf_nan=False)]

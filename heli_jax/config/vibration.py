@@ -14,7 +14,7 @@ from heli_jax.config.schema import FlightConfig
 from heli_jax.errors import InputError, located
 from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
-from heli_jax.flights.onto_grid import FEWEST
+from heli_jax.flights.request import FEWEST
 from heli_jax.flights.vibration import (
     folded,
     line_words,

@@ -46,7 +46,8 @@ def check_params(params: type, vehicle: Any) -> None:
         )
     if not all(hasattr(vehicle, name) for name in naming.names(params)):
         raise TypeError(
-            f"vehicle: expected the model's {params.__name__}, got {type(vehicle).__name__}"
+            f"vehicle: expected the model's {params.__name__}, got {type(vehicle).__name__}; "
+            "model.Params(**heli_jax.naming.asdict(vehicle), NAME=value) adds what is missing"
         )
 
 

@@ -11,7 +11,7 @@ the signal gives, and the spectrum of what is left (L. Ljung, System Identificat
 9.4; with white errors it is the Cramer-Rao bound of a delay).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,7 +27,8 @@ _SHARE = 0.3
 """of the shorter signal that the two overlap by, at least"""
 _FEWEST = 40
 """common samples at least"""
-_STEPS = 30
+_REACH = 3.0
+"""steps from the best shift, within which the lag is"""
 
 
 class Lag(NamedTuple):
@@ -66,8 +67,7 @@ def lag_between(a: Timed, b: Timed) -> Lag:
     lag = at_a - at_b + shift * step
     first, last = max(0, shift), min(even_a.size, even_b.size + shift)
     x, t = even_a[first:last], at_a + step * np.arange(first, last)
-    y = _Smooth(at_b, even_b, step)
-    lag, sd = _refined(t, x, y, lag, step)
+    lag, sd = _refined(t, x, at_b, even_b, lag, step)
     return Lag(lag + first_a - first_b, sd, correlation, (last - first - 1) * step)
 
 
@@ -171,72 +171,57 @@ def correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.where(enough, (sums(x, y) / n - mean_a * mean_b) / np.where(size > 0, size, 1), 0.0)
 
 
-class _Smooth:
-    """Even samples as a smooth function of time, with its first two derivatives."""
-
-    def __init__(self, first: float, samples: np.ndarray, step: float) -> None:
-        from scipy.interpolate import CubicSpline
-
-        seen = np.isfinite(samples)
-        t = first + step * np.arange(samples.size)
-        self._spline = CubicSpline(t[seen], samples[seen])
-        self._t, self._seen, self._step = t, seen, step
-
-    def at(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Value and first two derivatives at times (n,); NaN beside what is missing."""
-        i = np.floor((t - self._t[0]) / self._step + 1e-9).astype(np.int64)
-        inside = (i >= 0) & (i < self._seen.size - 1)
-        i = np.clip(i, 0, self._seen.size - 2)
-        known = inside & self._seen[i] & self._seen[i + 1]
-        value, slope, bend = (np.where(known, self._spline(t, k), np.nan) for k in range(3))
-        return value, slope, bend
-
-
 def _refined(
-    t: np.ndarray, x: np.ndarray, y: _Smooth, lag: float, step: float
+    t: np.ndarray, x: np.ndarray, first: float, samples: np.ndarray, near: float, step: float
 ) -> tuple[float, float]:
-    """The lag of least squares from a near one, and its standard deviation, both [s]."""
-    begun = lag
-    for _ in range(_STEPS):
-        slope, bend, left = _linearised(t, x, y, lag)
-        # Newton's: the slope of the sum of squares over its curvature. Where noise makes that
-        # negative the plain Gauss-Newton step does not fail.
-        curvature = float(slope @ slope - left @ bend)
-        curvature = curvature if curvature > 0.1 * float(slope @ slope) else float(slope @ slope)
-        # The model falls as the lag grows: its derivative is minus the slope.
-        move = float(np.clip(-(left @ slope) / curvature, -0.5 * step, 0.5 * step))
-        lag += move
-        if abs(lag - begun) > 3.0 * step:
-            raise NotAligned("the lag is not told by the sum of squares, which has no minimum near")
-        if abs(move) < 1e-7 * step:
-            break
-    slope, bend, left = _linearised(t, x, y, lag)
-    curvature = float(slope @ slope - left @ bend)
-    if not curvature > 0:
+    """The lag of least squares, and its standard deviation, both [s].
+
+    Args:
+        t: times of x [s].
+        x: the first signal (n,), NaN where it is missing, and so are others.
+        first: time [s] of the first of the second signal's `samples` (M,), a `step` [s] apart.
+        near: a lag within a step or two of it.
+    """
+    from scipy.interpolate import CubicSpline
+    from scipy.optimize import least_squares
+
+    there = np.isfinite(samples)
+    smooth = CubicSpline((first + step * np.arange(samples.size))[there], samples[there])
+
+    def linearised(lag: float) -> np.ndarray:
+        """Return what the model leaves of x, and its derivative by the lag (2, n); zero where one
+        of the two signals is missing. Scale, bias and drift are taken out of both."""
+        i = np.floor((t - lag - first) / step + 1e-9).astype(np.int64)
+        inside = (i >= 0) & (i < there.size - 1)
+        i = np.clip(i, 0, there.size - 2)
+        seen = inside & there[i] & there[i + 1] & np.isfinite(x)
+        if seen.sum() < _FEWEST:
+            raise NotAligned("they overlap by too little")
+        at = t[seen] - lag
+        others = np.stack([smooth(at), np.ones(at.size), at - at.mean()], axis=1)
+        both = np.stack([x[seen], smooth(at, 1)], axis=1)
+        gains = np.linalg.lstsq(others, both, rcond=None)[0]
+        left, slope = (both - others @ gains).T
+        whole = np.zeros((2, t.size))
+        # The model falls as the lag grows.
+        whole[:, seen] = left, gains[0, 0] * slope
+        return whole
+
+    # Counted in steps from the near one: an epoch's digits would cost those of the lag. Any: the
+    # stubs know no function here.
+    jacobian: Any = lambda z: step * linearised(near + z[0] * step)[1][:, None]  # noqa: E731
+    found = least_squares(
+        lambda z: linearised(near + z[0] * step)[0],
+        [0.0],
+        jac=jacobian,
+        bounds=([-_REACH], [_REACH]),
+    )
+    lag = near + float(found.x[0]) * step
+    left, slope = linearised(lag)
+    curvature = float(slope @ slope)
+    if abs(found.x[0]) > 0.999 * _REACH or not curvature > 0:
         raise NotAligned("the lag is not told by the sum of squares, which has no minimum near")
     return lag, float(np.sqrt(t.size * _long_run(slope * left)) / curvature)
-
-
-def _linearised(
-    t: np.ndarray, x: np.ndarray, y: _Smooth, lag: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Slope and second derivative of the model by time, and what it leaves of x, each (n,), zero
-    where one of the two is missing.
-
-    Scale, bias and drift are taken out of slope and rest, as least squares does.
-    """
-    value, slope, bend = y.at(t - lag)
-    seen = np.isfinite(value) & np.isfinite(x)
-    if seen.sum() < _FEWEST:
-        raise NotAligned("they overlap by too little")
-    others = np.stack([value, np.ones(t.size), t - t.mean()])[:, seen].T
-    gains, *_ = np.linalg.lstsq(others, x[seen], rcond=None)
-    left = x[seen] - others @ gains
-    slope = gains[0] * slope[seen]
-    slope = slope - others @ np.linalg.lstsq(others, slope, rcond=None)[0]
-    whole = np.zeros((3, t.size))
-    whole[:, seen] = slope, gains[0] * bend[seen], left
-    return whole[0], whole[1], whole[2]
 
 
 def _long_run(v: np.ndarray) -> float:

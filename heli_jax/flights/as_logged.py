@@ -1,4 +1,4 @@
-"""First corrections of logged signals: marks for missing values, and turns of angles.
+"""Signals as they were logged, without marks for missing values and turns of angles; their facts.
 
 Both would be spread over their neighbours by any filter or straight line: a -9999 that stands for
 no value, and the jump of an angle from 180 deg to -180 deg.
@@ -11,21 +11,21 @@ import numpy as np
 
 from heli_jax import units
 from heli_jax.finding import Finding, note
-from heli_jax.flights.flight import Signal, Source
+from heli_jax.flights.flight import Signal
+from heli_jax.flights.log import column, shown, wrong
 from heli_jax.flights.marks import (
     at_marks,
-    counted,
     mark_words,
+    marks_note,
     stray_words,
     strays,
     without_marks,
 )
-from heli_jax.flights.onto_grid import FEWEST, Key
-from heli_jax.flights.request import Request
+from heli_jax.flights.request import FEWEST, Key, Request
 from heli_jax.flights.resample import Timed
 from heli_jax.flights.signal_facts import SignalFacts, facts_of_all
-from heli_jax.flights.table import column, shown, wrong
 
+_MISSING = "taken as missing"
 _JUMP = (0.75, 1.001)
 """of a turn: by how much a wrapped angle jumps from a sample to the next, at least and at most"""
 _STEP = 0.125
@@ -34,8 +34,6 @@ _TURNS = (360.0, 2 * np.pi, 36000.0)
 """degrees, radians, hundredths of a degree"""
 _NEARLY = 0.9
 """turns that an angle of no stated unit has to go over"""
-_TURN = 1.001
-"""turns that a wrapped angle goes over, at most; its ends may be rounded"""
 _DIGITS, _TINY = 1e-9, 1e-6
 """of a number that is compared with one that was stated, and the smallest that counts"""
 
@@ -51,48 +49,37 @@ class AsLogged:
     facts: dict[Key, SignalFacts]
     notes: tuple[Finding, ...]
 
-    def source(self, source: Source, begin: float, end: float) -> Source:
-        """Return the source of a flight from `begin` to `end` [s] on the signals' clocks, with
-        their facts."""
-        facts = {key: f.within(begin, end) for key, f in self.facts.items()}
-        return replace(source, facts=facts)
-
 
 @np.errstate(over="ignore", invalid="ignore")  # differences of huge values
 def as_logged(request: Request, signals: Mapping[Key, Timed]) -> AsLogged:
     """The signals without marks and turns, and what they were."""
     made, odd, notes = {}, {}, []
-    for key, timed in signals.items():
+    for key, (seconds, values) in signals.items():
         signal, name = request.signals[key], shown(request.signals[key].name)
-        numbers = signal.from_si(timed.values)
+        numbers = signal.from_si(values)
         stated = _at_stated(signal, numbers)
         if stated.any():
-            values, words = _without(timed.values, stated, key[1])
+            values, words = _without(values, stated, key[1])
             count = int(np.count_nonzero(stated))
             notes.append(note("samples.missing-as-stated", f"{name} {words}", key[0], value=count))
-            timed = timed._replace(values=values)
             numbers = signal.from_si(values)
-        at = at_marks(numbers)
-        if at.any():
-            words = mark_words(counted(numbers[at]), int(np.sum(~np.isnan(numbers))))
+        if (at := at_marks(numbers)).any():
             if key[1] == "input":
-                first = float(timed.seconds[np.flatnonzero(at)[0]])
-                problem = f"has {words}, first at {first:.6g} s"
+                problem = f"has {mark_words(numbers, at)}, first at {seconds[np.argmax(at)]:.6g} s"
                 remedy = "expected an input that is known all the time; give a window without them"
                 raise wrong(request.path, f"{problem}; {remedy}", column(signal.name))
-            words = f"{name} has {words}: taken as missing"
-            notes.append(note("samples.marks", words, key[0], value=int(np.count_nonzero(at))))
-        values = np.where(at, np.nan, timed.values)
+            notes.append(marks_note(name, numbers, at, _MISSING, key[0]))
+            values = np.where(at, np.nan, values)
         turn = units.turn(signal.si)
         if turn is not None and is_wrapped(values, turn):
             values, unwrapping = unwrapped(values, turn, name)
             notes.append(unwrapping)
         # Behind the turns: a heading of about 180 deg may be -180 deg for a sample.
-        odd[key] = strays(timed.seconds, signal.from_si(values), key[1])
+        odd[key] = strays(seconds, signal.from_si(values), key[1])
         for s in odd[key]:
             words = f"{name} has {stray_words(s)}: kept as measured"
             notes.append(note("samples.stray-kept", words, key[0], value=s.values.size))
-        made[key] = Timed(timed.seconds, values)
+        made[key] = Timed(seconds, values)
     outputs = frozenset(key for key in made if key[1] == "output")
     facts = facts_of_all({key: (t.seconds, t.values) for key, t in made.items()}, outputs)
     facts = {key: replace(f, strays=odd[key]) for key, f in facts.items()}
@@ -132,15 +119,12 @@ def measured(signal: Signal, values: np.ndarray) -> np.ndarray:
 def without_marks_and_turns(name: str, numbers: np.ndarray) -> tuple[np.ndarray, list[Finding]]:
     """Numbers (N,) of a log whose unit nobody states, with marks as missing and angles unwrapped
     that are surely some, and what was done; `name` is the channel's, as it is shown."""
-    notes, at = [], at_marks(numbers)
-    if at.any():
-        size = int(np.sum(~np.isnan(numbers)))
-        words = f"{name} has {mark_words(counted(numbers[at]), size)}: taken as missing"
-        notes.append(note("samples.marks", words, value=int(np.count_nonzero(at))))
+    notes = []
+    if (at := at_marks(numbers)).any():
+        notes.append(marks_note(name, numbers, at, _MISSING))
         numbers = np.where(at, np.nan, numbers)
     for turn in _TURNS:
-        y = numbers[np.isfinite(numbers)]
-        if y.size and np.ptp(y) > _NEARLY * turn and is_wrapped(numbers, turn):
+        if is_wrapped(numbers, turn):
             after, unwrapping = unwrapped(numbers, turn, name)
             steps = np.abs(np.diff(after[np.isfinite(after)]))
             # Beside its jumps it goes through all of a turn by small steps: a mode or a switch
@@ -153,7 +137,7 @@ def without_marks_and_turns(name: str, numbers: np.ndarray) -> tuple[np.ndarray,
 def is_wrapped(values: np.ndarray, turn: float) -> bool:
     """True if an angle (N,) jumps by a turn at the ends of its range, and never leaves it."""
     y = values[np.isfinite(values)]
-    if y.size < FEWEST or not np.ptp(y) <= _TURN * turn:
+    if y.size < FEWEST or not np.ptp(y) <= _JUMP[1] * turn:
         return False
     jumps = np.abs(np.diff(y)) / turn
     wraps = (jumps >= _JUMP[0]) & (jumps <= _JUMP[1])
@@ -163,17 +147,12 @@ def is_wrapped(values: np.ndarray, turn: float) -> bool:
 
 def unwrapped(values: np.ndarray, turn: float, name: str) -> tuple[np.ndarray, Finding]:
     """An angle (N,) without its jumps of a turn, and what was done."""
-    seen = np.isfinite(values)
-    before = values[seen]
-    after = np.unwrap(before, period=turn)
-    made = np.array(values)
-    made[seen] = after
-    n = int(np.count_nonzero(np.abs(np.diff(after) - np.diff(before)) > 0.5 * turn))
+    made, seen = np.array(values), np.isfinite(values)
+    made[seen] = np.unwrap(values[seen], period=turn)
+    moved = np.diff(made[seen]) - np.diff(values[seen])
+    n = int(np.count_nonzero(np.abs(moved) > 0.5 * turn))
     often = "once" if n == 1 else f"{n} times"
     words = (
         f"{name} jumps by a turn {often}, at the ends of its range: taken as going on (unwrapped)"
     )
-    unsure = int(np.count_nonzero(np.abs(np.diff(after)) > (1 - _JUMP[0]) * turn))
-    if unsure:
-        words += f"; {unsure} steps of more than a quarter of a turn remain, and may be wrong"
     return made, note("angles.unwrapped", words, value=n)

@@ -5,71 +5,177 @@ each run, or a column numbers them, the runs are put one after another with some
 a gap, at which they become flights.
 """
 
+import datetime
 import math
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import PurePath
 
 import numpy as np
 
 from heli_jax import units
-from heli_jax.errors import InputError, nearest
+from heli_jax.errors import nearest
 from heli_jax.finding import Finding, note
 from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.grid import not_increasing, shared_stamps, without_overflow
-from heli_jax.flights.log import holds_commands
-from heli_jax.flights.table import (
+from heli_jax.flights.log import (
     Survey,
     Table,
-    TableView,
     column,
     listed,
     require_columns,
     shown,
     wrong,
 )
-from heli_jax.flights.time_units import (
-    LETTERS,
-    SECONDS,
-    TIME_NAMES,
-    likely_unit,
-    split_unit,
-    time_unit,
-)
 
 ROWS = "row number"
 """what the numbers of rows are called, from 0, as a column"""
-COUNTS_ROWS = "clock.counts-rows"
-"""code of a column that might be taken for a clock"""
-_SAMPLED = "timestamp_sample"
-"""of a topic of PX4, beside `timestamp`, when it was published"""
-_PACKETS = {"frame", "frames", "seq", "sequence", "index", "idx", "packet", "row", "iteration"}
-"""counts of which only each second or tenth may be of the samples at hand, as where packets of
-several sensors are counted together"""
-_COUNTERS = {
-    *("sample", "samples", "count", "counter", "id", "no", "nr", "number", "n", "tick", "axis"),
-    *("line", *_PACKETS),
-}
-_OTHERS = {"freq", "freqs", "frequency", "frequencies", "hz", "distance", "dist", "address"}
-"""what may increase along a table all the same, as the frequencies of a response"""
-_STEPS, _RATES = {"ts", "dt", "tsample", "tsamp", "tsampling"}, {"fs", "hz"}
-_OF_SAMPLES = {"sample", "samples", "sampling", "time"}
-_STEP_WORDS, _RATE_WORDS = {"time", "step", "period", "interval"}, {"rate", "freq", "frequency"}
-_OTHER_RATE = 0.01
-"""by which a stated rate differs from that of the times at least: less is a clock's own error"""
-_FASTEST, _SLOWEST = 1e5, 0.2
-"""Hz: no record of a flight is outside of these"""
 _BETWEEN = 10.0
 """s between two runs, which no gap that is bridged is long"""
 _SHORTEST = 20
 """rows of a run"""
 _BEGINNING = 0.1
 """part of the run before, in which the next begins: a stamp that goes back is no new run"""
-_RUN_NAMES = {
-    *("run", "runs", "segment", "seg", "maneuver", "manoeuvre", "experiment", "exp", "trial"),
-    *("test", "record", "repetition", "rep", "case", "leg"),
+
+
+# Units of time, in words or at the end of a name.
+
+TIME_NAMES = {
+    *("t", "time", "timestamp", "timestamps", "seconds", "sec", "elapsed", "clock", "zeit", "temps")
 }
+"""words in the names of clocks"""
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "day": 86400.0}
+"""of the units that clocks have: pint, which knows all, takes a quarter of a second to load"""
+_WORDS = {
+    "s": ("s", "sec", "secs", "second", "seconds"),
+    "ms": ("ms", "msec", "msecs", "millis", "millisec", "millisecond", "milliseconds"),
+    "us": ("us", "usec", "usecs", "micros", "microsec", "microsecond", "microseconds"),
+    "ns": ("ns", "nsec", "nsecs", "nanos", "nanosec", "nanosecond", "nanoseconds"),
+    "min": ("min", "mins", "minute", "minutes"),
+    "h": ("h", "hr", "hrs", "hour", "hours"),
+    "day": ("d", "day", "days"),
+}
+_UNITS = {word: unit for unit, words in _WORDS.items() for word in words}
+# A unit stands behind a name as time_ms, 'time ms', time[ms] or time(ms); the group tells whether a
+# bracket was opened that has to be closed.
+_AT_END = re.compile(r"^(.*?)\s*(?:_|\s|(?P<open>[\[(]))([^\W\d_]+)(?(open)[\])])$")
+# TimeUS, timestampMs: joined by a capital alone.
+_JOINED = re.compile(r"^(.*(?:[Tt]ime|[Ss]tamp|TIME))(US|Us|MS|Ms|NS|Ns|Sec|Secs|S)$")
+_SINCE = re.compile(r"\s+since\s+\S", re.IGNORECASE)
+"""of 'days since 2024-03-01', as the CF conventions write the unit of a clock"""
+LETTERS = ("h", "d")
+"""units that mean other things too, as pos_d a position down: with brackets around them alone"""
+_SLOWEST_STEP = 5.0
+"""s: no flight is logged once in more"""
+_LONGEST_FLIGHT, _LONGEST_SLOW = 6 * 3600.0, 2 * 3600.0
+"""s: ticks that would make a longer one are more likely of the next smaller unit, and those of a
+slow log sooner: 20 s at 1 kHz in ms would be hours at 1 Hz in s"""
+
+
+def time_unit(text: str) -> str | None:
+    """The unit of time that a text means: `ms` of Milliseconds, msec and Ms; None for others.
+
+    Of a clock, a capital is a way of writing: megaseconds nobody logs.
+    """
+    # Of which the epoch does not matter: times count from the first sample.
+    text = _SINCE.split(text, maxsplit=1)[0]
+    # The micro sign, and the Greek letter that looks the same.
+    word = text.strip().casefold().replace("µ", "u").replace("μ", "u")
+    return _UNITS.get(word)
+
+
+def split_unit(name: str) -> tuple[str, str]:
+    """A column's name without the unit of time at its end, and this unit, empty where there is
+    none."""
+    match = _AT_END.fullmatch(name)
+    if match is None and (joined := _JOINED.fullmatch(name)):
+        return joined[1], time_unit(joined[2]) or ""
+    unit = time_unit(match[3]) if match else None
+    if match and unit and not match["open"] and match[3].casefold() in LETTERS:
+        return name, ""
+    return (match[1], unit) if match and unit else (name, "")
+
+
+def likely_unit(stamps: np.ndarray | None) -> str:
+    """The unit of stamps (N,) by their usual step and their length: no flight is logged once in
+    5 s, or lasts a day."""
+    if stamps is None or stamps.size < 2:
+        return "s"
+    with np.errstate(all="ignore"):
+        step = float(np.median(np.diff(stamps)))
+        length = float(stamps[-1] - stamps[0])
+    # From the coarsest unit on: the first in which the usual step is that of a log is taken.
+    for unit, most, slow in (("s", _SLOWEST_STEP, 0.5), ("ms", 1e3, 100.0), ("us", 1e6, np.inf)):
+        longest = _LONGEST_SLOW if step >= slow else _LONGEST_FLIGHT
+        # Of parts of a second nothing is finer.
+        whole = unit == "ms" or step >= slow
+        if not step >= most and not (whole and length * SECONDS[unit] > longest):
+            return unit
+    return "ns"
+
+
+# Dates of ISO 8601 and of German spreadsheets, and times of day.
+
+_ISO = re.compile(r"\d{4}[-/]\d\d[-/]\d\d[T ,]+\d\d:\d\d(?::\d\d.*)?")
+_GERMAN = re.compile(r"(\d\d?)\.(\d\d?)\.(\d{4}),? (\d{1,2}:\d\d:\d\d(?:[.,]\d{1,6})?)")
+_TIME_OF_DAY = re.compile(r"(\d{1,3}):(\d\d):(\d\d(?:[.,]\d{1,12})?)")
+_LONGEST_TIME = 60
+"""characters of a time; of a damaged file a cell may be as long as itself"""
+
+
+def is_date(cell: str) -> bool:
+    """True for a date with a time of day, or a time of day."""
+    return len(cell) <= _LONGEST_TIME and _form_of(cell) is not None
+
+
+def seconds_of_dates(cells: Sequence[str | None]) -> np.ndarray | int:
+    """Seconds (N,) from the first midnight, NaN where a cell is empty.
+
+    Times of day go on behind midnight. All cells have to be of one kind, and dates with an offset
+    from UTC or without.
+
+    Returns:
+        The row of the first cell that is none, in place of the seconds.
+    """
+    filled = [i for i, cell in enumerate(cells) if cell is not None]
+    values = np.full(len(cells), np.nan)
+    if not filled:
+        return values
+    form = _form_of(cells[filled[0]] or "")
+    begin = None
+    for i in filled:
+        cell = cells[i] or ""
+        if form is None or len(cell) > _LONGEST_TIME or _form_of(cell) is not form:
+            return i
+        try:
+            if form is _TIME_OF_DAY:
+                hours, minutes, seconds = cell.replace(",", ".").split(":")
+                values[i] = 3600.0 * int(hours) + 60.0 * int(minutes) + float(seconds)
+                continue
+            date = _date(cell, form)
+            begin = begin or date.replace(hour=0, minute=0, second=0, microsecond=0)
+            values[i] = (date - begin).total_seconds()
+        # TypeError: dates with an offset from UTC and without cannot be compared.
+        except (ValueError, TypeError, OverflowError):
+            return i
+    if form is _TIME_OF_DAY:
+        day = SECONDS["day"]
+        falls = np.diff(values[filled]) < -0.5 * day
+        values[filled] += np.cumsum(np.r_[0.0, np.where(falls, day, 0.0)])
+    return values
+
+
+def _form_of(cell: str) -> re.Pattern[str] | None:
+    return next((form for form in (_ISO, _GERMAN, _TIME_OF_DAY) if form.fullmatch(cell)), None)
+
+
+def _date(cell: str, form: re.Pattern[str]) -> datetime.datetime:
+    if form is _GERMAN:
+        date, clock = cell.replace(", ", " ").split(" ", 1)
+        day, month, year = map(int, date.split("."))
+        cell = f"{year}-{month:02d}-{day:02d}T{clock.replace(',', '.').zfill(8)}"
+    text = cell.replace("/", "-").removesuffix(" UTC").removesuffix(" GMT")
+    return datetime.datetime.fromisoformat(re.sub("[ ,]+", "T", text, count=1))
 
 
 # Which column it is.
@@ -81,134 +187,55 @@ def table_clock(
     time: str | Signal | None,
     unit: str | None,
     rate: float | None,
-) -> tuple[Signal | None, bool, str]:
-    """The clock, None without one, True if its unit or rate is a guess, and what the file says of
-    its rate.
+) -> tuple[Signal | None, bool]:
+    """The clock, None without one, and True if its unit is a guess.
 
     Args:
         time: the column of time stamps, where it is stated.
         rate: samples a second [Hz], of rows or of what `time` counts.
     """
-    said = ""
     if rate is not None:
         if not (rate > 0 and np.isfinite(rate)):
             raise wrong(table.path, f"expected a positive number of samples a second, got {rate:g}")
         name = time.name if isinstance(time, Signal) else time
-        name = counter_of(surveys) if name is None else _asked(table, surveys, name).name
-        return by_rate(rate, name), False, said
-    if time is None:
-        # A rate in the file goes before what merely increases, as a distance may.
-        stated = stated_rate(surveys)
-        signal, guessed = guess_clock(table, surveys, by_name=stated is not None)
-        if signal is None and stated is not None:
-            return by_rate(stated[0], counter_of(surveys)), True, stated[1]
-    else:
+        return by_rate(rate, name and _asked(table, surveys, name).name), False
+    signal, guessed = guess_clock(table, surveys)
+    if time is not None:
         signal, guessed = _asked(table, surveys, time), False
     # A stated unit goes with whatever column is the clock, the guessed one too.
     if signal is not None and unit is not None:
         signal, guessed = _asked(table, surveys, Signal(signal.name, unit, "s")), False
-    return signal, guessed, said
+    return signal, guessed
 
 
-def guess_clock(
-    table: Table, surveys: Sequence[Survey], by_name: bool = False
-) -> tuple[Signal | None, bool]:
-    """The clock, and True if its unit is a guess.
-
-    Args:
-        by_name: True if only a column that is called so is taken.
-    """
+def guess_clock(table: Table, surveys: Sequence[Survey]) -> tuple[Signal | None, bool]:
+    """The clock by the names of columns, and True if its unit is a guess."""
     values = {s.name: s.values for s in reversed(surveys) if s.values is not None}
     numeric = [s.name for s in surveys if s.values is not None]
-    increasing = [n for n in numeric if _increases(values[n])]
-    # When a sample was taken, before when its message arrived: rostopic writes both. Then a name
-    # decides before the numbers do: a counter or a distance may increase all along too.
-    found = [n for n in increasing if _says_when_sampled(table, n)]
-    found += [n for n in numeric if is_called_time(n) or table.time_unit(n)]
+    found = [n for n in numeric if is_called_time(n) or table.time_unit(n)]
     # Those whose last word is one of time: flight_time could be a parameter, but for its steps.
-    found += [n for n in increasing if TIME_NAMES & set(words_in(split_unit(n)[0])[-1:])]
-    if not by_name:
-        # Else the first column that increases all along is taken, but for numbers of rows. Of
-        # arrays beside one another two limits are no clock of the hundreds of samples.
-        increasing += [n for n in numeric if n not in increasing and restarts(values[n]).size]
-        longest = max((x.size for x in values.values()), default=0)
-        found += [
-            n
-            for n in increasing
-            if values[n].size == longest
-            and not (_counts(n, values[n]) or _OTHERS & set(words_in(n)))
-        ]
+    found += [
+        n
+        for n in numeric
+        if TIME_NAMES & set(words_in(split_unit(n)[0])[-1:])
+        and values[n].size > 1
+        and np.all(values[n][1:] > values[n][:-1])
+    ]
     if not found:
         return None, False
     name = found[0]
     unit = table.time_unit(name) or split_unit(name)[1]
     # `ms` and `minutes` alone are names too; seconds are what clocks of any unit are called.
-    alone = "" if name.casefold() in LETTERS else time_unit(name) or ""
+    alone = time_unit(name) or ""
     unit = unit or ("" if alone == "s" else alone)
     return Signal(name, unit or likely_unit(values[name]), "s"), not unit
 
 
 def is_called_time(name: str) -> bool:
-    """True for a column's name that is one of a clock."""
-    stem, _ = split_unit(name)
+    """True for a column's name that is one of a clock, or a unit of time."""
     # Of a path, log.roll.time, the last part is the name; %time and __time are names of tools.
-    return re.split(r"[./]", stem)[-1].strip("%_ ").casefold() in TIME_NAMES
-
-
-def _says_when_sampled(table: Table, name: str) -> bool:
-    """True for a clock that goes before all others, since it is that of the samples themselves:
-    field.header.stamp, timestamp_sample."""
-    *_, last = path = tuple(re.split(r"[./]", name.casefold()))
-    if last != _SAMPLED:
-        return path[-2:] == ("header", "stamp")
-    # `convert` has put the clock of the topic beside what it copied. And a command acts from when
-    # it was published, 0.4 to 3 ms behind the gyro's sample: by the topic before the column
-    # (`/actuator_motors/timestamp_sample`) or by the name of the file, as ulog2csv gives it.
-    topic = re.split(r"[./]", name)[-2:-1]
-    commands = holds_commands(topic[0] if any(topic) else PurePath(table.path).name)
-    return "time" not in table.names and not commands
-
-
-def _increases(values: np.ndarray) -> bool:
-    return values.size > 1 and bool(np.all(values[1:] > values[:-1]))
-
-
-def _counts(name: str, values: np.ndarray) -> bool:
-    """True for whole numbers that count rows or frames, one by one, by name too: a log at a sample
-    a second has such times. Numbers of packets do so whatever their steps."""
-    if not _is_counter_name(name) or not np.all(values == np.rint(values)):
-        return False
-    return bool(_PACKETS & set(words_in(name))) or bool(np.all(np.diff(values) == 1.0))
-
-
-def _is_counter_name(name: str) -> bool:
-    """True for the name of a counter, or none: of a matrix, or of a text without names."""
-    is_numbered = not name or name.endswith("]") or re.fullmatch(r"column\d+", name) is not None
-    return is_numbered or bool(_COUNTERS & set(words_in(name)))
-
-
-def counter_of(surveys: Sequence[Survey]) -> str | None:
-    """The column that counts rows or frames, some of which may be lost; None without one."""
-    return next(
-        (
-            s.name
-            for s in surveys
-            if s.values is not None
-            and _is_counter_name(s.name)
-            and _increases(s.values)
-            and np.all(s.values == np.rint(s.values))
-            and float(np.median(np.diff(s.values))) == 1.0
-        ),
-        None,
-    )
-
-
-def counter_notes(surveys: Sequence[Survey]) -> tuple[Finding, ...]:
-    """A note on a column that might be taken for a clock and counts rows, where one does."""
-    name = counter_of(surveys)
-    if name is None:
-        return ()
-    return (note(COUNTS_ROWS, f"{shown(name)} counts rows and is taken for no time", name),)
+    leaf = re.split(r"[./]", split_unit(name)[0])[-1].strip("%_ ").casefold()
+    return leaf in TIME_NAMES or (len(leaf) > 1 and time_unit(leaf) is not None)
 
 
 def _asked(table: Table, surveys: Sequence[Survey], time: str | Signal) -> Signal:
@@ -273,6 +300,21 @@ def require_increasing(table: Table, name: str, stamps: np.ndarray) -> None:
     raise wrong(table.path, f"{problem}; {remedy}", table.place(row), column(name))
 
 
+def require_likely(path: str, time: Signal, stamps: np.ndarray) -> None:
+    """Refuse stamps (N,) in seconds that are a flight's in another unit alone, where their name
+    says that one or nobody stated seconds."""
+    named, likely = split_unit(time.name)[1], likely_unit(stamps)
+    if time.unit != "s" or likely == "s" or not (named == likely or time.assumed):
+        return
+    step, length = float(np.median(np.diff(stamps))), float(stamps[-1] - stamps[0])
+    problem = f"in s its stamps are {step:.4g} s apart over {length:.4g} s: they look like {likely}"
+    why = f", as its name says {named}" if named == likely else ""
+    remedy = f"expected its unit: {{signal: {time.name}, unit: {likely}}}"
+    if named != likely:
+        remedy += ", or unit: s where it is so slow"
+    raise wrong(path, f"{problem}{why}; {remedy}", column(time.name))
+
+
 # Rates in place of times.
 
 
@@ -281,79 +323,12 @@ def by_rate(rate: float, counter: str | None = None) -> Signal:
     return Signal(counter or ROWS, "s", "s", scale=1.0 / rate)
 
 
-def counted(table: Table) -> Table:
-    """A table of which the numbers of the rows can be asked for as a column, `ROWS`."""
-    return TableView(table, columns={ROWS: None})
-
-
-def stated_rate(surveys: Sequence[Survey]) -> tuple[float, str] | None:
-    """The rate [Hz] that a file states in a single number beside its samples (`Ts`, `dt`, `fs`),
-    and what says so; None where there is none, or are several."""
-    rates: dict[float, str] = {}
-    for each in surveys:
-        if each.values is not None:
-            for rate, words in _rate_of(each.name, each.values).items():
-                rates.setdefault(rate, words)
-    if len(rates) != 1:
-        return None
-    rate, words = next(iter(rates.items()))
-    # 1/0.02 is 50 in numbers of the vehicle, 1/0.033 is what it is.
-    near = round(rate, 6)
-    return (near if math.isclose(rate, near, rel_tol=1e-9) else rate), words
-
-
-def contradicted_rate(table: Table, clock: str, rate: float) -> tuple[Finding, ...]:
-    """A caution for each rate that a file states and that is neither that of its times [Hz] nor a
-    whole multiple, of which every second or tenth sample may have been logged."""
-    if not (math.isfinite(rate) and rate > 0):
-        return ()
-    stated: dict[float, str] = {}
-    for name in table.names:
-        # Of another clock than this one its path tells.
-        if _is_step(name) is not None and _group(name) == _group(clock):
-            try:
-                stated |= _rate_of(name, table.numbers([name])[name])
-            except InputError:
-                continue
-    return tuple(
-        Finding(
-            "clock.rate-contradicted",
-            "doubt",
-            f"the file states {other:.6g} Hz ({words}), and its times {shown(clock)} are at "
-            f"{rate:.6g} Hz: one of the two clocks is wrong, and rates that follow from it are off "
-            f"by {abs(other / rate - 1):.0%}.",
-            other / rate,
-            f"stated rate over that of the times, whole numbers to {_OTHER_RATE:g}",
-        )
-        for other, words in stated.items()
-        if abs(other / rate / max(round(other / rate), 1) - 1.0) > _OTHER_RATE
-    )
-
-
-def _group(name: str) -> str:
-    return re.split(r"[./][^./]*$", name)[0] if re.search(r"[./]", name) else ""
-
-
-def _rate_of(name: str, values: np.ndarray) -> dict[float, str]:
-    """The rate [Hz] that a column (N,) of a single number states, one that stands in the first row
-    alone or in each, and what says so; empty of others."""
-    step, values = _is_step(name), values[np.isfinite(values)]
-    if step is None or not values.size or np.ptp(values) > 0 or values[0] <= 0:
-        return {}
-    rate = 1.0 / float(values[0]) if step else float(values[0])
-    return {rate: f"{shown(name)} = {values[0]:g}"} if _SLOWEST <= rate <= _FASTEST else {}
-
-
-def _is_step(name: str) -> bool | None:
-    """True for the name of a time step, False of a rate, None of anything else."""
-    words = words_in(name.rpartition(".")[2].rpartition("/")[2])
-    joined, first, last = "".join(words), words[:1], words[-1:]
-    if len(words) == 2:
-        if first[0] in (*_OF_SAMPLES, "delta") and last[0] in _STEP_WORDS:
-            return True
-        if first[0] in _OF_SAMPLES and last[0] in _RATE_WORDS:
-            return False
-    return True if joined in _STEPS else False if joined in _RATES else None
+def columns_of(table: Table, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """The columns of a table as float64 (N,), `ROWS` as the numbers of its rows, from 0."""
+    own = [name for name in names if name != ROWS] or [table.names[0]]
+    columns = table.numbers(list(dict.fromkeys(own)))
+    columns[ROWS] = np.arange(columns[own[0]].size, dtype=np.float64)
+    return {name: columns[name] for name in names}
 
 
 # Several runs in one table.
@@ -381,54 +356,28 @@ def restarts(stamps: np.ndarray) -> np.ndarray:
     return falls if anew.all() else none
 
 
-def _changes(numbers: np.ndarray) -> np.ndarray:
-    """The rows (n,) in which the number of a run is another than in the row before."""
-    return np.flatnonzero(np.diff(numbers) != 0) + 1
-
-
 def with_runs(
-    table: Table, clock: str, numbers: Mapping[str, np.ndarray], scale: float, column: str = ""
-) -> Table:
-    """A table whose runs follow one another; as it is where it holds one.
+    table: Table, clock: str, columns: Mapping[str, np.ndarray], scale: float, runs: str = ""
+) -> tuple[dict[str, np.ndarray], tuple[Finding, ...]]:
+    """Return the columns (N,) with a clock in which runs follow one another, and a note; as they
+    are where the table holds one run.
 
     Args:
-        numbers: that column (N,), and the one that numbers runs.
+        columns: of the table, the clock among them.
         scale: [s] of a unit of the stamps.
-        column: that numbers runs; without one they begin where the time does.
+        runs: the column that numbers runs; without one they begin where the time does.
     """
-    stamps = numbers[clock]
-    starts = _changes(numbers[column]) if column else restarts(stamps)
+    stamps = columns[clock]
+    starts = np.flatnonzero(np.diff(columns[runs])) + 1 if runs else restarts(stamps)
     if not starts.size:
-        return table
+        return dict(columns), ()
     apart = stamps.copy()
     for start in starts:
         apart[start:] += apart[start - 1] - apart[start] + _BETWEEN / scale
     places = listed(table.place(int(start)) for start in starts)
-    why = f"{shown(column)} is another" if column else "the time begins anew"
+    why = f"{shown(runs)} is another" if runs else "the time begins anew"
     words = (
         f"{why} in {places}: {starts.size + 1} runs, put one after another with "
         f"{_BETWEEN:g} s between"
     )
-    said = note("clock.runs", words, value=starts.size + 1)
-    return TableView(table, columns={clock: apart}, note=said)
-
-
-def numbering(surveys: Sequence[Survey]) -> str:
-    """The column that numbers runs, by its name and numbers; empty without one."""
-    for each in surveys:
-        values = each.values
-        if values is None or not _RUN_NAMES & set(words_in(each.name)):
-            continue
-        if not np.isfinite(values).all() or np.any(values != np.rint(values)):
-            continue
-        bounds = np.concatenate([[0], _changes(values), [values.size]])
-        if bounds.size > 2 and np.all(np.diff(values) >= 0) and np.diff(bounds).min() >= _SHORTEST:
-            return each.name
-    return ""
-
-
-def numbering_notes(column: str) -> tuple[Finding, ...]:
-    """A note on a column that numbers runs, where one does."""
-    remedy = f"time: {{..., runs: {column}}} in a configuration makes a flight of each"
-    words = f"{shown(column)} seems to number runs, which the time does not part: {remedy}"
-    return (note("clock.runs-numbered", words, column),)
+    return {**columns, clock: apart}, (note("clock.runs", words, value=starts.size + 1),)

@@ -18,16 +18,14 @@ from heli_jax.flights.derived import (
 )
 from heli_jax.flights.formats.arrays import ArrayTable, by_clocks
 from heli_jax.flights.holds import decide
-from heli_jax.flights.log import ChannelLog
-from heli_jax.flights.marks import at_marks, counted, mark_words
-from heli_jax.flights.onto_grid import window_note
+from heli_jax.flights.log import ChannelLog, listed, require_few_columns, shown, wrong
+from heli_jax.flights.marks import at_marks, marks_note
+from heli_jax.flights.onto_grid import TopicClock, common_times, topic_clock, window_note
 from heli_jax.flights.open_log import open_log
 from heli_jax.flights.preset import NamedBy
-from heli_jax.flights.read_channels import TopicClock, common_times, topic_clock
 from heli_jax.flights.read_table import guessed_log, without_joins
 from heli_jax.flights.request import require_rate_and_window
-from heli_jax.flights.resample import hold, in_gaps, new_clock, resampled
-from heli_jax.flights.table import listed, require_few_columns, shown, wrong
+from heli_jax.flights.resample import hold, in_gaps, rate_notes, resampled
 
 ENDINGS = (".csv", ".parquet", ".nc")
 TIME = "time"
@@ -122,7 +120,7 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
     else:
         columns = _resampled(log, names, clocks, selection.rate, notes)
         for clock in clocks.values():
-            notes += [n.of(clock.words) for n in new_clock(clock.seconds, selection.rate).notes]
+            notes += [n.of(clock.words) for n in rate_notes(clock.seconds, selection.rate)]
             # A table has a value in every row; a fit takes slow outputs as missing in between.
             if selection.rate * clock.usual > _INTERPOLATED:
                 words = f"{clock.words}: interpolated, so its noise is no longer white"
@@ -198,12 +196,8 @@ def _clocks(
             notes.append(note(LEFT_OUT, f"left out: {e.within}", topic.name))
     if not clocks:
         raise problems[0]
-    longest = max(
-        (topic.times for topic in (log.topic_of(n) for n in names) if topic.name in clocks),
-        key=lambda times: times[-1],
-    )
-    end, step = float(longest[-1]) - log.first_time, float(np.median(np.diff(longest)))
-    notes += window_note(window, end, step)
+    taken = [clock.topic.times for clock in clocks.values()]
+    notes += window_note(window, [max(taken, key=lambda times: times[-1])], log.first_time)
     # Events that came in a moment would leave no time that all topics share.
     spans = {name: float(clock.seconds[-1] - clock.seconds[0]) for name, clock in clocks.items()}
     for name, span in spans.items():
@@ -253,10 +247,8 @@ def _as_logged(
     for name in names:
         values = _finite(log.channel(name).values[clock.rows])
         if (at := at_marks(values)).any():
-            words = mark_words(counted(values[at]), int(np.sum(~np.isnan(values))))
             done = "taken as missing" if converted else "kept; with --rate they are missing"
-            words = f"{shown(name)} has {words}: {done}"
-            notes.append(note("samples.marks", words, name, value=int(np.count_nonzero(at))))
+            notes.append(marks_note(shown(name), values, at, done, name))
         columns[name] = np.where(at, np.nan, values) if converted else values
     return columns
 

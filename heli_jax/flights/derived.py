@@ -13,10 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from heli_jax.errors import nearest
-from heli_jax.flights.log import ChannelLog, Topic, as_floats
+from heli_jax.flights.log import ChannelLog, Topic, as_floats, shown, wrong
 from heli_jax.flights.marks import without_marks
 from heli_jax.flights.resample import longest_gap
-from heli_jax.flights.table import shown, wrong
 
 # Servo outputs of a swashplate, unmixed to collective and cyclic (CCPM).
 

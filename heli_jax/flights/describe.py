@@ -12,11 +12,8 @@ from heli_jax import units
 from heli_jax.finding import Finding, note
 from heli_jax.flights.clock import (
     ROWS,
+    SECONDS,
     clock_scale,
-    contradicted_rate,
-    counter_notes,
-    numbering,
-    numbering_notes,
     restarts,
     table_clock,
     with_runs,
@@ -33,19 +30,19 @@ from heli_jax.flights.grid import (
     uniform_grid,
     without_overflow,
 )
-from heli_jax.flights.log import ChannelLog, Topic, as_floats
-from heli_jax.flights.marks import mark_notes
-from heli_jax.flights.open_log import chosen_flights, open_flights
-from heli_jax.flights.table import (
+from heli_jax.flights.log import (
+    ChannelLog,
     Survey,
     Table,
+    Topic,
+    as_floats,
     listed,
     sample_count,
     shown,
     wrong,
 )
-from heli_jax.flights.time_units import SECONDS
-from heli_jax.flights.vibration import RotorLines, rotor_lines
+from heli_jax.flights.marks import mark_notes
+from heli_jax.flights.open_log import chosen_flights, open_flights
 
 _GAP_STEPS = 1.5
 """usual steps: a lost sample makes a step of two, and jitter one of a tenth more"""
@@ -95,9 +92,8 @@ class TimeInfo:
     the stamps are no uniform grid what 95 % of the steps keep to, gaps apart; `problem` says why
     they are no clock at all, otherwise empty; `guessed` says that nothing states the unit.
     `counted` [Hz] is how many samples a second has, where `column` counts them, or no column is a
-    clock and the rows do (`heli_jax.flights.clock.ROWS`); `said` where the file says so.
-    Where the time begins anew the table holds several `runs`, put one after another; where it goes
-    on `numbering` is the column that numbers them.
+    clock and the rows do (`heli_jax.flights.clock.ROWS`).
+    Where the time begins anew the table holds several `runs`, put one after another.
     """
 
     column: str
@@ -110,9 +106,7 @@ class TimeInfo:
     problem: str = ""
     guessed: bool = False
     counted: float | None = None
-    said: str = ""
     runs: int = 1
-    numbering: str = ""
 
     @property
     def signal(self) -> Signal:
@@ -136,8 +130,7 @@ class LogInfo:
 
     `time` is None where no column looks like a clock; an autopilot's log has `topics` with clocks
     of their own, whose channels are `columns` too, and `duration` [s] from the first sample to the
-    last. `filters` are those of the `parameters` that say how the firmware filtered its signals,
-    `vibration` the lines in its signals where it has the rotor's speed.
+    last. `filters` are those of the `parameters` that say how the firmware filtered its signals.
     """
 
     path: str
@@ -154,7 +147,6 @@ class LogInfo:
     parameters: Mapping[str, str | int | float] = field(default_factory=dict)
     filters: Mapping[str, str | int | float] = field(default_factory=dict)
     notes: tuple[Finding, ...] = ()
-    vibration: RotorLines | None = None
 
 
 def describe_log(
@@ -180,7 +172,7 @@ def describe_flights(
         path: the log, in a format that `read_flight` reads.
         time: the column of time stamps, in seconds where only its name is given; by default a
             column with a usual name (its unit from an ending such as `_ms`, or guessed from the
-            steps), or the first that increases from row to row.
+            steps).
         number: of the one flight to describe, from 1.
         rate: samples a second [Hz] of a table without times: of its rows, or of a column that
             counts them.
@@ -222,7 +214,6 @@ def _describe_channels(log: ChannelLog) -> LogInfo:
         parameters=log.parameters,
         filters={k: v for k, v in log.parameters.items() if _FILTER.search(k)},
         notes=(*log.notes, *mark_notes(c for topic in log.topics for c in topic.columns.items())),
-        vibration=rotor_lines(log),
     )
 
 
@@ -245,21 +236,19 @@ def describe_table(
             clock, or a column that counts them, unless `time` names one.
     """
     surveys = table.survey()
-    signal, guessed, said = table_clock(table, surveys, time, unit, rate)
-    starts = np.zeros(0, int)
-    if signal is not None and signal.name != ROWS:
-        stamps = _values(surveys, signal.name)
-        if (starts := restarts(stamps)).size:
+    signal, guessed = table_clock(table, surveys, time, unit, rate)
+    clock = None
+    if signal is not None:
+        rows = np.arange(_n_rows(surveys), dtype=np.float64)
+        stamps = rows if signal.name == ROWS else _values(surveys, signal.name)
+        runs = restarts(stamps).size + 1
+        if runs > 1:
             scale = clock_scale(table, signal)
-            table = with_runs(table, signal.name, {signal.name: stamps}, scale)
-            surveys = table.survey()
+            stamps = with_runs(table, signal.name, {signal.name: stamps}, scale)[0][signal.name]
+        clock = replace(_describe_time(table, signal, stamps, guessed), runs=runs)
     # A stamp is never taken as missing: a wrong one is refused with its row.
     measured = [s for s in surveys if signal is None or s.name != signal.name]
     marks = mark_notes((s.name, s.values) for s in measured if s.values is not None)
-    clock = None if signal is None else _describe_time(table, surveys, signal, guessed)
-    if clock is not None:
-        numbered = "" if starts.size or clock.gaps else numbering(surveys)
-        clock = replace(clock, said=said, runs=starts.size + 1, numbering=numbered)
     return LogInfo(
         path=table.path,
         format=table.format,
@@ -273,9 +262,6 @@ def describe_table(
             *table.notes,
             *_other_lengths(surveys),
             *clock_notes(table),
-            *(counter_notes(surveys) if clock is None else ()),
-            *(numbering_notes(clock.numbering) if clock and clock.numbering else ()),
-            *(contradicted_rate(table, clock.column, clock.rate) if clock else ()),
             *marks,
         ),
     )
@@ -329,11 +315,7 @@ def _values(surveys: list[Survey], name: str) -> np.ndarray:
     return values
 
 
-def _describe_time(table: Table, surveys: list[Survey], signal: Signal, guessed: bool) -> TimeInfo:
-    if signal.name == ROWS:
-        stamps = np.arange(_n_rows(surveys), dtype=np.float64)
-    else:
-        stamps = _values(surveys, signal.name)
+def _describe_time(table: Table, signal: Signal, stamps: np.ndarray, guessed: bool) -> TimeInfo:
     if signal.name == ROWS or signal.scale != 1.0:
         clock = _describe_stamps(signal.name, "s", stamps, signal.scale)
         return replace(clock, guessed=guessed, counted=round(1.0 / signal.scale, 9))

@@ -9,7 +9,9 @@ import numpy as np
 
 from heli_jax import units
 from heli_jax.finding import Finding
+from heli_jax.flights.log import shown
 from heli_jax.flights.signal_facts import SignalFacts, facts_of_all
+from heli_jax.numbers import number
 
 HOLDS = ("zero-order", "linear", "mixed")
 _BY_NAME = {
@@ -78,6 +80,52 @@ class Signal:
     def _factor(self) -> float:
         sign = -1.0 if self.invert else 1.0
         return sign * self.scale * units.factor(self.unit, self.si)
+
+
+def scale_problem(signal: Signal) -> str:
+    """Reason why the scale or the offset of a signal is wrong; empty if neither is."""
+    # A scale of zero would make a constant of the signal, and one of 1e300 overflows.
+    if not 1e-12 <= abs(signal.scale) <= 1e12:
+        return f"scale is {signal.scale:g}, expected a number other than 0 from 1e-12 to 1e12"
+    if not abs(signal.offset) <= 1e12:
+        return f"offset is {signal.offset:g}, expected at most 1e12"
+    # Two minus signs are more likely a slip than an intention, and look like none.
+    if signal.invert and signal.scale < 0:
+        return f"scale is {signal.scale:g} and invert is true, expected one of the two"
+    return ""
+
+
+def in_words(signal: Signal) -> str:
+    """Describe a signal in the log: `'RCIN.C1', (number - 1500) x 0.002 in 1, inverted`."""
+    if signal.constant is not None:
+        words = f"{number(signal.constant, 6)} {_unit(signal)}".rstrip() + ", a constant"
+    else:
+        steps = f"number - {number(signal.offset, 6)}" if signal.offset else "number"
+        if signal.scale != 1.0:
+            steps = f"({steps})" if signal.offset else steps
+            steps += f" x {number(signal.scale, 6)}"
+        words = shown(signal.name) + ("" if steps == "number" else f", {steps}")
+        words += f", in {signal.unit}" if _unit(signal) else ""
+        words += ", inverted" if signal.invert else ""
+    return f"{words}; {signal.origin}" if signal.origin else words
+
+
+def _unit(signal: Signal) -> str:
+    return "" if signal.unit.strip() in ("", "1", "-") else signal.unit
+
+
+def as_content(signal: Signal) -> dict[str, str | float | bool | None]:
+    """A signal as plain data, for `fit.json`."""
+    if signal.constant is not None:
+        return {"constant": signal.constant, "unit": signal.unit, "origin": signal.origin}
+    return {
+        "signal": signal.name,
+        "unit": signal.unit,
+        "scale": signal.scale,
+        "offset": signal.offset,
+        "invert": signal.invert,
+        "origin": signal.origin,
+    }
 
 
 @dataclass(frozen=True)

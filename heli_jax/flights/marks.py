@@ -1,12 +1,12 @@
-"""Numbers of a log that stand for no value, such as -9999."""
+"""Numbers of a log that were not measured: marks such as -9999, strays, repeated values."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from heli_jax.finding import Finding, note
-from heli_jax.flights.table import shown
+from heli_jax.flights.log import shown
 
 _FEWEST = 8
 """samples of a signal beside its marks, at least"""
@@ -34,10 +34,6 @@ _APART = 1.0
 """times the range of all other values, by which a mark lies outside of it"""
 _LEVELS = 4
 """distinct values that a signal has beside its marks, at least"""
-_MOST_NOTES = 6
-
-Counts = tuple[tuple[float, int], ...]
-"""values, as the log has them, and how many of each there are"""
 
 
 def at_marks(numbers: np.ndarray) -> np.ndarray:
@@ -101,68 +97,57 @@ def mark_notes(channels: Iterable[tuple[str, np.ndarray]]) -> list[Finding]:
     """Notes on the marks that channels have, each of a name and numbers (N,) of any kind."""
     notes = []
     for name, numbers in channels:
-        x = np.asarray(numbers)
-        # A damaged log may hold NaNs that signal when they are converted.
-        with np.errstate(invalid="ignore"):
-            x = x.astype(np.float64) if x.dtype.kind in "biuf" else x
-        # Of what was never logged nothing else is there, and a switch may have any value.
-        if x.dtype.kind == "f" and (at := at_marks(x)).any():
-            # What counts first: a terminal shows the beginning.
-            stand = "stands" if np.count_nonzero(at) == 1 else "stand"
-            words = f"{listed(counted(x[at]))} {stand} for no value in {shown(name)}"
-            words += ": a fit takes them as missing"
-            notes.append(note("samples.marks", words, name, value=int(np.count_nonzero(at))))
-    more = len(notes) - _MOST_NOTES
-    if more <= 0:
-        return notes
-    return [*notes[:_MOST_NOTES], note("samples.marks", f"{more} more channels have such samples")]
+        # Of what was never logged nothing else is there, and a switch may have any value. A damaged
+        # log may hold NaNs that signal when they are converted.
+        if (x := np.asarray(numbers)).dtype.kind in "biuf":
+            with np.errstate(invalid="ignore"):
+                x = x.astype(np.float64)
+            if (at := at_marks(x)).any():
+                done = "a fit takes them as missing"
+                notes.append(marks_note(shown(name), x, at, done, name))
+    return notes
 
 
-def counted(values: np.ndarray) -> Counts:
-    """Each of the values (K,) of a log once, and how often it is there."""
-    numbers, counts = np.unique(values, return_counts=True)
-    return tuple((float(f"{v:.7g}"), int(n)) for v, n in zip(numbers, counts, strict=True))
+def marks_note(
+    name: str, numbers: np.ndarray, at: np.ndarray, done: str, *subjects: str
+) -> Finding:
+    """A note on the marks of a channel, a mask of its numbers (N,), and on what is done of them."""
+    words = f"{name} has {mark_words(numbers, at)}: {done}"
+    return note("samples.marks", words, *subjects, value=int(np.count_nonzero(at)))
 
 
-def mark_words(marks: Counts, size: int | None = None) -> str:
-    """`10 samples of -9999 and 1 of 1e+10, far outside of all others`.
-
-    Args:
-        marks: at least one.
-        size: of all samples, theirs among them; a large share is said.
-    """
-    share = sum(n for _, n in marks) / max(size, 1) if size is not None else 0.0
+def mark_words(numbers: np.ndarray, at: np.ndarray) -> str:
+    """`10 samples of -9999 and 1 of 1e+10, far outside of all others`; a large share is said."""
+    share = np.count_nonzero(at) / np.count_nonzero(~np.isnan(numbers))
     often = f" ({100 * share:.0f} % of all)" if share > _MOST else ""
-    return f"{listed(marks)}{often}, far outside of all others"
+    return f"{value_words(numbers[at])}{often}, far outside of all others"
 
 
-def listed(counts: Counts) -> str:
-    """`10 samples of -9999 and 1 of 1e+10`; of at least one value."""
-    words = [f"{n} of {v:.7g}" for v, n in counts[:3]]
-    words[0] = words[0].replace(" of", " sample of" if counts[0][1] == 1 else " samples of", 1)
-    more = f" and {len(counts) - 3} more such values" if len(counts) > 3 else ""
+def value_words(values: np.ndarray) -> str:
+    """`10 samples of -9999 and 1 of 1e+10`; of at least one value (K,)."""
+    numbers, counts = np.unique(values, return_counts=True)
+    words = [f"{n} of {v:.7g}" for v, n in zip(numbers[:3], counts[:3], strict=True)]
+    words[0] = words[0].replace(" of", " sample of" if counts[0] == 1 else " samples of", 1)
+    more = f" and {numbers.size - 3} more such values" if numbers.size > 3 else ""
     return " and ".join(words) + more
 
 
 # Samples of a log that no motion leads to, and numbers that nothing measures.
 
-_STRAY_LEVELS, _FEW_LEVELS = 8, 3
-"""distinct values of a signal beside its strays, at least; where they are so few, only what is
-farther away is told"""
-_LONGEST = 3
-"""samples in a row that no motion leads to, at most; one value that stays counts once"""
 _MOST_STRAYS = 0.05
 """part of the samples that no motion leads to, at most"""
 _MOTION = 50
 """samples from which the range of a motion is known"""
-_FAR, _FARTHER, _FARTHEST = 5.0, 20.0, 1e4
+_FAR, _FARTHER = 5.0, 20.0
 """times the range of all other samples, from which on no motion leads there; the second for
-inputs, since a stick may be pushed out of noise for a moment, and for outputs of longer steps than
-`_QUICK`; the third for inputs of such steps"""
+inputs, since a stick may be pushed out of noise for a moment, and for signals of few values"""
 _QUICK = 0.04
 """s, between two samples of which a motion does not come and go"""
-_SOME = 10_000
-"""samples by which a long signal is looked over first"""
+_LONGEST = 3
+"""such samples in a row, at most; one value that a sensor holds counts once"""
+_STRAY_LEVELS, _FEW_LEVELS = 8, 3
+"""distinct values of a signal beside its strays: below the first it has few, below the second too
+few to tell"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,19 +169,16 @@ def strays(seconds: np.ndarray, numbers: np.ndarray, kind: str) -> tuple[Strays,
     """Samples that may well be none and are not sure to be: single ones to which no motion leads,
     and many that are larger than any measurement.
     """
-    alone, far = _unreached(seconds, numbers, kind)
+    absurd, (alone, far) = is_absurd(numbers), _unreached(seconds, numbers, kind)
     off = f"which no motion leads to: more than {far:g} times the range of all others away"
-    absurd, too_large = is_absurd(numbers), "larger than any measurement"
-    alone &= ~absurd
-    kinds = ((absurd, too_large), (alone, off))
+    kinds = ((absurd, "larger than any measurement"), (alone & ~absurd, off))
     return tuple(Strays(seconds[at], numbers[at], words) for at, words in kinds if at.any())
 
 
 def stray_words(strays: Strays) -> str:
     """`3 samples of -99, the first at 12.3 s, which ...`."""
-    counts = counted(strays.values)
-    words = listed(counts)
-    if len(counts) > 3:
+    words = value_words(strays.values)
+    if np.unique(strays.values).size > 3:
         low, high = strays.values.min(), strays.values.max()
         words = f"{strays.values.size} samples from {low:.4g} to {high:.4g}"
     at = "at" if strays.times.size == 1 else "the first at"
@@ -207,42 +189,31 @@ def _unreached(seconds: np.ndarray, numbers: np.ndarray, kind: str) -> tuple[np.
     """Return a mask of the numbers (N,) that stand alone, so far outside of all others that no
     motion leads there and back, and their distance in ranges."""
     seen, none = np.flatnonzero(np.isfinite(numbers)), np.zeros(numbers.shape, bool)
-    x = numbers[seen]
+    x, far = numbers[seen], _FAR if kind == "output" else _FARTHER
     if x.size < _MOTION:
-        return none, _FAR
-    # All samples are nearly always near to most, and that is soon told.
-    low, high = np.quantile(x[:: max(1, x.size // _SOME)], [2 * _MOST_STRAYS, 1 - 2 * _MOST_STRAYS])
-    if max(x.max() - high, low - x.min()) <= _FAR * (high - low):
-        return none, _FAR
+        return none, far
     # What a sensor holds until its next sample is one. A stick that stays was moved there.
     new = np.r_[True, x[1:] != x[:-1]] if kind == "output" else np.ones(x.size, bool)
-    coarse = np.count_nonzero(new) < _MOTION
-    new |= coarse
-    y, times = x[new], seconds[seen][new]
-    quick = float(np.median(np.diff(times))) <= _QUICK
-    close = quick and not coarse and kind == "output"
-    far = _FAR if close else _FARTHER if quick or kind == "output" else _FARTHEST
-    out, far = _lonely(y, far, _LONGEST if quick else 1)
-    at = out[np.cumsum(new) - 1]
+    if np.count_nonzero(new) < _MOTION:
+        new[:], far = True, _FARTHER
+    y = x[new]
+    quick = float(np.median(np.diff(seconds[seen][new]))) <= _QUICK
+    if not quick and kind == "input":
+        return none, far
+    low, high = np.quantile(y, [_MOST_STRAYS, 1 - _MOST_STRAYS])
+    out = _beyond(y, low, high, far)
+    # Where it stays, or begins or ends, it moved; what is near to that is reached too.
+    alone = _alone(out, y, _LONGEST if quick else 1)
+    if not alone.any():
+        return none, far
+    rest = y[~alone]
+    levels = np.unique(rest).size
+    far = far if levels >= _STRAY_LEVELS else _FARTHER
+    alone &= _beyond(y, rest.min(), rest.max(), far) & (levels >= _FEW_LEVELS)
+    at = alone[np.cumsum(new) - 1]
     if np.count_nonzero(at) <= _MOST_STRAYS * x.size:
         none[seen[at]] = True
     return none, far
-
-
-def _lonely(y: np.ndarray, far: float, most: int) -> tuple[np.ndarray, float]:
-    """Return a mask of the samples (N,) that lie `far` times the range of all others off, at
-    most `most` in a row, and their distance in ranges."""
-    low, high = _range(y, far)
-    out = _beyond(y, low, high, far)
-    # Where it stays, or begins or ends, it moved; what is near to that is reached too.
-    while (moved := out & ~_alone(out, y, most)).any():
-        low, high = min(low, y[moved].min()), max(high, y[moved].max())
-        out = _beyond(y, low, high, far)
-    levels = np.unique(y[~out]).size
-    if levels < _STRAY_LEVELS:
-        far = max(far, _FARTHER)
-        out &= _beyond(y, low, high, far) & (levels >= _FEW_LEVELS)
-    return out, far
 
 
 def _beyond(y: np.ndarray, low: float, high: float, far: float) -> np.ndarray:
@@ -250,31 +221,112 @@ def _beyond(y: np.ndarray, low: float, high: float, far: float) -> np.ndarray:
     return (y > high + away) | (y < low - away)
 
 
-def _range(y: np.ndarray, far: float) -> tuple[float, float]:
-    """The range of samples (N,) that grows from its middle over all that are not too far off."""
-    s, k = np.sort(y), int(_MOST_STRAYS * y.size)
-    lo, hi = k, y.size - 1 - k
-    gaps = np.diff(s)
-    while True:
-        up = hi + _first(gaps[hi:] > far * (s[hi:-1] - s[lo]))
-        down = lo - _first(gaps[:lo][::-1] > far * (s[up] - s[1 : lo + 1][::-1]))
-        if (down, up) == (lo, hi):
-            return float(s[lo]), float(s[hi])
-        lo, hi = down, up
-
-
-def _first(at: np.ndarray) -> int:
-    return int(np.argmax(at)) if at.any() else at.size
-
-
 def _alone(out: np.ndarray, y: np.ndarray, most: int) -> np.ndarray:
-    """Return a mask of the samples that are `out` (N,) and stand between others, at most `most`
-    in a row."""
+    """Return a mask of the samples that are `out` (N,) to one side and stand between others, at
+    most `most` in a row."""
     edges = np.flatnonzero(np.diff(np.r_[False, out, False].astype(int)))
-    at = np.zeros(out.shape, bool)
-    middle = float(np.median(y))
+    at, above = np.zeros(out.shape, bool), y > np.median(y)
     for begin, end in edges.reshape(-1, 2):
-        run = y[begin:end] > middle
-        inside = begin > 0 and end < out.size
-        at[begin:end] = inside and end - begin <= most and bool(run.all() or not run.any())
+        inside = begin > 0 and end < out.size and end - begin <= most
+        at[begin:end] = inside and np.ptp(above[begin:end].astype(int)) == 0
     return at
+
+
+# Slow outputs in fast tables: many loggers write the last value again until the next is there.
+# Taken as measurements, the repeated values say that the signal stood still between two samples.
+
+REPEATS = ("auto", "keep", "missing")
+"""What is made of repeated values: missing samples where that is unmistakable, or as stated."""
+
+_SHORTEST_RUN = 3
+"""samples that a run of equal values has at least: two are equal by chance or resolution"""
+_REPEATED = 20
+"""complete runs from which the length of one is told"""
+_REGULAR = 0.9
+"""part of the runs that are of one length, or of twice that"""
+_FEWEST_SINGLE = 0.8
+"""part of the runs that are of the one length"""
+_ONE_COUNT = 0.5
+"""part of the jumps that are one count of the resolution, from which on a slow motion that is
+coarsely resolved looks the same"""
+_MOVES = 0.5
+"""part of its samples at which another output moves, which shows that the vehicle did"""
+
+
+def usual_run(values: np.ndarray) -> int | None:
+    """Return the number of samples for which each value of an output (N,) is repeated; None
+    unless unmistakable."""
+    lengths, jumps = _runs(values)
+    if lengths.size < _REPEATED:
+        return None
+    usual = round(float(np.median(lengths)))
+    if usual < _SHORTEST_RUN:
+        return None
+    near = max(1.0, 0.1 * usual)
+    single = np.abs(lengths - usual) <= near
+    double = np.abs(lengths - 2 * usual) <= 2 * near  # two samples of the same value
+    if single.mean() < _FEWEST_SINGLE or (single | double).mean() < _REGULAR:
+        return None
+    # A slow motion in whole degrees repeats values too, and then goes on by one.
+    if np.mean(jumps <= 1.5 * jumps.min()) >= _ONE_COUNT:
+        return None
+    return usual
+
+
+def without_repeats(values: np.ndarray, usual: int) -> np.ndarray:
+    """An output (N,) with the first sample of each value alone, the others missing.
+
+    Where a value stays for longer than the `usual` number of samples it was measured again, and
+    every so many are kept.
+    """
+    begins = np.flatnonzero(np.r_[True, values[1:] != values[:-1]])
+    ends = np.r_[begins[1:], values.size]
+    since = np.arange(values.size) - np.repeat(begins, ends - begins)
+    left = np.repeat(ends, ends - begins) - np.arange(values.size)
+    # A run that is one sample too long is one measurement, and not two.
+    measured = (since == 0) | ((since % usual == 0) & (left > usual / 2))
+    return np.where(measured, values, np.nan)
+
+
+def repeats_removed(
+    outputs: Mapping[str, np.ndarray], stated: Mapping[str, str]
+) -> tuple[dict[str, np.ndarray], list[Finding]]:
+    """Outputs (N,), each on its own clock, with repeated values as missing samples, and notes."""
+    made, notes = dict(outputs), []
+    runs = {n: usual_run(y) for n, y in outputs.items()}
+    moving = any(runs[n] is None and _moves(y) for n, y in outputs.items())
+    for name, y in outputs.items():
+        usual, lengths = runs[name], _runs(y)[0]
+        if stated[name] == "missing" and usual is None and lengths.size:
+            # Stated by somebody who knows: then no further sign is asked for.
+            usual = round(float(np.median(lengths)))
+        if stated[name] == "keep" or usual is None or usual < 2:
+            continue
+        if stated[name] == "auto" and not moving:
+            # Nothing else shows that the vehicle moved while this signal stood still.
+            words = (
+                f"{name} keeps each value for {usual} samples; if it was measured so slowly, state "
+                "`repeats: missing`"
+            )
+            notes.append(note("repeats.kept", words, name, value=usual))
+            continue
+        made[name] = without_repeats(y, usual)
+        words = (
+            f"{name} keeps each value for {usual} samples: taken as measured at the first of them "
+            "and missing at the others (`repeats: keep` leaves them)"
+        )
+        notes.append(note("repeats.missing", words, name, value=usual))
+    return made, notes
+
+
+def _runs(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lengths (r,) of the complete runs of equal values, and sizes (r + 1,) of the jumps."""
+    seen = values[~np.isnan(values)]
+    at = np.flatnonzero(seen[1:] != seen[:-1])
+    with np.errstate(over="ignore"):  # of huge values infinite jumps: no less regular
+        return np.diff(at), np.abs(seen[at + 1] - seen[at])
+
+
+def _moves(values: np.ndarray) -> bool:
+    seen = values[~np.isnan(values)]
+    return seen.size > 1 and float(np.mean(seen[1:] != seen[:-1])) >= _MOVES

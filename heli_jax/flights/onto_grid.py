@@ -1,18 +1,33 @@
-"""Common steps from tables of rows, and topics with clocks of their own, to a `Flight`.
+"""From signals on clocks of their own, as logs have them, to a `Flight` on one uniform grid.
 
-Sentences about a wrong log are not among it: they name rows of a table, and seconds of a topic.
+The rows of a table are a topic too: its places in messages are lines, those of an autopilot's log
+are times.
 """
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
+from heli_jax.errors import InputError
 from heli_jax.finding import Finding, note
+from heli_jax.flights.as_logged import as_logged
 from heli_jax.flights.flight import Flight, Source
+from heli_jax.flights.grid import (
+    LATEST,
+    SHORTEST_STEP,
+    Grid,
+    Uneven,
+    not_increasing,
+    rounding_of,
+    uniform_grid,
+)
 from heli_jax.flights.holds import LOW_PASSED, Decision, decide, low_passed
-from heli_jax.flights.repeats import repeats_removed
-from heli_jax.flights.request import Request
+from heli_jax.flights.log import ChannelLog, Topic, column, sample_count, shown, wrong
+from heli_jax.flights.marks import infinite, repeats_removed
+from heli_jax.flights.request import FEWEST, Key, Request, other_units
 from heli_jax.flights.resample import (
     OWN,
     Timed,
@@ -27,102 +42,368 @@ from heli_jax.flights.resample import (
     is_slower,
     longest_gap,
     own_clock,
+    rate_notes,
     resampled,
-    slower_words,
     usual_step,
 )
-from heli_jax.flights.table import shown
 
-Key = tuple[str, str]
-"""a model's name, and `input` or `output`"""
-_NO_HOLD = Decision("", "")
-FEWEST = 8
-"""samples in a run"""
 MOST_UPSAMPLING = 100
 """times the log's rate: more is a slip, and fills the memory with straight lines"""
+_ALIKE = 1e-3
+"""by which the rate of a grid and that of an output differ at most where both are one"""
+_SAME = 1e-6
+"""of a step, by which stamps differ at most that are one"""
+_MOST_GAPS = 20
+"""times the samples that there are"""
+_AN_INPUT = "; an input acts all the time: fill it in, or take windows without that part"
 
 
-class LongGap(NamedTuple):
-    """A step that nothing should bridge: the sample before it, its size and the limit [s]."""
-
-    row: int
-    step: float
-    most: float
+# The clocks of a log's topics, and signals on them.
 
 
-def long_gap(seconds: np.ndarray) -> LongGap | None:
-    """The longest step between stamps (N,) [s] where it is too long to be bridged."""
-    steps, most = np.diff(seconds), longest_gap(seconds)
-    row = int(np.argmax(steps))
-    # A step of exactly the limit, but for its rounding, passes.
-    return LongGap(row, float(steps[row]), most) if steps[row] > most * (1 + 1e-9) else None
+@dataclass(frozen=True, eq=False)
+class TopicClock:
+    """The times of one topic inside the window.
+
+    Attributes:
+        name: of the topic.
+        seconds: (N,) [s] from the log's beginning.
+        rows: of the topic that they are.
+        topic: itself.
+    """
+
+    name: str
+    seconds: np.ndarray
+    rows: slice
+    topic: Topic
+
+    @property
+    def usual(self) -> float:
+        """The usual step [s]."""
+        return float(np.median(np.diff(self.seconds)))
+
+    @property
+    def words(self) -> str:
+        return f"{self.name} at about {1 / self.usual:.4g} Hz"
+
+    def part(self, rows: slice) -> "TopicClock":
+        """Return the clock at some of its own rows."""
+        first = self.rows.start
+        of_topic = slice(first + rows.start, first + rows.stop)
+        return replace(self, seconds=self.seconds[rows], rows=of_topic)
+
+    def grid(self) -> Grid | Uneven:
+        """The uniform grid that the stamps are, if they are one."""
+        rounding, table = rounding_of(self.seconds), self.topic.rows
+        if table is not None:
+            rounding = rounding_of(table.stamps[self.rows]) * table.scale
+        return uniform_grid(self.seconds, rounding)
+
+    def wrong(self, path: str, problem: str, i: int) -> InputError:
+        """The error at the i-th of the times, with the line of a table or the topic's name."""
+        places = (f"topic {shown(self.name)}",)
+        if (rows := self.topic.rows) is not None:
+            places = rows.table.place(self.rows.start + i), column(self.topic.clock)
+        return wrong(path, f"{problem} at {self.seconds[i]:.6g} s", *places)
+
+
+@dataclass(frozen=True, eq=False)
+class ClockedSignal:
+    """Samples (N,) in SI on the clock of a topic."""
+
+    clock: TopicClock
+    values: np.ndarray
+
+    @property
+    def timed(self) -> Timed:
+        """The stamps and the samples."""
+        return Timed(self.clock.seconds, self.values)
+
+
+def rows_in_window(
+    path: str, elapsed: np.ndarray, window: tuple[float, float] | None, *place: str
+) -> slice:
+    """The rows of a clock (N,) [s] inside the window."""
+    first, last = 0, elapsed.size
+    where = ""
+    if window is not None and elapsed.size > 1:
+        # The bounds are inclusive whatever the rounding of the stamps. The median and not the mean,
+        # which would count the gaps.
+        near = 1e-3 * float(np.median(np.diff(elapsed)))
+        first = int(np.searchsorted(elapsed, window[0] - near, side="left"))
+        last = int(np.searchsorted(elapsed, window[1] + near, side="right"))
+        where = f" from {window[0]:g} s to {window[1]:g} s"
+    if last - first < FEWEST:
+        span = f"; it goes from {elapsed[0]:.6g} s to {elapsed[-1]:.6g} s" if elapsed.size else ""
+        problem = f"holds {sample_count(max(last - first, 0))}{where}, expected at least {FEWEST}"
+        raise wrong(path, f"{problem}{span}", *place)
+    return slice(first, last)
+
+
+def topic_clock(log: ChannelLog, topic: Topic, window: tuple[float, float] | None) -> TopicClock:
+    """Return the times of a topic inside the window [s], finite and increasing."""
+    place = () if topic.rows else (f"topic {shown(topic.name)}",)
+    elapsed = topic.times - log.first_time
+    if elapsed.size and not np.all(np.abs(elapsed) <= LATEST):
+        raise wrong(log.path, "got times that are no finite numbers, expected a clock", *place)
+    # What lies outside of the window may be as wrong as it likes: stamps that go back there do no
+    # harm.
+    if window is not None and np.any(np.diff(elapsed) <= 0):
+        inside = np.flatnonzero((elapsed >= window[0]) & (elapsed <= window[1]))
+        rows = slice(int(inside[0]), int(inside[-1]) + 1) if inside.size else slice(0, 0)
+        rows_in_window(log.path, elapsed[rows], None, *place)
+    else:
+        rows = rows_in_window(log.path, elapsed, window, *place)
+    clock = TopicClock(topic.name, elapsed[rows], rows, topic)
+    if (back := not_increasing(clock.seconds)) is not None:
+        row, fault = back
+        problem = f"the time {fault} after {clock.seconds[row - 1]:.6g} s, expected increasing"
+        raise wrong(log.path, f"{problem} times; give a window without it", *place)
+    # The median and not the mean, which one long gap would lift above any limit.
+    if clock.usual < SHORTEST_STEP:
+        problem = "the usual step is shorter than 1 ns, expected a clock; look at the time's unit;"
+        raise clock.wrong(log.path, f"{problem} it begins", 0)
+    return clock
+
+
+def signals_of(log: ChannelLog, request: Request) -> dict[Key, ClockedSignal]:
+    """Return the signals in SI inside the window, each on the clock of its topic."""
+    clocks: dict[str, TopicClock] = {}
+    signals = {}
+    for key, signal in request.signals.items():
+        topic, channel = log.topic_of(signal.name), log.channel(signal.name)
+        if topic.name not in clocks:
+            clocks[topic.name] = topic_clock(log, topic, request.options.window)
+        signals[key] = _in_si(log, request, key, channel.values, clocks[topic.name])
+    return signals
+
+
+def _in_si(
+    log: ChannelLog, request: Request, key: Key, numbers: np.ndarray, clock: TopicClock
+) -> ClockedSignal:
+    signal, kind, numbers = request.signals[key], key[1], numbers[clock.rows]
+    with np.errstate(over="ignore"):  # what overflows is refused below
+        values = signal.to_si(numbers)
+    # An output may be missing here and there.
+    bad = infinite(values, numbers) if kind == "output" else ~np.isfinite(values)
+    if not bad.any():
+        return ClockedSignal(clock, values)
+    i = int(np.argmax(bad))
+    more = _AN_INPUT if kind == "input" and np.isnan(numbers[i]) else ""
+    if clock.topic.rows is None:
+        problem = f"got {numbers[i]} at {clock.seconds[i]:.6g} s, expected a finite number{more}"
+        raise wrong(log.path, problem, f"channel {shown(signal.name)}")
+    table, row = clock.topic.rows.table, clock.rows.start + i
+    is_derived = signal.name not in table.names
+    cell = f"{numbers[i]:g}" if is_derived else table.cell_text(signal.name, row)
+    problem = f"got {cell}, expected a finite number{more}"
+    raise wrong(log.path, problem, table.place(row), column(signal.name))
 
 
 def window_note(
-    window: tuple[float, float] | None, end: float, step: float = 0.0
+    window: tuple[float, float] | None, times: Iterable[np.ndarray], begin: float
 ) -> tuple[Finding, ...]:
-    """A note where a window reaches beyond the log, else none."""
-    if window is None or (window[0] >= 0 and window[1] <= end + 1.001 * step):
+    """A note where a window reaches beyond the clocks (N,) of a log that begins at a time [s]."""
+    # The one that ends first is where the flight does.
+    last = min((t for t in times if t.size > 1), key=lambda t: t[-1], default=None)
+    if window is None or last is None:
+        return ()
+    end, step = float(last[-1]) - begin, float(np.median(np.diff(last)))
+    if window[0] >= 0 and window[1] <= end + 1.001 * step:
         return ()
     words = f"the window from {window[0]:g} s to {window[1]:g} s was cut to the log"
     return (note("windows.cut", f"{words}, which ends at {end:.6g} s", value=end),)
 
 
-def even_expected(seconds: np.ndarray, usual: float) -> str:
-    """Return the remedy for stamps (N,) [s] that are no uniform grid; `usual` is the step [s] of
-    most."""
-    # Where a gap is too long to be bridged, a rate would only lead to the next error.
-    bridged = long_gap(seconds) is None
-    remedy = f"`rate: {1 / usual:.4g}` to resample, or " if bridged else ""
-    # The parts beside it may well be uniform.
-    split = "" if bridged else " or `gaps: split`"
-    return f"expected a uniform grid; give {remedy}a window without such steps{split}"
+# From them to one grid.
+
+
+def flight_of_signals(
+    signals: Mapping[Key, ClockedSignal], request: Request, source: Source
+) -> Flight:
+    """The flight of signals with clocks of their own.
+
+    The samples of a table stay as they are where they are a uniform grid of the rate that is asked
+    for. Else they are resampled: inputs by their hold, outputs on straight lines where they are as
+    fast as the rate; what is slower is missing between its samples.
+    """
+    clocks, rate, path = clocks_of(signals.values()), request.options.rate, source.path
+    grid = None
+    if len(clocks) == 1 and (rate is None or clocks[0].topic.rows is not None):
+        # Before the samples are looked at: a wrong unit makes anything of their steps.
+        grid = clocks[0].grid()
+        if isinstance(grid, Uneven) and rate is None:
+            raise _uneven(path, clocks[0], grid)
+    logged = as_logged(request, {key: s.timed for key, s in signals.items()})
+    values = {key: timed.values for key, timed in logged.signals.items()}
+    # Before any resampling, which moves an input at more samples than the log shows it to.
+    holds = decided_holds(request, values)
+    outputs = request.of_kind("output", values)
+    stated = {name: request.signals[name, "output"].repeats for name in outputs}
+    once, repeated = repeats_removed(outputs, stated)
+    values |= {(name, "output"): y for name, y in once.items()}
+    signals = {key: replace(s, values=values[key]) for key, s in signals.items()}
+    notes = [*other_units(request), *logged.notes, *repeated, *_missing(request, signals)]
+    # A rate that leaves the log's own grid by less than half a sample at its end is that grid: the
+    # samples stay as they are, unblurred by interpolation.
+    start, end = float(clocks[0].seconds[0]), float(clocks[0].seconds[-1])
+    if isinstance(grid, Grid) and (
+        rate is None or abs(rate * grid.dt - 1.0) * clocks[0].seconds.size < 0.5
+    ):
+        dt = grid.dt if rate is None else 1.0 / rate
+        made = OnGrid(values, holds, list(grid.notes))
+    else:
+        if rate is None:
+            raise _several(path, clocks)
+        if isinstance(grid, Grid):
+            # The grid is better than its rounded stamps: held inputs would slip by a sample.
+            even = start + grid.dt * np.arange(clocks[0].seconds.size)
+            clock = replace(clocks[0], seconds=even)
+            signals = {key: replace(s, clock=clock) for key, s in signals.items()}
+            notes += grid.notes
+        times, of_rate = _times(path, signals, rate)
+        notes += of_rate
+        made = at_times(request, {key: s.timed for key, s in signals.items()}, holds, times)
+        start, dt = float(times[0]), 1.0 / rate
+        end = end if len(clocks) == 1 else float(times[-1])
+    rates = {n: 1.0 / s.clock.usual for (n, kind), s in signals.items() if kind == "output"}
+    source = replace(
+        source,
+        notes=(*source.notes, *notes, *made.notes),
+        rates=rates,
+        facts={key: f.within(start, end) for key, f in logged.facts.items()},
+    )
+    return Flight(
+        dt=dt,
+        inputs=request.of_kind("input", made.samples),
+        outputs=request.of_kind("output", made.samples),
+        t0=source.first_time + start,
+        sd=request.noise(),
+        known=request.known,
+        hold_out=request.options.hold_out,
+        name=request.options.name,
+        source=source,
+        hold={key: decision.hold for key, decision in made.holds.items()},
+        hold_reason={key: d.reason for key, d in made.holds.items() if d.reason},
+    )
 
 
 def decided_holds(request: Request, values: Mapping[Key, np.ndarray]) -> dict[str, Decision]:
     """Decide the hold of each input: as stated, or by its own samples (N,)."""
-    holds = {}
-    for (key, kind), signal in request.signals.items():
-        if kind == "input":
-            stated = Decision(signal.hold, "")  # no reason: the log decided nothing
-            holds[key] = decide(values[key, kind]) if signal.hold == "auto" else stated
-    return holds
+    return {
+        # No reason where it is stated: the log decided nothing.
+        key: decide(values[key, kind]) if signal.hold == "auto" else Decision(signal.hold, "")
+        for (key, kind), signal in request.signals.items()
+        if kind == "input"
+    }
 
 
-def sample_notes(request: Request, signals: Mapping[Key, Timed]) -> list[Finding]:
+def _missing(request: Request, signals: Mapping[Key, ClockedSignal]) -> list[Finding]:
     """A note for every output with missing samples: how many, and where in the log."""
     notes = []
     for key, signal in signals.items():
         missing = np.isnan(signal.values)
-        count = int(missing.sum())
-        if count:
-            name = shown(request.signals[key].name)
-            words = f"{count} of {missing.size} samples of {name} {'is' if count == 1 else 'are'}"
-            words += f" missing, {_where(signal.seconds[missing], missing)}"
-            notes.append(note("samples.missing", words, key[0], value=count))
+        if not missing.any():
+            continue
+        count, seconds = int(missing.sum()), signal.clock.seconds[missing]
+        runs = int(missing[0]) + int(np.count_nonzero(missing[1:] & ~missing[:-1]))
+        words = f"{count} of {missing.size} samples of {shown(request.signals[key].name)} are"
+        words += f" missing, in {runs} places from {seconds[0]:.6g} s to {seconds[-1]:.6g} s"
+        notes.append(note("samples.missing", words, key[0], value=count))
     return notes
 
 
-def _where(seconds: np.ndarray, missing: np.ndarray) -> str:
-    """Describe the missing samples: their times [s] and their indices of all samples (N,)."""
-    first, last = f"{seconds[0]:.6g} s", f"{seconds[-1]:.6g} s"
-    if seconds.size == 1:
-        return f"at {first}"
-    runs = int(missing[0]) + int(np.count_nonzero(missing[1:] & ~missing[:-1]))
-    if runs == 1:
-        return f"all from {first} to {last}"
-    return f"in {runs} places from {first} to {last}"
+def clocks_of(signals: Iterable[ClockedSignal]) -> list[TopicClock]:
+    """One for each topic, since signals of the same topic share their stamps."""
+    return list({s.clock.name: s.clock for s in signals}.values())
 
 
-def measured_once(
-    request: Request, signals: Mapping[Key, Timed]
-) -> tuple[dict[Key, np.ndarray], list[Finding]]:
-    """The signals (N,), repeated values of slow outputs taken as missing, and notes."""
-    outputs = request.of_kind("output", signals)
-    stated = {name: request.signals[name, "output"].repeats for name in outputs}
-    made, notes = repeats_removed(outputs, stated)
-    values = {key: signal.values for key, signal in signals.items()}
-    return {**values, **{(name, "output"): y for name, y in made.items()}}, notes
+def on_all_the_time(signals: Mapping[Key, ClockedSignal], rate: float) -> list[TopicClock]:
+    """The clocks whose samples the flight needs throughout: of the inputs, and of outputs that are
+    not slower than the `rate` [Hz]; what is slower is missing most of the time anyway."""
+    needed = [s for (_, kind), s in signals.items() if kind == "input"]
+    needed += [
+        s for (_, kind), s in signals.items() if kind == "output" and not is_slower(s.timed, rate)
+    ]
+    return clocks_of(needed or signals.values())
+
+
+def _times(
+    path: str, signals: Mapping[Key, ClockedSignal], rate: float
+) -> tuple[np.ndarray, list[Finding]]:
+    """The times (M,) [s] of the grid of a rate [Hz], and notes on how the signals come there."""
+    clocks, notes = on_all_the_time(signals, rate), []
+    for clock in clocks:
+        found = rate_notes(clock.seconds, rate)
+        notes += [n.of(clock.name) if clock.topic.rows is None else n for n in found]
+        steps, most = np.diff(clock.seconds), longest_gap(clock.seconds)
+        row = int(np.argmax(steps))
+        # A step of exactly the limit, but for its rounding, passes.
+        if steps[row] > most * (1 + 1e-9):
+            problem = f"a gap of {steps[row]:.6g} s, expected none longer than {most:.3g} s; give a"
+            problem += " window without it, or `gaps: split`; it ends"
+            raise clock.wrong(path, problem, row + 1)
+    outputs = (s.clock for (_, kind), s in signals.items() if kind == "output")
+    alike = next((c for c in outputs if abs(rate * c.usual - 1.0) < _ALIKE), None)
+    return common_times(path, clocks, rate, alike), notes
+
+
+def _uneven(path: str, clock: TopicClock, uneven: Uneven) -> InputError:
+    """The error for stamps that are no uniform grid, with the remedy."""
+    problem = f"a step of {uneven.step:.6g} s where {uneven.usual:.6g} s is usual"
+    if uneven.drift is not None:
+        problem = f"the times leave a uniform grid by {uneven.drift:.2g} samples"
+    # Where a gap is too long to be bridged, a rate would only lead to the next error, and the parts
+    # beside it may well be uniform.
+    bridged = np.diff(clock.seconds).max() <= longest_gap(clock.seconds) * (1 + 1e-9)
+    remedy = f"`rate: {1 / uneven.usual:.4g}` to resample, or " if bridged else ""
+    remedy += "a window without such steps" + ("" if bridged else " or `gaps: split`")
+    return clock.wrong(path, f"{problem}, expected a uniform grid; give {remedy};", uneven.row)
+
+
+def _several(path: str, clocks: Sequence[TopicClock]) -> InputError:
+    slowest = min(1 / clock.usual for clock in clocks)
+    words = ", ".join(clock.words for clock in clocks)
+    problem = f"the signals have {len(clocks)} clocks ({words}), expected a rate to which"
+    return wrong(path, f"{problem} they are resampled, such as `rate: {slowest:.3g}`")
+
+
+def common_times(
+    path: str, clocks: list[TopicClock], rate: float, on: TopicClock | None = None
+) -> np.ndarray:
+    """Times (M,) [s] at the rate [Hz] at which all topics have samples before and behind.
+
+    Args:
+        clocks: of the topics, at least one; their times count from the log's beginning.
+        rate: of the times [Hz].
+        on: a clock at a sample of which they begin: one of that rate. Samples that fall on the grid
+            stay as they are; a mean of two neighbours has less noise, and that is not white.
+    """
+    # Nothing is extrapolated: what a topic did before its first sample or behind its last nobody
+    # knows.
+    start = max(float(clock.seconds[0]) for clock in clocks)
+    if on is not None:
+        later = on.seconds[on.seconds >= start - _SAME * on.usual]
+        start = max(start, float(later[0])) if later.size else start
+    end = min(float(clock.seconds[-1]) for clock in clocks)
+    count, usual = (end - start) * rate, min(clock.usual for clock in clocks)
+    # Written so that a NaN is refused too, here and below.
+    if not count >= FEWEST - 1 - 1e-6:
+        problem = f"a rate of {rate:g} Hz leaves fewer than {FEWEST} samples"
+        raise wrong(path, f"{problem} of {max(count / rate, 0.0):.6g} s, expected more")
+    # The product can overflow where the rate alone is finite.
+    if not (rate * usual <= MOST_UPSAMPLING and math.isfinite(count)):
+        problem = f"a rate of {rate:g} Hz for a log of about {1 / usual:.4g} Hz"
+        # A thousandth of such a step is one of a flight.
+        unit = "; is its time in ms (time.unit)?" if 1.0 <= usual <= 1e3 else ""
+        raise wrong(path, f"{problem}, expected at most {MOST_UPSAMPLING} times as much{unit}")
+    # One wrong stamp at the end of a damaged log would otherwise fill the memory.
+    most = _MOST_GAPS * max(clock.seconds.size * max(1.0, rate * clock.usual) for clock in clocks)
+    if count > most:
+        problem = f"the times go over {end - start:.6g} s, of which samples cover less than 5 %"
+        raise wrong(path, f"{problem}, expected a window without such gaps")
+    # Counted and multiplied, never added up: the sum of 1e6 rounded steps would drift.
+    return start + np.arange(int(count + 1e-6) + 1) / rate
 
 
 class OnGrid(NamedTuple):
@@ -145,8 +426,13 @@ def at_times(
     instant nearest to its jump. Other inputs and the outputs are interpolated, or low-pass filtered
     where the rate goes down; outputs that are slower than the grid stand at the instants nearest to
     their own. A held input that a low-passed output follows within a sample is low-passed too, and
-    is linear between samples then. Args: request: names them. signals: by key, SI, each on its own
-    clock. holds: by input. times: of the grid (M,) [s].
+    is linear between samples then.
+
+    Args:
+        request: names them.
+        signals: by key, SI, each on its own clock.
+        holds: by input.
+        times: of the grid (M,) [s].
     """
     samples, notes, rate = {}, [], 1.0 / float(times[1] - times[0])
     alike = _alike(request, signals, holds, times)
@@ -172,13 +458,15 @@ def at_times(
             else:
                 # A low-pass filter would turn a stick that jumps into one that rings.
                 samples[key, kind] = held_mean(*signal, times)
-                if not np.isin(samples[key, kind], signal.values).all():
-                    notes += _between(request, signals, key, times)
         elif is_slower(signal, rate):
-            placed = at_nearest(signal, times)
-            samples[key, kind] = placed.samples
-            words = slower_words(shown(request.signals[key, kind].name), placed, signal, rate)
-            count = int(np.count_nonzero(np.isfinite(placed.samples)))
+            samples[key, kind] = at_nearest(signal, times)
+            count = int(np.count_nonzero(np.isfinite(samples[key, kind])))
+            words = (
+                f"{shown(request.signals[key, kind].name)} at about "
+                f"{1 / usual_step(own_clock(signal).seconds):.4g} Hz is slower than the grid of "
+                f"{rate:.6g} Hz: {count} samples at the instants nearest to their own; between "
+                "them it is missing"
+            )
             notes.append(note("resampling.slower", words, key, value=count))
         else:
             own = own_clock(signal)
@@ -203,28 +491,6 @@ def at_times(
     return OnGrid(samples, decided, notes)
 
 
-def _between(
-    request: Request, signals: Mapping[Key, Timed], name: str, times: np.ndarray
-) -> list[Finding]:
-    """Note held inputs that move between the samples of outputs that jump with them."""
-    signal = signals[name, "input"]
-    jump = [o for (i, o), at_once in request.options.follows.items() if i == name and at_once]
-    # What is low-passed is no longer here, and a slower one has its samples where they were.
-    rate = 1.0 / float(times[1] - times[0])
-    jump = [
-        o for o in jump if (o, "output") in signals and not is_slower(signals[o, "output"], rate)
-    ]
-    if not jump or not goes_down(signal.seconds, times):
-        return []
-    hz = 1.0 / usual_step(signal.seconds)
-    words = (
-        f"{', '.join(jump)} and {name} jump together, and {name} was logged at about {hz:.4g} Hz: "
-        "its mean over a step is not what they show at the step's beginning, and estimates suffer; "
-        f"a rate as high as that of {name} keeps both as they are"
-    )
-    return [note("resampling.jumps-averaged", words, name, *jump, value=hz)]
-
-
 def _alike(
     request: Request,
     signals: Mapping[Key, Timed],
@@ -235,10 +501,10 @@ def _alike(
     sample of the grid (M,) [s]."""
     alike: dict[str, list[str]] = {}
     for name, output in request.options.follows:
-        if holds.get(name, _NO_HOLD).hold == "zero-order" and (output, "output") in signals:
-            own = own_clock(signals[output, "output"])
-            if goes_down(own.seconds, times):
-                alike.setdefault(name, []).append(output)
+        held = name in holds and holds[name].hold == "zero-order"
+        signal = signals.get((output, "output"))
+        if held and signal is not None and goes_down(own_clock(signal).seconds, times):
+            alike.setdefault(name, []).append(output)
     return alike
 
 
@@ -263,28 +529,3 @@ def _resampled_with(
     gains = np.linalg.lstsq(np.diff(held)[:, known].T, moves[known], rcond=None)[0]
     jumping = gains @ np.array([low for _, low in inputs])
     return resampled(seconds, values - gains @ held, times) + jumping
-
-
-def flight_of(
-    request: Request,
-    samples: Mapping[Key, np.ndarray],
-    dt: float,
-    t0: float,
-    holds: Mapping[str, Decision],
-    source: Source,
-) -> Flight:
-    """The flight of samples (N,) on one grid."""
-    options = request.options
-    return Flight(
-        dt=dt,
-        inputs=request.of_kind("input", samples),
-        outputs=request.of_kind("output", samples),
-        t0=t0,
-        sd=request.noise(),
-        known=request.known,
-        hold_out=options.hold_out,
-        name=options.name,
-        source=source,
-        hold={key: decision.hold for key, decision in holds.items()},
-        hold_reason={key: decision.reason for key, decision in holds.items() if decision.reason},
-    )

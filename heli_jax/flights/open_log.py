@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 from heli_jax.flights import progress
 from heli_jax.flights.formats import (
@@ -16,15 +17,14 @@ from heli_jax.flights.formats import (
     numpy_arrays,
     ulog,
 )
-from heli_jax.flights.log import ChannelLog
-from heli_jax.flights.table import Table, require_short_names, shown, wrong
+from heli_jax.flights.log import ChannelLog, Table, require_short_names, shown, wrong
 from heli_jax.regular_file import open_regular, require_regular
 
 _SNIFFED = 8192
 """bytes: a DataFlash log in text may begin with the firmware's own lines"""
 _TEXTS = (".csv", ".txt", ".tsv", ".asc", ".dat", ".log", ".lvm", ".prn", ".tab")
-_AUTOPILOTS = (ulog.MAGIC, dataflash.MAGIC, blackbox_frames.MARK)
-"""what their logs begin with, and no table does"""
+_ARRAYS = (".mat", ".nc", ".h5", ".hdf5")
+"""which go by their ending: MATLAB 7.3, NetCDF 4 and HDF5 files begin alike"""
 EXPECTED = (
     "expected a table (.csv, .txt, .tsv, .asc, .dat, .lvm, .parquet, .feather, .json), arrays "
     "(.mat, .nc, .h5, .hdf5, .npz, .npy) or an autopilot's log (.ulg, .bin, .log, .bbl, .bfl)"
@@ -100,75 +100,69 @@ def open_flights(path: str | Path) -> Table | tuple[ChannelLog, ...]:
 _Reader = Callable[[Path], Table | tuple[ChannelLog, ...]]
 
 
-def _reader(path: Path) -> _Reader:
-    ending = path.suffix.lower()
-    with open_regular(path, "a log", sys.maxsize) as file:
-        head = file.read(_SNIFFED)
-    _refuse_foreign(path, head)
-    # By the ending first where it says enough, so that a damaged Parquet file is called so and not
-    # read as text.
-    if ending == ".parquet":
-        return arrow.open_parquet
-    if csv_text.is_gzipped(path):
-        if csv_text.inner_ending(path) not in _TEXTS:
-            problem = f"is packed by gzip, which is read of texts alone ({', '.join(_TEXTS[:3])})"
-            raise wrong(str(path), f"{problem}; expected it unpacked")
-        return csv_text.open_csv
-    marked = _by_content(head)
-    # What such a file begins with is the user's own text, which may look like the mark of any
-    # other; but an autopilot's log may have been given the name of a table.
-    if ending in (".csv", ".tsv"):
-        exported = head.lstrip().startswith(b"FMT,") and dataflash.is_dataflash_text(head)
-        of_autopilot = exported or head.startswith(_AUTOPILOTS)
-        return marked if marked is not None and of_autopilot else csv_text.open_csv
-    # Arrays go by their ending, since MATLAB 7.3, NetCDF 4 and HDF5 files hold the same mark.
-    if marked is not None and ending not in (".mat", ".nc", ".h5", ".hdf5"):
-        return marked
-    if ending not in _BY_NAME:
-        raise wrong(str(path), f"logs ending in {shown(path.suffix)} cannot be read, {EXPECTED}")
-    return _BY_NAME[ending]
+class Format(NamedTuple):
+    """A format that is read: by what its files begin with, and by their ending."""
 
-
-def _by_content(head: bytes) -> _Reader | None:
-    """The reader of a file whose first bytes say what it is, whatever it is called."""
-    for mark, reader in _READERS:
-        if head.startswith(mark):
-            return reader
-    # Anywhere in the first bytes: its reader looks for the beginning of each flight, and does not
-    # mind what stands before the first.
-    if blackbox_frames.MARK in head:
-        return blackbox.open_blackbox
-    return _one(dataflash.open_dataflash_text) if dataflash.is_dataflash_text(head) else None
+    read: _Reader
+    endings: tuple[str, ...]
+    marks: tuple[bytes, ...] = ()
+    of_autopilot: bool = False
 
 
 def _one(reader: Callable[[Path], ChannelLog]) -> _Reader:
     return lambda path: (reader(path),)
 
 
-_READERS: tuple[tuple[bytes, _Reader], ...] = (
-    (ulog.MAGIC, _one(ulog.open_ulog)),
-    (dataflash.MAGIC, _one(dataflash.open_dataflash)),
-    (b"PAR1", arrow.open_parquet),
-    (library_arrays.MATLAB_MAGIC, library_arrays.open_mat),
-    *((magic, library_arrays.open_netcdf) for magic in library_arrays.NETCDF_MAGICS),
-    (library_arrays.HDF5_MAGIC, library_arrays.open_hdf5),
-    (numpy_arrays.MAGIC, numpy_arrays.open_numpy),
-    (arrow.ARROW_MARK, arrow.open_arrow),
+FORMATS = (
+    Format(_one(ulog.open_ulog), (".ulg",), (ulog.MAGIC,), of_autopilot=True),
+    Format(_one(dataflash.open_dataflash), (".bin",), (dataflash.MAGIC,), of_autopilot=True),
+    Format(blackbox.open_blackbox, (".bbl", ".bfl"), (blackbox_frames.MARK,), of_autopilot=True),
+    Format(csv_text.open_csv, _TEXTS),
+    Format(arrow.open_parquet, (".parquet",), (b"PAR1",)),
+    Format(arrow.open_arrow, (".feather", ".arrow", ".arrows", ".ipc"), (arrow.ARROW_MARK,)),
+    Format(json_records.open_json, (".json", ".jsonl", ".ndjson")),
+    Format(numpy_arrays.open_numpy, (".npy", ".npz"), (numpy_arrays.MAGIC,)),
+    Format(library_arrays.open_mat, (".mat",), (library_arrays.MATLAB_MAGIC,)),
+    Format(library_arrays.open_netcdf, (".nc",), library_arrays.NETCDF_MAGICS),
+    Format(library_arrays.open_hdf5, (".h5", ".hdf5"), (library_arrays.HDF5_MAGIC,)),
 )
-"""by what their files begin with"""
-_BY_NAME: dict[str, _Reader] = {
-    **dict.fromkeys(_TEXTS, csv_text.open_csv),
-    **dict.fromkeys((".feather", ".arrow", ".arrows", ".ipc"), arrow.open_arrow),
-    **dict.fromkeys((".json", ".jsonl", ".ndjson"), json_records.open_json),
-    **dict.fromkeys((".npy", ".npz"), numpy_arrays.open_numpy),
-    **dict.fromkeys((".h5", ".hdf5"), library_arrays.open_hdf5),
-    **dict.fromkeys((".bbl", ".bfl"), blackbox.open_blackbox),
-    ".mat": library_arrays.open_mat,
-    ".nc": library_arrays.open_netcdf,
-    ".ulg": _one(ulog.open_ulog),
-    ".bin": _one(dataflash.open_dataflash),
-}
-"""by their ending"""
+
+
+def _reader(path: Path) -> _Reader:
+    ending = path.suffix.lower()
+    with open_regular(path, "a log", sys.maxsize) as file:
+        head = file.read(_SNIFFED)
+    _refuse_foreign(path, head)
+    if csv_text.is_gzipped(path):
+        if csv_text.inner_ending(path) not in _TEXTS:
+            problem = f"is packed by gzip, which is read of texts alone ({', '.join(_TEXTS[:3])})"
+            raise wrong(str(path), f"{problem}; expected it unpacked")
+        return csv_text.open_csv
+    # By the ending where it says enough, so that a damaged Parquet file is called so, and no text.
+    named = next((f.read for f in FORMATS if ending in f.endings), None)
+    marked = None
+    if ending not in (*_ARRAYS, ".parquet"):
+        marked = _by_content(head, is_table=ending in (".csv", ".tsv"))
+    reader = marked or named
+    if reader is None:
+        raise wrong(str(path), f"logs ending in {shown(path.suffix)} cannot be read, {EXPECTED}")
+    return reader
+
+
+def _by_content(head: bytes, is_table: bool) -> _Reader | None:
+    """The reader of a file whose first bytes say what it is, whatever it is called.
+
+    What a table begins with is the user's own text, which may look like the mark of another format;
+    but an autopilot's log may have been given the name of a table.
+    """
+    for known in FORMATS:
+        if known.marks and head.startswith(known.marks) and (known.of_autopilot or not is_table):
+            return known.read
+    if dataflash.is_dataflash_text(head) and (not is_table or head.lstrip().startswith(b"FMT,")):
+        return _one(dataflash.open_dataflash_text)
+    # Anywhere in the first bytes: its reader looks for the beginning of each flight, and does not
+    # mind what stands before the first.
+    return blackbox.open_blackbox if blackbox_frames.MARK in head and not is_table else None
 
 
 # Files that hold flights and are not read: what each is, and what to make of it instead.

@@ -16,8 +16,7 @@ from heli_jax.errors import nearest
 from heli_jax.finding import Finding, note
 from heli_jax.flights.derived import sources
 from heli_jax.flights.flight import Signal
-from heli_jax.flights.log import ChannelLog
-from heli_jax.flights.table import Table, wrong
+from heli_jax.flights.log import ChannelLog, Table, wrong
 from heli_jax.yaml_file import parse_mapping
 
 _SIGNALS = "signals"

@@ -2,39 +2,47 @@
 
 import copy
 import dataclasses
-import functools
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from heli_jax.errors import InputError
-from heli_jax.finding import LEFT_OUT, Finding, note
+from heli_jax.finding import LEFT_OUT, Finding, note, sentences
+from heli_jax.flights.align import NotAligned, lag_between
 from heli_jax.flights.as_logged import measured
-from heli_jax.flights.flight import Flight, Signal
+from heli_jax.flights.derived import with_derived
+from heli_jax.flights.flight import Flight, Signal, Source
+from heli_jax.flights.formats.arrays import ArrayTable, by_clocks
 from heli_jax.flights.holds import Decision
-from heli_jax.flights.log import ChannelLog
-from heli_jax.flights.onto_grid import FEWEST, decided_holds
-from heli_jax.flights.origins import with_origins, without_constants
+from heli_jax.flights.log import ChannelLog, Table, shown, wrong
+from heli_jax.flights.marks import without_marks
+from heli_jax.flights.onto_grid import (
+    ClockedSignal,
+    clocks_of,
+    decided_holds,
+    flight_of_signals,
+    on_all_the_time,
+    rows_in_window,
+    signals_of,
+    window_note,
+)
+from heli_jax.flights.open_log import open_log
 from heli_jax.flights.parts import is_too_short, stretches
-from heli_jax.flights.read_channels import clocks_of, on_all_the_time
-from heli_jax.flights.request import ReadOptions, Request
-from heli_jax.flights.resample import Timed
-from heli_jax.flights.sources import Opened, beyond, clocked, flight_from, opened
-from heli_jax.flights.table import Table, wrong
+from heli_jax.flights.read_table import load_table
+from heli_jax.flights.request import FEWEST, Also, Key, ReadOptions, Request, with_file_units
 
 _DEFAULT = ReadOptions()
 _SHORTEST = 0.05
 """s: no vehicle answers a stick sooner"""
 _STILL = 1e-100
 """SI: an output that moves by no more does not move"""
-
+_SHARED = 0.5
+"""of the shorter of two logs of one clock that the other covers too, at least"""
 
 type _Log = str | Path | ChannelLog | Table
-type _Finish = Callable[[Flight], Flight]
-"""adds what is in no log, and what the signals are in theirs"""
 
 
 def read_flight(
@@ -66,8 +74,8 @@ def read_flight(
         TypeError: a keyword that is no field of ReadOptions.
     """
     options = dataclasses.replace(options, **keywords)
-    logs, request, finish = _opened(path, time, inputs, outputs, options)
-    return finish(flight_from(logs, request))
+    logs = _opened(path, time, inputs, outputs, options)
+    return _flight(logs, logs.request)
 
 
 def read_parts(
@@ -94,28 +102,28 @@ def read_parts(
         InputError: as `read_flight`, or no part is left.
     """
     options = dataclasses.replace(options, **keywords, split=True)
-    logs, request, finish = _opened(path, time, inputs, outputs, options)
+    logs = _opened(path, time, inputs, outputs, options)
+    request = logs.request
     # A slow sensor whose rows are padded with marks is needed at its own instants alone.
     signals = {
         key: dataclasses.replace(s, values=measured(request.signals[key], s.values))
         if key[1] == "output"
         else s
-        for key, s in clocked(logs, request)[0].items()
+        for key, s in _clocked(logs, request).items()
     }
     rate = options.rate
     needed = clocks_of(signals.values()) if rate is None else on_all_the_time(signals, rate)
     clocks = [clock.seconds for clock in needed]
     intervals = stretches(clocks)
     if len(intervals) < 2:
-        return (finish(flight_from(logs, request)),)
-    values = {key: signal.values for key, signal in signals.items()}
-    holds = decided_holds(request, values)
-    inputs_of = [s.timed for (_, kind), s in signals.items() if kind == "input"]
+        return (_flight(logs, request),)
+    # By the whole run: of the few moves in a part the same stick may look different.
+    holds = decided_holds(request, {key: signal.values for key, signal in signals.items()})
+    inputs_of = [s for (_, kind), s in signals.items() if kind == "input"]
     moving = [i for i in intervals if any(_moves(u, *i) for u in inputs_of)]
     parts, left_out, why = [], [], None
     for start, end in intervals:
         name = f"{options.name or 'flight 1'}, part {len(parts) + 1}"
-        part = _of_part(request, (start, end), name, holds)
         try:
             if is_too_short((start, end), clocks):
                 raise InputError("too short")
@@ -123,86 +131,46 @@ def read_parts(
             # free decay.
             if moving and inputs_of and (start, end) not in moving:
                 raise InputError("no input moves")
-            flight = _enough_measured(finish(flight_from(logs, part)))
+            part = _part(request, (start, end), name, holds)
+            flight = _enough_measured(_flight(logs, part))
         except InputError as e:
             left_out.append(f"{start:.6g} s to {end:.6g} s ({e.within})")
             why = e
             continue
-        reasons = {
-            key: d.reason
-            for key, d in holds.items()
-            # What the resampling made of it has the part's own reason.
-            if d.reason and flight.hold.get(key) == d.hold
-        }
-        reasons = {**flight.hold_reason, **reasons}
-        parts.append(dataclasses.replace(flight, hold_reason=reasons))
+        # What the resampling made of a hold has the part's own reason.
+        whole = {n: d.reason for n, d in holds.items() if d.reason and flight.hold[n] == d.hold}
+        parts.append(dataclasses.replace(flight, hold_reason={**flight.hold_reason, **whole}))
     if not parts:
-        problem = (
-            f"{len(intervals)} parts between gaps, expected one that is long enough; the last: "
-        )
-        raise wrong(request.path, problem + left_out[-1]) from why
-    notes = (*beyond(logs, request), *_notes(intervals, left_out))
-    return (_with_notes(parts[0], notes), *parts[1:])
+        problem = f"{len(intervals)} parts between gaps, expected one that is long enough; the last"
+        raise wrong(request.path, f"{problem}: {left_out[-1]}") from why
+    gap = max(after - before for (_, before), (after, _) in itertools.pairwise(intervals))
+    words = f"gaps of up to {gap:.3g} s split the run into {len(intervals)} parts"
+    notes = [*_beyond(logs, request), note("clock.gaps-split", words, value=gap)]
+    if left_out:
+        more = f" and {len(left_out) - 3} more" if len(left_out) > 3 else ""
+        words = f"left out: {'; '.join(left_out[:3])}{more}"
+        notes.append(note("windows.left-out", words, value=len(left_out)))
+    return (_with_notes(parts[0], *notes), *parts[1:])
 
 
-def _moves(signal: Timed, start: float, end: float) -> bool:
+def _moves(signal: ClockedSignal, start: float, end: float) -> bool:
     """True if a signal moves from `start` to `end` [s]."""
-    values = signal.values[(signal.seconds >= start) & (signal.seconds <= end)]
+    seconds = signal.clock.seconds
+    values = signal.values[(seconds >= start) & (seconds <= end)]
     return values.size > 1 and bool(np.ptp(values) > 0)
 
 
-def _opened(
-    path: _Log,
-    time: str | Signal | None,
-    inputs: Mapping[str, Signal],
-    outputs: Mapping[str, Signal],
-    options: ReadOptions,
-) -> tuple[Opened, Request, _Finish]:
-    """The logs, what is asked of all of them, and what makes a flight of them whole."""
-    logged, constants = without_constants(inputs)
-    is_open = not isinstance(path, str | Path)
-    # Checked before a log is opened, which may take minutes.
-    request = Request(path.path if is_open else str(path), time, logged, outputs, options)
-    logs, request = opened(request, path if is_open else None)
-    # In the order in which they were asked for, those of further logs last; units as they are read.
-    asked = [
-        {**own, **{n: s for also in options.also for n, s in getattr(also, role).items()}}
-        for role, own in (("inputs", inputs), ("outputs", outputs))
-    ]
-    signals = request.signals
-    both = [
-        {**of_kind, **{n: signals[n, kind] for n in of_kind if (n, kind) in signals}}
-        for kind, of_kind in zip(("input", "output"), asked, strict=True)
-    ]
-    return logs, request, functools.partial(
-        with_origins, inputs=both[0], outputs=both[1], constants=constants
-    )  # fmt: skip
-
-
-def _of_part(
+def _part(
     request: Request, window: tuple[float, float], name: str, holds: Mapping[str, Decision]
 ) -> Request:
     """The request for one part of a run."""
     part = copy.copy(request)
     part.options = dataclasses.replace(request.options, window=window, name=name)
-    # By the whole run: of the few moves in a part the same stick may look different.
     part.signals = {
         key: dataclasses.replace(s, hold=holds[key[0]].hold) if key[1] == "input" else s
         for key, s in request.signals.items()
     }
     return part
-
-
-def _notes(intervals: list[tuple[float, float]], left_out: list[str]) -> tuple[Finding, ...]:
-    """A note on the gaps at which a log was split and the parts left out; `intervals` [s]."""
-    gaps = [after - before for (_, before), (after, _) in itertools.pairwise(intervals)]
-    words = f"gaps of up to {max(gaps):.3g} s split the run into {len(intervals)} parts"
-    split = note("clock.gaps-split", words, value=max(gaps))
-    if not left_out:
-        return (split,)
-    more = f" and {len(left_out) - 3} more" if len(left_out) > 3 else ""
-    words = f"left out: {'; '.join(left_out[:3])}{more}"
-    return (split, note("windows.left-out", words, value=len(left_out)))
 
 
 def _enough_measured(flight: Flight) -> Flight:
@@ -218,13 +186,240 @@ def _enough_measured(flight: Flight) -> Flight:
     words = (
         f"{flight.name}: without {', '.join(few)}, of which fewer than {FEWEST} samples are seen"
     )
-    return _with_notes(flight, (note(LEFT_OUT, words, *few),))
+    return _with_notes(flight, note(LEFT_OUT, words, *few))
 
 
-def _with_notes(flight: Flight, notes: tuple[Finding, ...]) -> Flight:
+def _with_notes(flight: Flight, *notes: Finding) -> Flight:
     assert flight.source is not None  # it was read from a log
     source = dataclasses.replace(flight.source, notes=(*flight.source.notes, *notes))
     return dataclasses.replace(flight, source=source)
+
+
+# A log, and others of the same flight with clocks of their own.
+
+
+class _Beside(NamedTuple):
+    """The signals of a further log, by the clock of the first [s], and a note on how that was
+    found."""
+
+    signals: Mapping[Key, ClockedSignal]
+    note: Finding
+
+
+class _Opened(NamedTuple):
+    """Logs that are read for one flight."""
+
+    log: ChannelLog
+    keys: frozenset[Key]
+    """the signals that the first log holds"""
+    beside: tuple[_Beside, ...]
+    request: Request
+    """for the signals of all of them"""
+    inputs: Mapping[str, Signal]
+    """all that are asked for, constants too, in the user's order"""
+
+
+def _opened(
+    path: _Log,
+    time: str | Signal | None,
+    inputs: Mapping[str, Signal],
+    outputs: Mapping[str, Signal],
+    options: ReadOptions,
+) -> _Opened:
+    """The logs, those beside the first aligned with it."""
+    logged = {name: s for name, s in inputs.items() if s.constant is None}
+    is_open = not isinstance(path, str | Path)
+    # Checked before a log is opened, which may take minutes.
+    request = Request(path.path if is_open else str(path), time, logged, outputs, options)
+    log = _open(request, path if is_open else None)
+    request = with_file_units(log, request)
+    keys, everything, beside = frozenset(request.signals), copy.copy(request), []
+    for also in options.also:
+        signals = {(n, "input"): s for n, s in also.inputs.items()}
+        signals |= {(n, "output"): s for n, s in also.outputs.items()}
+        twice = next((key for key in signals if key in everything.signals), None)
+        if twice is not None:
+            raise wrong(also.path, f"{twice[1]} {twice[0]!r} is taken from two logs, expected one")
+        one, asked = _beside(log, request, also)
+        everything.signals = {**everything.signals, **asked.signals}
+        beside.append(one)
+        inputs = {**inputs, **also.inputs}
+    return _Opened(log, keys, tuple(beside), everything, inputs)
+
+
+def _clocked(logs: _Opened, request: Request) -> dict[Key, ClockedSignal]:
+    """The signals inside the window, each on its clock, in seconds from the first log's
+    beginning."""
+    signals = signals_of(logs.log, _only(request, logs.keys))
+    for one in logs.beside:
+        signals |= {key: _within(s, request) for key, s in one.signals.items()}
+    return signals
+
+
+def _flight(logs: _Opened, request: Request) -> Flight:
+    """The flight inside the window, with its constant inputs."""
+    log = logs.log
+    try:
+        notes = (*log.notes, *_beyond(logs, request), *(one.note for one in logs.beside))
+        flight = flight_of_signals(
+            _clocked(logs, request),
+            request,
+            Source(log.path, log.sha256, notes, log.firmware, log.parameters, first_time=log.begin),
+        )
+    except InputError as e:
+        # A wrong unit of the clock makes errors of other kinds.
+        said = [n for n in log.notes if n.code == "units.contradicted"]
+        if not said:
+            raise
+        raise InputError("; ".join([str(e), *sentences(said)])) from e
+    assert flight.source is not None
+    values, reasons = dict(flight.inputs), dict(flight.hold_reason)
+    for name, signal in logs.inputs.items():
+        if signal.constant is not None:
+            # Scale and offset are of numbers in a log, and a constant is none.
+            plain = dataclasses.replace(signal, scale=1.0, offset=0.0, invert=False)
+            values[name] = plain.to_si(np.full(flight.n_samples, signal.constant))
+            reasons[name] = "a constant"
+    as_read = request.signals
+    source = dataclasses.replace(
+        flight.source,
+        inputs={n: as_read.get((n, "input"), s) for n, s in logs.inputs.items()},
+        outputs={n: as_read[n, "output"] for n in flight.outputs},
+    )
+    inputs = {name: values[name] for name in logs.inputs}
+    return dataclasses.replace(flight, inputs=inputs, hold_reason=reasons, source=source)
+
+
+def _beyond(logs: _Opened, request: Request) -> tuple[Finding, ...]:
+    """A note where the window reaches beyond the first log."""
+    log = logs.log
+    times = [log.topic_of(request.signals[key].name).times for key in logs.keys]
+    return window_note(request.options.window, times, log.first_time)
+
+
+def _open(request: Request, log: ChannelLog | Table | None = None) -> ChannelLog:
+    log = log or open_log(request.path, request.options.number)
+    if request.time is None and isinstance(log, ArrayTable):
+        # Arrays may have clocks of their own beside them in the file.
+        log = by_clocks(log) or log
+    if not isinstance(log, ChannelLog):
+        return load_table(log, request)
+    if request.time is not None:
+        problem = "its topics have clocks of their own, expected no time to be stated, got "
+        raise wrong(log.path, problem + shown(request.time.name))
+    return with_derived(log, request.options.swashplate)
+
+
+def _only(request: Request, keys: frozenset[Key], whole: bool = False) -> Request:
+    """Return the request for some signals; over all of the log if `whole`: a lag is found from as
+    much as there is."""
+    part = copy.copy(request)
+    part.signals = {key: s for key, s in request.signals.items() if key in keys}
+    if whole:
+        part.options = dataclasses.replace(request.options, window=None)
+    return part
+
+
+def _beside(log: ChannelLog, request: Request, also: Also) -> tuple[_Beside, Request]:
+    """The signals of a further log, its clock shifted to that of the first, and the request for
+    them with the units that they have."""
+    options = ReadOptions(number=also.number)
+    asked = Request(also.path, also.time, also.inputs, also.outputs, options)
+    # The log that is open already may be large.
+    file = also.log or open_log(asked.path, asked.options.number)
+    other = _open(asked, file)
+    asked = with_file_units(other, asked)
+    signals = signals_of(other, asked)
+    name = Path(also.path).name
+    stated = f"{name} (sha256 {file.sha256[:12]})"
+    if also.same:
+        lag, said = _aligned(log, request, also, file, stated)
+    else:
+        lag = float(other.begin - log.begin)
+        ours = signals_of(log, _only(request, frozenset(request.signals), whole=True))
+        said = _as_one(request, also, _span(ours, log.begin), _span(signals, other.begin), stated)
+    shifted = {}
+    for key, signal in signals.items():
+        # Two files may well have topics of the same name.
+        clock = signal.clock
+        called = clock.name if clock.name == name else f"{name}, {clock.name}"
+        clock = dataclasses.replace(clock, name=called, seconds=clock.seconds + lag)
+        shifted[key] = dataclasses.replace(signal, clock=clock)
+    return _Beside(shifted, said), asked
+
+
+def _aligned(
+    log: ChannelLog, request: Request, also: Also, file: ChannelLog | Table, name: str
+) -> tuple[float, Finding]:
+    """Return the correction of a further log's times [s], by a motion that both logs hold."""
+    key = next((key for key in request.signals if key[0] == also.same), None)
+    if key is None:
+        known = ", ".join(dict.fromkeys(name for name, _ in request.signals))
+        problem = f"expected a signal of the first log ({known}), got {also.same!r:.60}"
+        raise wrong(also.path, problem, "align.with")
+    # Apart from the others, since it may well be one of them.
+    options = ReadOptions(number=also.number)
+    alone = Request(also.path, also.time, {}, {also.same: Signal(also.to, "1", "1")}, options)
+    reference = signals_of(log, _only(request, frozenset({key}), whole=True))[key].timed
+    (twin,) = signals_of(_open(alone, file), alone).values()
+    reference = reference._replace(values=measured(request.signals[key], reference.values))
+    # A scale does not matter for it, so that no unit is asked for.
+    motion = (-1.0 if also.reverse else 1.0) * without_marks(twin.values)
+    try:
+        lag = lag_between(reference, twin.timed._replace(values=motion))
+    except NotAligned as e:
+        what = f"{also.same} of {Path(request.path).name} and {shown(also.to)}"
+        raise wrong(also.path, f"cannot be aligned by {what}: {e}") from e
+    words = (
+        f"{name}: {lag.lag:.6g} s (sd {1e3 * lag.sd:.2g} ms) were added to its times, counted from "
+        f"its beginning, by which {shown(also.to)} agrees best with {also.same} (correlation "
+        f"{lag.correlation:.3f} over {lag.overlap:.4g} s)"
+    )
+    return lag.lag, Finding(
+        "clock.aligned", "note", words, lag.lag, "seconds added to its times", (also.same,)
+    )
+
+
+def _as_one(
+    request: Request,
+    also: Also,
+    ours: tuple[float, float],
+    theirs: tuple[float, float],
+    name: str,
+) -> Finding:
+    """A note that the times of two logs, from first to last [s], count alike."""
+    first, shared = Path(request.path).name, min(ours[1], theirs[1]) - max(ours[0], theirs[0])
+    if not shared >= _SHARED * min(ours[1] - ours[0], theirs[1] - theirs[0]):
+        raise wrong(
+            also.path,
+            f"its times go from {theirs[0]:.6g} s to {theirs[1]:.6g} s and those of {first} from "
+            f"{ours[0]:.6g} s to {ours[1]:.6g} s, so that they are no one clock; state a motion "
+            "that both hold, align: {with: ..., to: ...}",
+        )
+    words = (
+        f"{name}: its times are taken as those of {first}, with which it shares {shared:.4g} s; if "
+        "each counts from a beginning of its own, state align"
+    )
+    return note("clock.taken-as-one", words, value=shared)
+
+
+def _span(signals: Mapping[Key, ClockedSignal], first_time: float) -> tuple[float, float]:
+    """First and last time of signals [s], in the log's own count."""
+    clocks = [s.clock.seconds for s in signals.values()]
+    begin, end = min(float(c[0]) for c in clocks), max(float(c[-1]) for c in clocks)
+    return first_time + begin, first_time + end
+
+
+def _within(signal: ClockedSignal, request: Request) -> ClockedSignal:
+    """The part of a signal inside the window."""
+    if request.options.window is None:
+        return signal
+    clock = signal.clock
+    rows = rows_in_window(request.path, clock.seconds, request.options.window, clock.name)
+    return dataclasses.replace(signal, clock=clock.part(rows), values=signal.values[rows])
+
+
+# What no fit can use.
 
 
 def require_some_time(flight: Flight) -> None:

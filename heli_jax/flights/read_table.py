@@ -7,7 +7,6 @@ forward is told by its repeated values (`repeats.carried_on`).
 """
 
 import itertools
-import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,22 +18,30 @@ from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.clock import (
     ROWS,
     clock_scale,
-    contradicted_rate,
-    counted,
+    columns_of,
     require_increasing,
+    require_likely,
     unit_notes,
     with_runs,
 )
 from heli_jax.flights.derived import sources, with_derived
-from heli_jax.flights.describe import TimeInfo, describe_table
+from heli_jax.flights.describe import describe_table
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.formats.arrays import SEGMENT, ArrayTable
 from heli_jax.flights.grid import LATEST, without_overflow
-from heli_jax.flights.log import ChannelLog, TableRows, Topic, as_floats
+from heli_jax.flights.log import (
+    ChannelLog,
+    Table,
+    TableRows,
+    Topic,
+    as_floats,
+    column,
+    listed,
+    shown,
+    wrong,
+)
 from heli_jax.flights.request import Request
 from heli_jax.flights.resample import SLOWER, usual_step
-from heli_jax.flights.table import Table, column, listed, shown, wrong
-from heli_jax.flights.time_units import require_likely
 
 _SHARED = 0.1
 """of the rows of the smaller of two topics that hold the other too, at most: stamps may coincide"""
@@ -60,28 +67,22 @@ def load_table(table: Table, request: Request) -> ChannelLog:
             names += sources(signal.name, known, request.options.swashplate)
         except ValueError as e:
             raise wrong(table.path, str(e), column(signal.name)) from e
-    names = list(dict.fromkeys(names))
-    table = counted(table) if time.name == ROWS else table
-    numbers = table.numbers(names)
+    numbers = columns_of(table, list(dict.fromkeys(names)))
+    said: tuple[Finding, ...] = ()
     if request.options.split:
-        table = with_runs(table, time.name, numbers, clock_scale(table, time), runs)
-        numbers = table.numbers(names)
+        numbers, said = with_runs(table, time.name, numbers, clock_scale(table, time), runs)
+    log = with_derived(_with_clock(table, numbers, time), request.options.swashplate)
     stamps = numbers[time.name]
     # Stamps that are no clock are refused with their line.
-    is_clock = stamps.size and np.isfinite(stamps).all() and np.all(np.diff(stamps) >= 0)
-    log = None
-    if is_clock:
-        log = with_derived(_with_clock(table, numbers, time), request.options.swashplate)
+    if stamps.size and np.isfinite(stamps).all() and np.all(np.diff(stamps) >= 0):
         columns = {s.name: log.channel(s.name).values for s in request.signals.values()}
         inputs = {s.name for (_, kind), s in request.signals.items() if kind == "input"}
         if is_joined(stamps * clock_scale(table, time), columns, inputs):
-            return without_joins(log, joined=True)
-    said, cautions = _checked(table, time, stamps)
-    # A counter that began anew is a clock once it goes on.
-    log = log or with_derived(_with_clock(table, numbers, time), request.options.swashplate)
-    return replace(log, notes=(*log.notes, *said), cautions=cautions)
+            return without_joins(replace(log, notes=(*log.notes, *said)), joined=True)
+    return replace(log, notes=(*log.notes, *said, *_checked(table, time, stamps)))
 
 
+@np.errstate(over="ignore", invalid="ignore")  # stamps that are no clock are refused later
 def _with_clock(
     table: Table, numbers: Mapping[str, np.ndarray], time: Signal, name: str = ""
 ) -> ChannelLog:
@@ -97,11 +98,10 @@ def _with_clock(
     return ChannelLog.of_table(table, (topic,), notes=table.notes, origin=first * scale)
 
 
-def _checked(
-    table: Table, time: Signal, stamps: np.ndarray
-) -> tuple[tuple[Finding, ...], tuple[Finding, ...]]:
-    """Refuse stamps (N,) that are no clock; return notes on their unit, and cautions."""
-    stated, scale = table.time_unit(time.name), clock_scale(table, time)
+def _checked(table: Table, time: Signal, stamps: np.ndarray) -> tuple[Finding, ...]:
+    """Refuse stamps (N,) that are no clock; return notes on their unit."""
+    stated = None if time.name == ROWS else table.time_unit(time.name)
+    scale = clock_scale(table, time)
     # A type is unmistakable; only words may be meant for something else.
     is_sure = time.scale != 1.0 or (stated and not table.units.get(time.name))
     said = () if is_sure else unit_notes(time, stated)
@@ -113,30 +113,12 @@ def _checked(
         raise wrong(table.path, problem, table.place(row), column(time.name))
     stamps = without_overflow(stamps)
     require_increasing(table, time.name, stamps)
-    step = float(np.median(np.diff(stamps))) * scale if stamps.size > 1 else math.inf
-    cautions = contradicted_rate(table, time.name, 1.0 / step)
     if not stated and time.scale == 1.0:
-        cautions += require_likely(table.path, time.name, time.unit, stamps, time.assumed)
-    return said, cautions
+        require_likely(table.path, time, stamps)
+    return said
 
 
 # Without a request: the clock is guessed, and all columns are taken.
-
-
-def in_runs(table: Table, clock: TimeInfo) -> Table:
-    """Return a table with its runs one after another, where its clock begins anew."""
-    if clock.runs < 2:
-        return table
-    return with_runs(
-        table, clock.column, table.numbers([clock.column]), clock_scale(table, clock.signal)
-    )
-
-
-def rate_note(clock: TimeInfo) -> Finding:
-    """Return a note on a clock whose rate the file states."""
-    what = "rows" if clock.column == ROWS else shown(clock.column)
-    words = f"{what} are taken as samples at {clock.counted:g} Hz, as the file says: {clock.said}"
-    return note("clock.rate-of-file", words, value=clock.counted)
 
 
 def guessed_log(table: Table, time: str | None, unit: str | None, rate: float | None) -> ChannelLog:
@@ -158,9 +140,7 @@ def guessed_log(table: Table, time: str | None, unit: str | None, rate: float | 
         if not clock and texts:
             why += f" ({shown(texts[0].name)} is text{texts[0].strays and ': ' + texts[0].strays})"
         raise wrong(table.path, f"{why}, {remedy}")
-    if clock.said:
-        notes.append(rate_note(clock))
-    elif clock.guessed:
+    if clock.guessed:
         words = f"column {shown(clock.column)} is taken for a clock in {clock.unit}"
         notes.append(note("clock.guessed", words, clock.column))
     rows = next((c.count for c in info.columns if c.name == clock.column), info.n_rows)
@@ -178,8 +158,11 @@ def guessed_log(table: Table, time: str | None, unit: str | None, rate: float | 
     twice = next((n for n in names if names.count(n) > 1), None)
     if twice is not None:
         raise wrong(table.path, f"two columns are named {shown(twice)}, expected different names")
-    table = counted(table) if clock.column == ROWS else in_runs(table, clock)
-    numbers = table.numbers(list(dict.fromkeys([*names, clock.column])))
+    numbers = columns_of(table, list(dict.fromkeys([*names, clock.column])))
+    if clock.runs > 1:
+        scale = clock_scale(table, clock.signal)
+        numbers, said = with_runs(table, clock.column, numbers, scale)
+        notes += said
     log = _with_clock(table, numbers, clock.signal, "the table")
     return replace(log, notes=(*notes, *log.notes))
 

@@ -13,11 +13,14 @@ from dataclasses import dataclass, field
 from heli_jax import units
 from heli_jax.finding import Finding, note
 from heli_jax.flights.derived import Swashplate
-from heli_jax.flights.flight import HOLDS, Signal
-from heli_jax.flights.log import ChannelLog
-from heli_jax.flights.origins import scale_problem
-from heli_jax.flights.repeats import REPEATS
-from heli_jax.flights.table import Table, column, shown, wrong
+from heli_jax.flights.flight import HOLDS, Signal, scale_problem
+from heli_jax.flights.log import ChannelLog, Table, column, shown, wrong
+from heli_jax.flights.marks import REPEATS
+
+Key = tuple[str, str]
+"""a model's name, and `input` or `output`"""
+FEWEST = 8
+"""samples in a run"""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ samples' unit, NaN where too much is missing. Holds take times from the first st
 """
 
 import functools
-from dataclasses import dataclass
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -18,24 +17,11 @@ from heli_jax.numerics.jumps import split
 # still near a straight line. What lies in a longer gap nobody knows.
 _GAP_STEPS = 5.0
 _GAP_SECONDS = 0.25
-_LONG = 3.0
-"""usual steps, from which on one is long"""
-_MOST_LONG = 0.002
-"""part of the steps that are long, at most, for them to be noted one by one"""
 _GOES_DOWN = 0.9
 """new rate over old, below which something between the two Nyquist frequencies could fold"""
 _CELLS = 16
 """parts of a grid step over which a held signal is averaged before it is low-passed: the mean takes
 0.1 % off what is at 0.4 of the rate"""
-
-
-@dataclass(frozen=True)
-class Clock:
-    """Grid to sample at: `times` (M,) [s], `dt` apart, with notes for the reader."""
-
-    times: np.ndarray
-    dt: float
-    notes: tuple[Finding, ...]
 
 
 def longest_gap(seconds: np.ndarray) -> float:
@@ -45,39 +31,16 @@ def longest_gap(seconds: np.ndarray) -> float:
     return max(_GAP_STEPS * float(np.median(np.diff(seconds))), _GAP_SECONDS)
 
 
-def new_clock(seconds: np.ndarray, rate: float) -> Clock:
-    """A uniform clock of `rate` [Hz] from the first of the stamps (N,) [s] to the last."""
+def rate_notes(seconds: np.ndarray, rate: float) -> list[Finding]:
+    """Notes on what becomes of samples at these stamps (N,) [s] at a rate [Hz]."""
     usual = float(np.median(np.diff(seconds)))
-    # The last sample is not lost to the rounding of its stamp.
-    count = int(np.floor((seconds[-1] - seconds[0]) * rate + 1e-6)) + 1
-    # Counted and multiplied, never added up: the sum of 1e6 rounded steps would drift.
     words = f"resampled to {rate:.6g} Hz from about {1 / usual:.6g} Hz"
     notes = [note("resampling.rate", words, value=1 / usual)]
-    notes += _long_steps(seconds, usual)
     if rate * usual < _GOES_DOWN:
         passed = PASSED * rate
         words = f"low-pass filtered first: {passed:.3g} Hz and below pass, not held inputs"
         notes.append(note("resampling.low-passed", words, value=passed))
-    return Clock(seconds[0] + np.arange(count) / rate, 1.0 / rate, tuple(notes))
-
-
-def _long_steps(seconds: np.ndarray, usual: float) -> tuple[Finding, ...]:
-    """A note on steps that are bridged and are much longer than the `usual` one [s], where they are
-    few: of many the share of missing samples tells."""
-    steps = np.diff(seconds)
-    long = np.flatnonzero((steps > _LONG * usual) & (steps <= longest_gap(seconds)))
-    if not 0 < long.size <= max(3, _MOST_LONG * steps.size):
-        return ()
-    worst = long[np.argmax(steps[long])]
-    which = "a step" if long.size == 1 else f"{long.size} steps"
-    size = f"of {steps[worst]:.4g} s" if long.size == 1 else f"of up to {steps[worst]:.4g} s"
-    at = "at" if long.size == 1 else "the longest at"
-    words = (
-        f"the clock has {which} {size}, {at} {seconds[worst]:.6g} s, where {usual:.4g} s is "
-        "usual: samples were lost there, or the clock was set; if it was set, what was flown "
-        "before and after is farther apart than it was, and the estimates are off"
-    )
-    return (note("clock.long-steps", words, value=float(steps[worst])),)
+    return notes
 
 
 def in_gaps(seconds: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -204,17 +167,6 @@ class Timed(NamedTuple):
     values: np.ndarray
 
 
-class Placed(NamedTuple):
-    """A slow signal on a fast grid."""
-
-    samples: np.ndarray
-    """(M,), NaN where there is none"""
-    moved: float
-    """[s] by how much a sample was moved at most"""
-    left_out: int
-    """samples to whose instant another was nearer"""
-
-
 def usual_step(seconds: np.ndarray) -> float:
     """Return the usual step of stamps (N,) [s]; infinite for fewer than two."""
     return float(np.median(np.diff(seconds))) if seconds.size > 1 else float("inf")
@@ -236,8 +188,8 @@ def is_slower(signal: Timed, rate: float) -> bool:
     return usual_step(own_clock(signal).seconds) * rate > SLOWER * (1 + 1e-6)
 
 
-def at_nearest(signal: Timed, times: np.ndarray) -> Placed:
-    """Each sample at the instant nearest to its own, and nothing between.
+def at_nearest(signal: Timed, times: np.ndarray) -> np.ndarray:
+    """Each sample at the one of the times (M,) nearest to its own; NaN between.
 
     It is moved there, by half a grid step at most, along the slope between its neighbours (second
     order, also where steps are uneven). So its value is right to that order, and its noise stays
@@ -250,7 +202,7 @@ def at_nearest(signal: Timed, times: np.ndarray) -> Placed:
     nearest = np.rint((seconds - times[0]) / step).astype(np.int64)
     inside = (nearest >= 0) & (nearest < times.size)
     if not inside.any():
-        return Placed(samples, 0.0, 0)
+        return samples
     few = seconds.size < 3
     away = times[np.clip(nearest, 0, times.size - 1)] - seconds
     with np.errstate(over="ignore", invalid="ignore"):
@@ -261,10 +213,7 @@ def at_nearest(signal: Timed, times: np.ndarray) -> Placed:
     order = np.argsort(-np.abs(away), kind="stable")
     order = order[inside[order]]
     samples[nearest[order]] = moved[order]
-    # Of stamps that are multiples of the grid's step the rest is rounding.
-    largest = float(np.abs(away[inside]).max())
-    left_out = int(inside.sum()) - int(np.count_nonzero(~np.isnan(samples)))
-    return Placed(samples, largest if largest > 1e-6 * step else 0.0, left_out)
+    return samples
 
 
 def at_own_rate(signal: Timed, times: np.ndarray) -> np.ndarray:
@@ -299,20 +248,6 @@ def at_own_rate(signal: Timed, times: np.ndarray) -> np.ndarray:
     with np.errstate(over="ignore", invalid="ignore"):
         moved = signal.values[nearest] + whole[nearest] * away
     return np.where(np.isfinite(moved) & (np.abs(away) <= _NEAR * step), moved, lines)
-
-
-def slower_words(name: str, placed: Placed, signal: Timed, rate: float) -> str:
-    """Describe the treatment of a slow output, in one sentence."""
-    there = int(np.count_nonzero(~np.isnan(placed.samples)))
-    words = (
-        f"{name} at about {1 / usual_step(own_clock(signal).seconds):.4g} Hz is slower than the "
-        f"grid of {rate:.6g} Hz: {there} samples at the instants nearest to their own"
-    )
-    if placed.moved:
-        words += f", moved there by up to {1e3 * placed.moved:.2g} ms along the slope"
-    if placed.left_out:
-        words += f", {placed.left_out} left out that fell on the instant of another"
-    return f"{words}; between them it is missing"
 
 
 # Fewer samples a second, without folding what the new rate cannot hold onto what it can.

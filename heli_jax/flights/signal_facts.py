@@ -37,10 +37,6 @@ _TURNS = 0.3
 """part of a signal's moves that go back, from which on its noise is as large as its steps"""
 _TIMES = 5.0
 """times the longest usual run of such a signal, from which on it is stuck"""
-_FAILURES = 20
-"""runs out of all proportion at most: of more it is the signal's way"""
-_DITHER = 0.01
-"""of a usual move, by which a frozen sensor may go to and fro"""
 _DROPS, DROP_SHARE = 5, 0.01
 """visits of a value, and part of the samples at it, from which on they are dropouts"""
 _TRIFLE = 0.2
@@ -160,7 +156,9 @@ def signal_facts(seconds: np.ndarray, x: np.ndarray) -> SignalFacts:
         return SignalFacts(0, none, none, 0.0, 0, 0.0, 0.0)
     # Once for all that is asked: sorting is what takes the time in a long log.
     levels, counts = np.unique(y, return_counts=True)
-    low, high = _at_rails(y, y, levels, counts)
+    none = np.zeros(y.shape, bool)
+    few = levels.size < FEW
+    low, high = (none, none) if few else (_at_top(-y, counts), _at_top(y, counts[::-1]))
     return SignalFacts(
         size=y.size,
         low=Rail(float(y.min()), s[low]),
@@ -197,40 +195,24 @@ def _stretches(seconds: np.ndarray, x: np.ndarray, facts: SignalFacts) -> list[S
     """The times at one value that are out of all proportion."""
     seen = np.isfinite(x)
     s, y = seconds[seen], x[seen]
-    moves = np.abs(np.diff(y))
-    if not moves.any():
-        return []
-    usual = float(np.median(moves[moves > 0]))
-    # Once by equal samples, once with the last bit of a frozen sensor going to and fro.
-    stuck = _runs_out_of_proportion(s, y, facts, usual, 0.0)
-    return stuck or _runs_out_of_proportion(s, y, facts, usual, _DITHER * usual)
-
-
-def _runs_out_of_proportion(
-    s: np.ndarray, y: np.ndarray, facts: SignalFacts, usual: float, within: float
-) -> list[Stuck]:
-    """Runs of samples (N,) of which none moves by more than `within`, and that are too long."""
     moves = np.diff(y)
-    begins = np.flatnonzero(np.r_[True, np.abs(moves) > within])
+    begins = np.flatnonzero(np.r_[True, moves != 0])
     lengths = np.diff(np.r_[begins, y.size])
     if lengths.size < _RUNS:
         return []
     # What rests at a rail is told as such.
     rails = [rail.value for rail in (facts.low, facts.high) if rail.times.size]
     lengths = np.where(np.isin(y[begins], rails), 0, lengths)
-    noisy = _turns(moves) >= _TURNS
-    least = _longest_by_itself(lengths, moves)
-    stuck = []
-    for i in np.flatnonzero(lengths >= least):
+    usual = float(np.median(np.abs(moves[moves != 0])))
+    stuck, noisy = [], _turns(moves) >= _TURNS
+    for i in np.flatnonzero(lengths >= _longest_by_itself(lengths, moves)):
         first, last = begins[i], begins[i] + lengths[i] - 1
-        begin, end = float(s[first]), float(s[last])
+        one = Stuck(float(s[first]), float(s[last]), float(y[first]))
         # A simulated signal without noise comes to rest within the last digit.
-        before = abs(moves[first - 1]) if first else np.inf
-        rests = before < max(_AT_REST * usual, 10.0 * within)
-        drifts = np.ptp(y[first : last + 1]) > within
+        rests = first > 0 and abs(moves[first - 1]) < _AT_REST * usual
         # What has no noise may rest for a while without being stuck.
-        if not rests and not drifts and (end - begin >= STUCK_SECONDS or noisy):
-            stuck.append(Stuck(begin, end, float(y[first])))
+        if not rests and (noisy or one.end - one.begin >= STUCK_SECONDS):
+            stuck.append(one)
     return stuck
 
 
@@ -266,20 +248,17 @@ def _turns(moves: np.ndarray) -> float:
 def _longest_by_itself(lengths: np.ndarray, moves: np.ndarray) -> float:
     """The number of samples in a row from which on a signal does not stay at one value by itself;
     inf where it may for any time."""
-    usual = float(np.median(lengths))
-    if np.mean(lengths <= 1.5 * usual) >= _REGULAR:
-        return _STUCK * usual
+    least = _STUCK * float(np.median(lengths))
+    if np.mean(lengths <= 1.5 * float(np.median(lengths))) >= _REGULAR:
+        return least
     # A slow motion in coarse steps has runs of any length; noise as large as the steps turns back
     # at every other one, and ends each run by chance.
     if _turns(moves) < _TURNS:
         return np.inf
     # The runs in which all but a hundredth of the time is spent, those that are stuck left out.
-    ordered = np.sort(lengths[lengths < _STUCK * usual])
+    ordered = np.sort(lengths[lengths < least])
     spent = np.cumsum(ordered) / ordered.sum()
-    high = float(ordered[int(np.searchsorted(spent, 0.99))])
-    # Time in longer runs than that: a few sensors' failures, or the way in which the signal moves.
-    longer = int(np.count_nonzero(lengths >= _STUCK * usual))
-    return max(_STUCK * usual, _TIMES * high) if longer <= _FAILURES else np.inf
+    return max(least, _TIMES * float(ordered[int(np.searchsorted(spent, 0.99))]))
 
 
 def _dropouts(seconds: np.ndarray, x: np.ndarray) -> Rail | None:
@@ -309,26 +288,17 @@ def _dropouts(seconds: np.ndarray, x: np.ndarray) -> Rail | None:
     return Rail(float(levels[k]), s[at])
 
 
-def _at_rails(
-    x: np.ndarray, finite: np.ndarray, levels: np.ndarray, counts: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    if levels.size < FEW:
-        none = np.zeros(x.shape, bool)
-        return none, none
-    return _at_top(-x, -finite, counts), _at_top(x, finite, counts[::-1])
-
-
-def _at_top(x: np.ndarray, finite: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """The samples at the largest value, where that is a rail."""
-    top = finite.max()
+def _at_top(x: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Return a mask of the samples (N,) at the largest value, where that is a rail; `counts` of
+    each value, the largest first."""
     # Beside the values next to it also those of all the signal: random steps are held unequally.
     usual = max(float(counts[1:4].mean()), float(np.median(counts[1:])))
-    piled = counts[0] > _PILE * usual and counts[0] >= RAIL_SHARE * finite.size
+    piled = counts[0] > _PILE * usual and counts[0] >= RAIL_SHARE * x.size
     # Visits to the end of the range, and not a signal at rest.
-    at = finite == top
+    at = x == x.max()
     edges = np.flatnonzero(np.diff(np.r_[0, at.astype(int), 0])).reshape(-1, 2)
     visits = len(edges) >= _VISITS and np.diff(edges).max() >= _RUN and not (at[0] and at[-1])
-    return x == top if piled and visits else np.zeros(x.shape, bool)
+    return at & (piled and visits)
 
 
 def quantum(x: np.ndarray) -> float:

@@ -179,7 +179,7 @@ class Fit:
     def distrust(self) -> str:
         """A sentence that belongs beside what the data determine; empty where all is trusted."""
         each = [
-            n if d.shift is None else f"{n} (would move by {d.shift:+.2g}: {d.brief})"
+            n if d.shift is None else f"{n} (off by about {abs(d.shift):.2g}: {d.brief})"
             for n, d in self.distrusts.items()
         ]
         if not each:

@@ -29,6 +29,7 @@ from heli_jax.identification.estimation.starts import coarse_guess, delay_start,
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.restarts import RESTARTS, SearchState, left_stability
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, layout_of
+from heli_jax.messages import messages
 
 _FIRST_STEPS = 40
 """of filter error, before the search knows that there is a disturbance"""
@@ -118,9 +119,11 @@ def search(
     for restart in RESTARTS:
         if not restart.when(state):
             continue
-        report(f"the search begins again: {restart.name}")
+        points = list(restart.points(state))
+        if points:
+            report(f"another search, {messages()[f'search.{restart.name}'].title}")
         begun = state.best
-        for noise, z in restart.points(state):
+        for noise, z in points:
             [run] = over.run(noise, z[None, :])
             runs.append(Run(restart.name, z, run))
             other = relax_noise_covariance(over, noise, run)

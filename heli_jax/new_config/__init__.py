@@ -10,8 +10,8 @@ from heli_jax import naming
 from heli_jax.errors import InputError
 from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.flight import Flight
+from heli_jax.flights.log import shown
 from heli_jax.flights.preset import fitting_presets
-from heli_jax.flights.table import shown
 from heli_jax.identification.validation.follows_response import feedback
 from heli_jax.identification.validation.shifts import led_by
 from heli_jax.linear_models import read as linear_models

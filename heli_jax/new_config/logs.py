@@ -11,19 +11,18 @@ import numpy as np
 
 from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.clock import (
-    COUNTS_ROWS,
     ROWS,
-    counted,
+    clock_scale,
+    columns_of,
     is_called_time,
     require_increasing,
+    with_runs,
 )
 from heli_jax.flights.describe import LogInfo, describe_table
 from heli_jax.flights.formats.arrays import ArrayTable, by_clocks
-from heli_jax.flights.log import ChannelLog, as_floats
+from heli_jax.flights.log import ChannelLog, Table, as_floats, shown, wrong
 from heli_jax.flights.marks import without_marks
 from heli_jax.flights.open_log import chosen_flights, open_flights
-from heli_jax.flights.read_table import in_runs, rate_note
-from heli_jax.flights.table import Table, shown, wrong
 from heli_jax.new_config.guess import Series
 
 _ASSUMED = 100.0
@@ -115,10 +114,7 @@ def _read_table(table: Table, rate: float | None) -> Log:
             require_increasing(table, time.column, table.numbers([time.column])[time.column])
         problem = "expected a column of increasing times, got none"
         raise wrong(table.path, f"{problem}: {time.problem}")
-    if time.said:
-        notes = (rate_note(time),)
     clock = time.column
-    table = counted(table) if clock == ROWS else in_runs(table, time)
     names = [c.name for c in info.columns if c.kind == "number"]
     # Of two columns of one name neither can be asked for.
     names = [n for n in names if table.names.count(n) == 1]
@@ -126,15 +122,16 @@ def _read_table(table: Table, rate: float | None) -> Log:
     rows = {ROWS: info.n_rows} | {c.name: c.rows for c in info.columns}
     others = [n for n in names if rows[n] != rows[clock]]
     names = [n for n in names if n not in others]
-    values = table.numbers([clock, *(n for n in names if n != clock)])
+    values = columns_of(table, list(dict.fromkeys([clock, *names])))
+    if time.runs > 1:
+        values, said = with_runs(table, clock, values, clock_scale(table, time.signal))
+        notes += said
     times = _from_first(values[clock], time.duration)
     series = {
         n: Series(times, without_marks(values[n]), table.units.get(n, ""))
         for n in names
         if n != clock and _is_known(values[n])
     }
-    if time.runs > 1:
-        notes += table.notes[-1:]
     if others:
         listed = ", ".join(map(shown, others[:6]))
         words = shown(clock) if clock != ROWS else "the others"
@@ -177,9 +174,8 @@ def _from_first(stamps: np.ndarray, duration: float) -> np.ndarray:
 
 def _without_time(info: LogInfo) -> str:
     """Reason why none of a table's columns is a time."""
-    strays = next((f"{shown(c.name)}: {c.strays}" for c in info.columns if c.strays), "")
-    notes = [strays, *(n.sentence for n in info.notes if n.code == COUNTS_ROWS)]
-    return "; ".join(filter(None, ("no column is a time", *notes)))
+    strays = next((f"; {shown(c.name)}: {c.strays}" for c in info.columns if c.strays), "")
+    return f"no column is a time{strays}"
 
 
 def _is_known(values: np.ndarray) -> bool:

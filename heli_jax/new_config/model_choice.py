@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 
 from heli_jax import models
-from heli_jax.flights.log import ChannelLog, as_floats
+from heli_jax.flights.log import ChannelLog, as_floats, shown, wrong
 from heli_jax.flights.preset import fitting_presets
-from heli_jax.flights.table import shown, wrong
 from heli_jax.linear_models import read as linear_models
 from heli_jax.new_config import guess, tables
 from heli_jax.new_config.logs import Log

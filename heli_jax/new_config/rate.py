@@ -6,7 +6,6 @@ import numpy as np
 
 from heli_jax.flights.derived import sources
 from heli_jax.flights.preset import model_inputs, model_outputs, preset
-from heli_jax.flights.repeats import carried_on, first_of_each
 from heli_jax.flights.resample import SLOWER, usual_step
 from heli_jax.new_config.guess import Series
 
@@ -38,8 +37,7 @@ def rate_of_outputs(series: Mapping[str, Series], outputs: Collection[str]) -> f
     """
     rates, rows = [], 0.0
     for times, values, *_ in (series[n] for n in outputs if n in series):
-        seen = ~np.isnan(first_of_each(values) if carried_on(times, values) else values)
-        rates.append(1.0 / usual_step(times[seen]))
+        rates.append(1.0 / usual_step(times[~np.isnan(values)]))
         rows = max(rows, 1.0 / usual_step(times), (times.size - 1) / float(np.ptp(times)))
     if not rates or rows < SLOWER * max(rates):
         return None

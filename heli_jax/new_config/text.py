@@ -27,6 +27,7 @@ _GUSTS = (
 _NO_AXIS = (
     "  # output-error: the model names no axis on which gusts could act (axes in its file).",
 )
+_PRIOR_OF_A = "    # a: {prior: {mean: 5.5, sd: 0.3}} # else taken as exact: Ixx and If go with it"
 _SMOOTH = (
     "  # GUESS: output-error, since the outputs have no sensor's noise: the log was smoothed or",
     "  # simulated, and filter-error needs the noise as the sensors gave it.",
@@ -165,6 +166,8 @@ def configuration(
     ]
     stays = "# stays at this, another vehicle's; found without the first #"
     lines += [f"    # {n}: {{start: {_number(v)}}}".ljust(33) + stays for n, v in held.items()]
+    if not chosen.linear and "a" in naming.names(chosen.model.Params) and "a" not in free:
+        lines.append(_PRIOR_OF_A)
     guess, sure = late
     why = f"GUESS: {_comment(guess)}" if guess else "where the stick was logged late or early"
     lines += [
@@ -266,21 +269,16 @@ def _flight(chosen: Chosen, signals: Signals, time: TimeInfo | None, log: str) -
 
 def _time(time: TimeInfo) -> str:
     """The clock of a table."""
-    runs = f", runs: {_value(time.numbering)}" if time.numbering else ""
     if time.counted is None:
         unit = "" if time.unit == "s" else f", unit: {time.unit}"
-        guesses = ["the unit, by its steps"] * time.guessed + ["that each run is a flight"] * bool(
-            runs
-        )
-        guessed = f"   # GUESS: {'; '.join(guesses)}" if guesses else ""
-        return f"      time: {{signal: {_value(time.column)}{unit}{runs}}}{guessed}"
+        guessed = "   # GUESS: the unit, by its steps" if time.guessed else ""
+        return f"      time: {{signal: {_value(time.column)}{unit}}}{guessed}"
     counter = "" if time.column == ROWS else f"signal: {_value(time.column)}, "
     if math.isnan(time.counted):
         return (
             f"      time: {{{counter}rate: {EDIT}}}   # Hz, samples a second: no column is a time"
         )
-    said = f"   # GUESS: the file says {_comment(time.said)}" if time.said else ""
-    return f"      time: {{{counter}rate: {time.counted:.10g}{runs}}}{said}"
+    return f"      time: {{{counter}rate: {time.counted:.10g}}}"
 
 
 def _preset(preset: str, outputs: Sequence[str], filtered: Mapping[str, Filtered]) -> list[str]:

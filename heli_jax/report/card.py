@@ -7,21 +7,18 @@ card may see it, and a card that is passed must not stand beside a `no`.
 import math
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
-from heli_jax import naming
 from heli_jax.analysis.spectra import COHERENT
 from heli_jax.identification.fit import Estimate, Fit
-from heli_jax.identification.identifiability.analysis import ILL_CONDITIONED
+from heli_jax.identification.identifiability.verdict import ILL_CONDITIONED
 from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.adequacy import EXPECTED
 from heli_jax.identification.validation.held_out import LEVEL
 from heli_jax.identification.validation.metrics import Metrics
 from heli_jax.numbers import number, p_value, percent, vaf_percent
-from heli_jax.report import frequency
-from heli_jax.report.frequency import Coherence, FittedFlight, coherences
+from heli_jax.report.fitted_responses import FittedResponses
 
 CRAMER_RAO, INSENSITIVITY, COHERENCE = 20.0, 10.0, COHERENT
 """Tischler and Remple, Aircraft and Rotorcraft System Identification (2012)"""
@@ -56,8 +53,8 @@ class Gate(NamedTuple):
     """text in place of a number"""
 
 
-def card(problem: Problem, fit: Fit) -> tuple[Gate, ...]:
-    """Every line: the verdicts, parameters, their relations, agreement, whiteness, excitation.
+def card(problem: Problem, fit: Fit, responses: FittedResponses | None = None) -> tuple[Gate, ...]:
+    """Every line: the verdicts, parameters, their relations, agreement, whiteness, coherence.
 
     None of a fit that stopped before an optimum: its numbers are no result.
     """
@@ -86,7 +83,7 @@ def card(problem: Problem, fit: Fit) -> tuple[Gate, ...]:
     lines += _of_disturbance(fit)
     errors = "innovations" if noise_model == "disturbance" else "residuals"
     lines += _of_whiteness(fit, f"whiteness of {errors}, p-value")
-    lines += _of_excitation(problem, fit)
+    lines += _of_coherence(responses)
     return tuple(lines)
 
 
@@ -284,36 +281,11 @@ def _of_whiteness(fit: Fit, what: str) -> list[Gate]:
     return [line._replace(gate="", passed=None, remark=why) for line in lines]
 
 
-def _of_excitation(problem: Problem, fit: Fit) -> list[Gate]:
-    """Coherence, asked for where the model says that the output follows the input, and stated
-    elsewhere."""
-    lines = []
-    # In the order of the signals: the fitted flights first.
-    flights = (*problem.training, *(f for f in problem.flights if f.hold_out))
-    for s, flight in zip(fit.signals, flights, strict=False):
-        constants = {n: jnp.asarray(v) for n, v in flight.known.items()}
-        params = naming.replace(fit.params, **constants)
-        at = frequency.at_record(FittedFlight(problem.model, params, fit, s))
-        for (u, y), coherence in coherences(problem.model, params, at, s, fit).items():
-            lines.append(_of_coherence(f"{u} to {y}, {s.flight}", coherence))
-    return lines
-
-
-def _of_coherence(of: str, coherence: Coherence | str) -> Gate:
-    if isinstance(coherence, str):
-        return Gate("coherence", of, math.nan, "", "", None, coherence)
-    hz = coherence.lowest / (2.0 * math.pi) if coherence.lowest else 0.0
-    # Of what lies below nothing is said: segments of this record are too short for it.
-    band = f"; from {hz:.2g} Hz ({coherence.lowest:.2g} rad/s) on" if coherence.lowest else ""
-    remark = f"weighted by the expected response, {coherence.segments} segments"
-    what = "partial coherence" if coherence.others else "coherence"
-    if not coherence.asked:
-        share = percent(coherence.share, 0)
-        remark = f"not asked: the model puts {share} of this output down to this input"
-    elif coherence.expected < COHERENCE:
-        # A simulation has no noise: what it lacks is the segments' doing (leakage, a memory longer
-        # than one of them, a nonlinear vehicle), and no measurement could have more.
-        remark = f"not asked: in the simulation it is {coherence.expected:.2g} too"
-    else:
-        return _least(what, of, coherence.value, "", COHERENCE, remark + band)
-    return Gate(what, of, coherence.value, "", "", None, remark + band)
+def _of_coherence(responses: FittedResponses | None) -> list[Gate]:
+    """Gates of the most coherent input of each output, in the fitted flights together."""
+    every = {} if responses is None else responses.coherence
+    remark = "highest mean over an octave"
+    return [
+        _least("coherence", f"{input} to {output}", value, "", COHERENCE, remark)
+        for output, (input, value) in every.items()
+    ]

@@ -1,31 +1,20 @@
 """Several fits side by side: estimates and differences, agreement, verdicts; and their page."""
 
-import contextlib
-import csv
-import functools
-import io
-import itertools
 import math
 import os
 import re
 import urllib.parse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-
-from heli_jax import units
 from heli_jax.errors import InputError
 from heli_jax.finding import Finding, note, sentences
-from heli_jax.identification.result import Estimate, Signals
+from heli_jax.identification.result import Estimate
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
-from heli_jax.numbers import lowered, measured, number, rounded, vaf_percent
-from heli_jax.report import style
-from heli_jax.report.charts import Chart, Numbers, Series, limits_of, panel, samples
-from heli_jax.report.figures import time_label
+from heli_jax.numbers import NOTHING, lowered, number, vaf_percent, with_sd
 from heli_jax.report.origin import origin
-from heli_jax.report.page import Picture, filled, picture
+from heli_jax.report.page import filled
 from heli_jax.report.saved_fit import SavedFit, load_fit
 from heli_jax.report.style import pretty
 from heli_jax.report.tables import NOT_DETERMINED, Table, combination, product
@@ -35,7 +24,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 NOT_CONVERGED = "not converged"
-_ABSENT = "–"
 _METRICS: tuple[tuple[str, str, Callable[[float | None], str]], ...] = (
     ("VAF", "vaf", vaf_percent),
     ("fit", "nrmse_fit_percent", lambda v: vaf_percent(None if v is None else v / 100)),
@@ -47,14 +35,6 @@ _LATEX = str.maketrans(
     | {"$": r"\$", "{": r"\{", "}": r"\}", "~": r"\~{}", "\\": r"\textbackslash{}"}
 )
 _RAISED = re.compile(r"(·10)?([⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)")
-_JOINT = (
-    "± is one standard deviation (sd), a 95 % interval about twice as far. Differences are from "
-    "the first run, in the sd that the two have together if nothing is common to them."
-)
-_SAME = (
-    "{first} and {second} share a log: their estimates are correlated, and differ by less than "
-    "that by chance."
-)
 
 
 class ComparedRuns(NamedTuple):
@@ -66,43 +46,22 @@ class ComparedRuns(NamedTuple):
     @property
     def estimates(self) -> Table:
         """Each parameter's estimate and sd by run, those of each combination that a run determines
-        and of what flights share beside them, with the differences from the first; in ASCII but for
-        ±, so that a number can be pasted into a vehicle file."""
-        return self._estimates(rounded, str)
-
-    @property
-    def page_estimates(self) -> Table:
-        """As `estimates`, with numbers and units as all pages have them."""
-        head, rows = self._estimates(lambda value, sd: measured(sd, value), pretty)
-        first = 1 + len(self.labels)
-        return Table(
-            head,
-            [
-                (*row[:first], *(c.replace("-", "−") for c in row[first:-1]), row[-1])
-                for row in rows
-            ],
-        )
-
-    def _estimates(
-        self, pair: Callable[[float, float], tuple[str, ...]], shown_unit: Callable[[str], str]
-    ) -> Table:
-        """Estimates with `pair` for the text of a value and its sd, and `shown_unit` of a unit."""
+        and of what flights share beside them, with the differences from the first."""
         first = self.labels[0]
         several = [f"{label} - {first} [sd]" for label in self.labels[1:]]
-        rows = []
-        of_runs = self._by_run()
+        rows, of_runs = [], self._by_run()
         for name in _in_order(of_runs):
             estimates = [of_run.get(name) for of_run in of_runs]
-            units = {e.unit for e in estimates if e is not None}
+            units = {pretty(e.unit) for e in estimates if e is not None}
             cells = [
-                _measured(e, pair, shown_unit if len(units) > 1 else None, arrived=_arrived(run))
+                _measured(e, run, with_unit=len(units) > 1)
                 for e, run in zip(estimates, self.runs, strict=True)
             ]
             # Where an optimiser stopped on its way there is nothing to compare.
             pairs = zip(estimates, self.runs, strict=True)
             first_one, *others = (e if _arrived(run) else None for e, run in pairs)
             apart = [_difference(first_one, other) for other in others]
-            rows.append((name, *cells, *apart, shown_unit(units.pop()) if len(units) == 1 else ""))
+            rows.append((name, *cells, *apart, units.pop() if len(units) == 1 else ""))
         return Table(("parameter", *self.labels, *several, "unit"), rows)
 
     def _by_run(self) -> list[dict[str, Estimate]]:
@@ -153,24 +112,29 @@ class ComparedRuns(NamedTuple):
     @property
     def notes(self) -> tuple[Finding, ...]:
         """Notes on the differences and doubts about runs; subjects are labels of runs."""
-        notes, first = [note("compared.joint-sd", _JOINT)], self.runs[0]
-        for label, run in zip(self.labels[1:], self.runs[1:], strict=True):
+        words = (
+            "± is one standard deviation (sd), a 95 % interval about twice as far. Differences are "
+            "from the first run, in the sd that the two have together if nothing is common to them."
+        )
+        notes, first, label = [note("compared.joint-sd", words)], self.runs[0], self.labels[0]
+        for other, run in zip(self.labels[1:], self.runs[1:], strict=True):
             if _share_a_log(first, run):
-                words = _SAME.format(first=self.labels[0], second=label)
-                notes.append(note("compared.one-log", words, self.labels[0], label))
+                words = (
+                    f"{label} and {other} share a log: their estimates are correlated, and differ "
+                    "by less than that by chance."
+                )
+                notes.append(note("compared.one-log", words, label, other))
         for label, run in zip(self.labels, self.runs, strict=True):
-            if run.status == "not-converged":
-                words = f"{label} did not converge: its numbers are no result."
-                if run is first:
-                    words += " Differences are from the first run: name one first that did."
-                notes.append(Finding("compared.not-converged", "doubt", words, subjects=(label,)))
-                continue
             doubts = {}
-            if run.distrust:
+            if not _arrived(run):
+                doubts["not-converged"] = " did not converge: its numbers are no result."
+                if run is first:
+                    doubts["not-converged"] += " Name one first that did: differences are from it."
+            elif run.distrust:
                 doubts["not-trusted"] = f": {run.distrust}"
-            if run.adequate is False:
+            if _arrived(run) and run.adequate is False:
                 doubts["not-adequate"] = " is not adequate: its intervals may be too narrow."
-            elif run.overconfident:
+            elif _arrived(run) and run.overconfident:
                 doubts["overconfident"] = ": its sd are too small: its residuals are not white."
             notes += [
                 Finding(f"compared.{what}", "doubt", f"{label}{words}", subjects=(label,))
@@ -189,19 +153,11 @@ class ComparedRuns(NamedTuple):
     def to_csv(self) -> str:
         """As `to_dataframe`, as text; cells of what is not determined are empty, and those of fits
         that did not converge."""
-        out = io.StringIO()
-        writer = csv.writer(out, lineterminator="\n")
-        writer.writerow(["run", "parameter", "value", "sd", "lower95", "upper95", "unit"])
-        for label, estimates in zip(self.labels, self._usable(), strict=True):
-            for name, e in estimates.items():
-                known = e.sd is not None
-                numbers = (e.value, e.sd, e.lower95, e.upper95) if known else ("",) * 4
-                writer.writerow([label, name, *numbers, e.unit])
-        return out.getvalue()
+        return self.to_dataframe().to_csv(index=False, lineterminator="\n")
 
     def to_latex(self) -> str:
         """The estimates as a table for a paper, with booktabs; its first line says what ± is."""
-        head, rows = self.page_estimates
+        head, rows = self.estimates
         lines = [
             "% estimate ± one standard deviation; [sd]: difference in joint standard deviations",
             r"\begin{tabular}{l" + "r" * (len(head) - 2) + "l}",
@@ -310,32 +266,25 @@ def _arrived(run: SavedFit) -> bool:
     return run.status != "not-converged"
 
 
-def _measured(
-    e: Estimate | None,
-    pair: Callable[[float, float], tuple[str, ...]],
-    shown_unit: Callable[[str], str] | None,
-    *,
-    arrived: bool,
-) -> str:
+def _measured(e: Estimate | None, run: SavedFit, *, with_unit: bool) -> str:
     if e is None:
-        return _ABSENT
-    if not arrived:
+        return NOTHING
+    if not _arrived(run):
         return NOT_CONVERGED
     if e.sd is None:
         # Of a disturbance that does not show the size is zero.
         return "0" if e.at_bound and e.value == 0.0 else NOT_DETERMINED
-    value, sd = pair(e.value, e.sd)
-    return f"{value} ± {sd}" + (f" {shown_unit(e.unit)}" if shown_unit else "")
+    return with_sd(e.value, e.sd) + (f" {pretty(e.unit)}" if with_unit else "")
 
 
 def _difference(first: Estimate | None, other: Estimate | None) -> str:
     if first is None or other is None or first.sd is None or other.sd is None:
-        return _ABSENT
+        return NOTHING
     joint = math.hypot(first.sd, other.sd)
     if first.unit != other.unit or not joint:
-        return _ABSENT
-    text = f"{(other.value - first.value) / joint:+.1f}"
-    return "0.0" if float(text) == 0.0 else text
+        return NOTHING
+    text = f"{(other.value - first.value) / joint:+.1f}".replace("-", "−")
+    return "0.0" if text in ("+0.0", "−0.0") else text
 
 
 def _agreement(m: Metrics | None, key: str, text: Callable[[float | None], str]) -> str:
@@ -372,31 +321,29 @@ def _latex(text: str) -> str:
 
 
 _FILES = ("report.html", "fit.json", "signals.csv", "config.yaml")
-_MOST_FIGURES = 24
-_SHOWN, _FAR = 2.0, 20.0
-"""of an output's measured range: how far from its middle the axes reach at most, and curves"""
-_SI = ("1", "m", "m/s", "m/s^2", "rad", "rad/s", "rad/s^2")
 
 
 def write_page(path: Path, compared: ComparedRuns) -> None:
     """The page, self-contained."""
-    numbers = Numbers()
-    pictures = list(_pictures(compared, numbers))
-    folder = path.absolute().parent
+
+    def link(file: Path) -> str:
+        return urllib.parse.quote(os.path.relpath(file.absolute(), path.absolute().parent))
+
     page = filled(
         "compared.html.j2",
         labels=compared.labels,
         tables=[
-            ("Estimates", compared.page_estimates),
+            ("Estimates", compared.estimates),
             ("Verdicts", compared.verdicts),
             ("Agreement", compared.agreement),
         ],
         notes=sentences(compared.notes),
-        pictures=pictures,
-        numbers=numbers.content(),
         # Relative, so that page and runs can be moved together.
         files=[
-            (label, [(n, _link(run.directory / n, folder)) for n in _FILES if _is(run, n)])
+            (
+                label,
+                [(n, link(run.directory / n)) for n in _FILES if _is(run, n)],
+            )
             for label, run in zip(compared.labels, compared.runs, strict=True)
         ],
         configs=[
@@ -411,93 +358,3 @@ def write_page(path: Path, compared: ComparedRuns) -> None:
 
 def _is(run: SavedFit, name: str) -> bool:
     return (run.directory / name).is_file()
-
-
-def _link(file: Path, folder: Path) -> str:
-    """The address of a file for a page in a folder."""
-    try:
-        relative = os.path.relpath(file.absolute(), folder)
-    except ValueError:  # on another drive
-        return file.absolute().as_uri()
-    return urllib.parse.quote(relative.replace(os.sep, "/"))
-
-
-def _pictures(compared: ComparedRuns, numbers: Numbers) -> Iterator[tuple[Picture, str]]:
-    """The figures, each with its caption."""
-    for name, output, by_run in itertools.islice(_overlaps(compared), _MOST_FIGURES):
-        unit = _unit(compared, output)
-        made = picture("overlay", functools.partial(_overlay, by_run, name, output, unit), numbers)
-        if made is not None:
-            drawn = {label for label, _ in by_run}
-            missing = [label for label in compared.labels if label not in drawn]
-            without = f"no {output} of that log in a flight named {name}, or no result"
-            yield made, f"Not drawn: {', '.join(missing)} ({without})." if missing else ""
-
-
-def _overlaps(
-    compared: ComparedRuns,
-) -> Iterator[tuple[str, str, list[tuple[str, Signals]]]]:
-    """Flights and outputs that more than one run has, with the runs' signals."""
-    by_place: dict[tuple[str, str, str], list[tuple[str, Signals]]] = {}
-    names: dict[tuple[str, tuple[float, ...]], str] = {}
-    for label, run in zip(compared.labels, compared.runs, strict=True):
-        # What stopped on its way is no result, and simulates nothing that was found.
-        if run.status == "not-converged":
-            continue
-        # Flights without a name are all called flight 1, whatever log they are of.
-        logs = {f["flight"]: f for f in run.content["data"] if f.get("flight")}
-        for signals in run.signals:
-            flight = logs.get(signals.flight, {})
-            log, name = str(flight.get("sha256", "")), signals.flight
-            # And one part of a log may have a name of its own in each run.
-            if log and flight.get("window"):
-                part = (log, tuple(round(float(t), 3) for t in flight["window"]))
-                called = names.setdefault(part, name)
-                name = called if called not in logs else name
-            for output in signals.measured:
-                by_place.setdefault((log, name, output), []).append((label, signals))
-    for (_, name, output), by_run in by_place.items():
-        if len(by_run) > 1:
-            yield name, output, by_run
-
-
-def _unit(compared: ComparedRuns, output: str) -> str:
-    """The SI unit of an output, by the unit that it was logged in; empty where none is stated."""
-    flights = [f for run in compared.runs for f in run.content.get("data", ())]
-    logged = [((f.get("signals") or {}).get("outputs") or {}).get(output) for f in flights]
-    for stated in (signal.get("unit") for signal in logged if isinstance(signal, dict)):
-        for si in _SI:
-            with contextlib.suppress(ValueError):
-                units.factor(str(stated), si)
-                return si
-    return ""
-
-
-def _overlay(by_run: Sequence[tuple[str, Signals]], name: str, output: str, unit: str) -> Chart:
-    first = by_run[0][1]
-    # By what was measured: one run that diverges would leave of all others a straight line.
-    measured = first.measured[output][np.isfinite(first.measured[output])]
-    middle = float(np.mean(measured)) if measured.size else 0.0
-    size = float(np.ptp(measured)) if measured.size and np.ptp(measured) > 0 else 1.0
-    t, colours = first.log_times, style.CYCLE
-    series = [samples("measured", t, first.measured[output], style.PALE, 1.2)]
-    for i, (label, signals) in enumerate(by_run):
-        simulated = signals.simulated[output]
-        far = np.abs(simulated - middle) > _FAR * size
-        if far.any():
-            label, simulated = f"{label} (diverges)", np.where(far, np.nan, simulated)
-        look = {"width": 0.9, "dashed": i // len(colours) % 2 == 1}
-        color = colours[i % len(colours)]
-        series.append(Series(label, signals.log_times, simulated, color, **look))
-    low, high = limits_of(series)
-    limits = max(low, middle - _SHOWN * size), min(high, middle + _SHOWN * size)
-    words = f"{output} [{unit}]" if unit not in ("", "1") else output
-    begin = min(float(s.log_times[0]) for _, s in by_run)
-    end = max(float(s.log_times[-1]) for _, s in by_run)
-    return Chart(
-        f"{output}, {style.short(name)}: simulated",
-        time_label(first.log_start),
-        (begin, end if end > begin else begin + 1.0),
-        (panel(words, series, 2.2, limits=limits),),
-        of=name,
-    )

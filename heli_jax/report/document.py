@@ -31,7 +31,7 @@ from heli_jax.analysis.handling_qualities import NUMBERS, UNITS, HandlingQualiti
 from heli_jax.analysis.response_agreement import USUAL_J, ResponseAgreement
 from heli_jax.finding import Distrust, Finding, sentences
 from heli_jax.flights import Flight
-from heli_jax.flights.origins import as_content
+from heli_jax.flights.flight import as_content
 from heli_jax.identification.diagnostics.noise import COLOURED, TOO_NARROW
 from heli_jax.identification.equation_error.start import (
     Equation,
@@ -426,7 +426,7 @@ class FitFile(TypedDict):
     """predicted one sample ahead, of the flights that were fitted"""
     one_step_validation: Annotated[dict[str, Metrics], "fit.one_step_validation"]
     """the same of flights held out"""
-    acceptance: Annotated[list[Gate], lambda a: card(a.problem, a.fit)]
+    acceptance: Annotated[list[Gate], lambda a: card(a.problem, a.fit, a.supplementary.responses)]
     """the lines of the acceptance card"""
     models: Annotated[CandidatesCompared | None, "supplementary.choice"]
     methods: Annotated[MethodsCompared | None, "supplementary.methods"]

@@ -19,7 +19,6 @@ from heli_jax.identification.result import Fit, Signals
 from heli_jax.identification.validation.adequacy import (
     EXPECTED,
     EXPLAINED,
-    FAR_FROM_WHITE,
     NEARLY_WHITE,
 )
 from heli_jax.identification.validation.metrics import metrics
@@ -27,7 +26,7 @@ from heli_jax.numbers import measured, percent, vaf_percent
 from heli_jax.report import figures, tables
 from heli_jax.report.card import card, summary
 from heli_jax.report.charts import Logged, Numbers
-from heli_jax.report.figures.estimates import MOST, share_within
+from heli_jax.report.figures.estimates import MOST
 from heli_jax.report.files import Analysis as Analysis
 from heli_jax.report.fitted_responses import FittedPair
 from heli_jax.report.origin import Origin
@@ -96,15 +95,18 @@ def render(
         problem=problem,
         baseline=analysis.baseline,
         more=analysis.supplementary,
-        # Once: it takes spectra of every pair of signals.
-        card=card(problem, fit),
+        card=card(problem, fit, analysis.supplementary.responses),
         summary=summary,
         # The template asks this module for its rows.
         lines=lines(fit),
-        meanings=meanings(fit),
+        limits={
+            "factor": f"{FACTOR:g}",
+            "explained": percent(EXPLAINED, 0),
+            "nearly_white": percent(NEARLY_WHITE, 0),
+            "expected": f"{EXPECTED:g}",
+        },
         remark=model_remark(problem),
         tables=tables,
-        logged=logged_outputs(analysis),
         constants=tables.constants(problem, vehicle_constants),
         versions=versions(),
         origin=origin,
@@ -118,10 +120,6 @@ def render(
     )
 
 
-_MOST = 6
-"""pairs that are told one by one"""
-
-
 # No group may begin another's name.
 GROUPS = {
     "response": "From above, over time: measured and simulated, what is left between them, inputs.",
@@ -133,9 +131,7 @@ GROUPS = {
     "1980).",
     "held": "The same of all flights held out together: gain and phase of model and data with 95 % "
     "intervals, partial coherence of the data, and data over model.",
-    "starts": "The misfit that each start of the optimiser reached, best first.",
     "rls": "Each coefficient while the record goes by: one to be trusted settles.",
-    "trace": "Each colour is a chain. Chains to be trusted cannot be told apart and do not drift.",
     "pairs": "Dots and bars: the samples. Blue: the fit's Gaussian approximation with its "
     "intervals' sd; 95 % of it lie within a curve. Where the dots do not follow it, neither do "
     "intervals and correlations.",
@@ -166,7 +162,6 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
     model, drawings = problem.model, dict[str, Draw]()
     if (comparison := supplementary.intervals) is not None:
         if comparison.posterior is not None:
-            drawings["trace"] = later(figures.trace, comparison.posterior, fit)
             drawings["pairs_posterior"] = later(figures.posterior_pairs, comparison.posterior, fit)
         if comparison.bootstrap is not None:
             drawings["pairs_bootstrap"] = later(figures.bootstrap_pairs, comparison.bootstrap, fit)
@@ -198,7 +193,6 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
                 name = f"{group}_{pair.output}-{pair.input}"
                 rls = baseline if group == "match" and _of(baseline, pair) else None
                 drawings[name] = later(figures.match, pair, unit, note, rls)
-    drawings["starts"] = later(figures.waterfall, fit.starts)
     if baseline is not None:
         # Time in the log of its flight's first sample [s].
         start = next((s.log_start for s in fit.signals if s.flight == baseline.flight), None)
@@ -262,19 +256,6 @@ def as_logged(signal: Signal) -> Logged | None:
     return Logged(signal.name, one - zero, zero)
 
 
-def logged_outputs(analysis: Analysis) -> dict[str, tuple[str, float]]:
-    """By output the unit of the logs, and what SI is times to be in it; those alone that all
-    flights have in one unit other than SI."""
-    by_output: dict[str, set[tuple[str, float]]] = {}
-    for flight in analysis.problem.flights:
-        listed = flight.source.outputs if flight.source else {}
-        for name in flight.outputs:
-            unit = (listed[name].unit, from_si(listed[name])) if name in listed else ("", 1.0)
-            by_output.setdefault(name, set()).add(unit)
-    alike = {name: next(iter(units)) for name, units in by_output.items() if len(units) == 1}
-    return {name: unit for name, unit in alike.items() if unit[1] != 1.0}
-
-
 def from_si(signal: Signal) -> float:
     """Return the factor from SI to the unit that the configuration states for a signal."""
     try:
@@ -292,30 +273,22 @@ def caption(picture: Picture) -> str:
 def alt_text(picture: Picture, analysis: Analysis) -> str:
     """Text alternative of a figure."""
     fit, intervals = analysis.fit, analysis.supplementary.intervals
+    samples: Mapping[str, np.ndarray] = {}
     if picture.name == "pairs_posterior" and intervals and intervals.posterior:
-        return f"{picture.title}. {_pairs(intervals.posterior.draws, fit)}."
-    if picture.name == "pairs_bootstrap" and intervals and intervals.bootstrap:
-        return f"{picture.title}. {_pairs(intervals.bootstrap.values, fit)}."
+        samples = intervals.posterior.draws
+    elif picture.name == "pairs_bootstrap" and intervals and intervals.bootstrap:
+        samples = intervals.bootstrap.values
+    if samples:
+        each = []
+        for name in list(samples)[:MOST]:
+            mean, sd = measured(float(np.std(samples[name])), float(np.mean(samples[name])))
+            each.append(f"{name} {mean}, {sd} {fit.estimates[name].unit}".rstrip())
+        count = next(iter(samples.values())).size
+        return f"{picture.title}. {count} samples, mean and sd: {'; '.join(each)}."
     for output, m in fit.metrics.items():
         if picture.name.startswith("response") and picture.name.endswith(f"_{output}"):
             return f"{picture.alt} Over the fitted flights: VAF {vaf_percent(m.vaf)}."
     return picture.alt
-
-
-def _pairs(samples: Mapping[str, np.ndarray], fit: Fit) -> str:
-    """Describe pairs of samples in words."""
-    names, each = list(samples)[:MOST], []
-    for name in names:
-        mean, sd = measured(float(np.std(samples[name])), float(np.mean(samples[name])))
-        each.append(f"{name} {mean}, {sd} {fit.estimates[name].unit}".rstrip())
-    pairs = [(names[j], names[i]) for i in range(len(names)) for j in range(i)]
-    shares = [(p, s) for p in pairs if (s := share_within(fit, samples, *p)) is not None]
-    # What is furthest from the 95 % that the curve stands for is told first.
-    worst = sorted(shares, key=lambda s: -abs(s[1] - 0.95))[:_MOST]
-    inside = ", ".join(f"{x} and {y} {percent(share, 0)}" for (x, y), share in worst)
-    count = next(iter(samples.values())).size
-    within = f". Within the Gaussian 95 % curve: {inside}" if inside else ""
-    return f"{count} samples, mean and sd: {'; '.join(each)}{within}"
 
 
 class Line(NamedTuple):
@@ -328,13 +301,17 @@ class Line(NamedTuple):
     """one sentence"""
 
 
+_SPEAK_AGAINST = ("adequacy", "dynamics", "units", "timing", "quality")
+"""topics whose doubts speak against a model that is adequate"""
+
+
 def lines(fit: Fit) -> tuple[Line, Line, Line]:
     """Did the optimiser converge; what do the data determine; is the model adequate."""
     if fit.status == "not-converged":
         stopped = "The optimiser stopped before an optimum, and these numbers are no result."
         return (
             Line("bad", "Not converged", stopped),
-            Line("none", "Identifiability not judged", "The data determine numbers at an optimum."),
+            Line("none", "Identifiability not judged", "The data are asked at an optimum alone."),
             Line("none", "Adequacy not judged", "A model is judged at an optimum."),
         )
     best, runs = sum(row.optimum == 1 for row in fit.starts), len(fit.starts)
@@ -352,7 +329,7 @@ def lines(fit: Fit) -> tuple[Line, Line, Line]:
         against = [
             f.brief
             for f in fit.findings
-            if f.bad and f.brief and f.code.partition(".")[0] in ("adequacy", "dynamics")
+            if f.bad and f.brief and f.code.partition(".")[0] in _SPEAK_AGAINST
         ]
         told = ["Nothing in the record speaks against the model"]
         if against:
@@ -383,61 +360,4 @@ def model_remark(problem: Problem) -> str:
         f"factor 1/2 (cyclic_moment, here {factor:g}) where blade-element theory averaged over a "
         "turn gives 1/8 for two blades, and the inertia that is found grows and shrinks with it. "
         "Compare an estimate with a weighed or swung inertia only with that in mind."
-    )
-
-
-def meanings(fit: Fit) -> list[tuple[str, str]]:
-    """Heading and text of each statement, and of what residuals that are not white do to it."""
-    return [
-        (
-            "Converged",
-            "the last step changed every parameter by less than a thousandth of the sd that it "
-            "would have were all else known.",
-        ),
-        (
-            "Determined",
-            "by data and priors the 95 % intervals, as they are reported, reach at most a factor "
-            f"of {FACTOR:g} to either side, also without the weak priors of biases, offsets and "
-            "initial states.",
-        ),
-        ("Adequate", _adequate(fit)),
-        (
-            "Not trusted",
-            "a misfit that was found moves the estimate by more than half of its 95 % interval, or "
-            "by an amount that is not known: the interval is withdrawn.",
-        ),
-        ("Residuals that are not white", _coloured(fit)),
-    ]
-
-
-def _adequate(fit: Fit) -> str:
-    if any(output.against_disturbance is not None for output in fit.adequacy.judged):
-        ahead = fit.adequacy.ahead
-        what = "simulation" if ahead is None else f"predictions up to {ahead:g} s ahead"
-        return (
-            f"the error of the {what} has at most {EXPECTED:g} times the power that the estimated "
-            "disturbance makes, with innovations that are white or have an autocorrelation below "
-            f"{FAR_FROM_WHITE:g} at one sample; or the simulation explains {percent(EXPLAINED, 0)} "
-            "of what is not white noise. Nothing in the record speaks against every model."
-        )
-    return (
-        f"the simulation explains at least {percent(EXPLAINED, 0)} of what is not white noise, or "
-        f"at most {percent(NEARLY_WHITE, 0)} of the residual's variance is other than that. "
-        "Nothing in the record speaks against every model."
-    )
-
-
-def _coloured(fit: Fit) -> str:
-    if fit.status == "not-converged":
-        intervals = "Of a fit that stopped before an optimum no intervals are given."
-    elif fit.overconfident:
-        intervals = "The intervals given are not corrected for them and are too narrow."
-    elif fit.coloured:
-        intervals = "The intervals given are corrected for their autocorrelation."
-    else:
-        intervals = "There are none here, and the intervals need no correction."
-    return (
-        f"{intervals} A disturbance in them that knows nothing of the inputs leaves the estimates "
-        "unbiased; dynamics that the model lacks bias them, and so does a disturbance under "
-        "feedback, and no interval allows for that."
     )

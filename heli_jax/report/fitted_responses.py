@@ -5,7 +5,7 @@ The measured ones are conditioned: inputs that move together are separated, and 
 """
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +19,7 @@ from heli_jax.analysis.attitude_responses import (
 )
 from heli_jax.analysis.flight_responses import FlightResponses, Settings, flight_responses
 from heli_jax.analysis.handling_qualities import HandlingQualities, handling_qualities
+from heli_jax.analysis.operating_point import OperatingPoint, operating_point
 from heli_jax.analysis.response_curves import (
     COHERENT,
     Acting,
@@ -30,12 +31,12 @@ from heli_jax.analysis.response_curves import (
     without_hold,
 )
 from heli_jax.analysis.spectra import octave_mean
+from heli_jax.dynamics.model import Model
 from heli_jax.finding import Finding, note
 from heli_jax.identification.fit import Fit
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate
-from heli_jax.report import frequency
-from heli_jax.report.frequency import FittedFlight
+from heli_jax.simulation.simulate import substeps_for
 
 MOST_PAIRS = 6
 """of input and output that get a figure"""
@@ -81,6 +82,8 @@ class FittedResponses(NamedTuple):
     """those without a coherence worth showing, as `lat to p`; they have no figure"""
     held_out: tuple[FittedPair, ...] = ()
     """of the flights held out, as many as are shown"""
+    coherence: Mapping[str, tuple[str, float]] = {}
+    """by output its most coherent input, and the highest mean coherence over an octave"""
 
 
 def fitted_responses(
@@ -94,8 +97,7 @@ def fitted_responses(
         return FittedResponses((), 0, (), "", (note(NO_RESPONSES, words),))
     known = problem.training[0].known
     params = naming.replace(fit.params, **{n: jnp.asarray(v) for n, v in known.items()})
-    flight = FittedFlight(problem.model, params, fit, fit.signals[0])
-    at = frequency.at_record(flight)
+    at = at_record(problem.model, params, fit)
     free = [n for n in fit.estimates if n in naming.names(problem.model.Params) and n not in known]
     of = linear_responses(problem.model, params, free, at.state, at.inputs)
     if not all(np.isfinite(M).all() for M in of.matrices):
@@ -103,8 +105,8 @@ def fitted_responses(
         lacking = note("responses.not-linearised", words)
         return FittedResponses((), 0, (), at.words, (*responses.notes, lacking))
     curves = _Curves(fit, of, tuple(free), (responses.omega[0], _BEYOND * responses.omega[-1]))
-    coherent = _coherent(responses)
-    pairs = _pairs(responses, curves, coherent)
+    means = _octave_means(responses)
+    pairs = _pairs(responses, curves, means)
     handling = tuple(
         Handling(p, _of_model(curves, p), measured_handling(responses, p))
         for p in asked
@@ -113,10 +115,36 @@ def fitted_responses(
     )
     left_out = max(len(pairs) - MOST_PAIRS, 0)
     drawn = tuple(pairs[:MOST_PAIRS])
-    incoherent = tuple(f"{input} to {name}" for (input, name), c in coherent.items() if not c)
+    highest = {names: float(np.max(c)) for names, c in means.items()}
+    incoherent = tuple(f"{i} to {o}" for (i, o), c in highest.items() if c < COHERENT)
+    by_output = {o: (i, c) for (i, o), c in sorted(highest.items(), key=lambda pair: pair[1])}
     held_out, notes = _of_held_out(problem, settings, curves)
-    notes = (*responses.notes, *notes)
-    return FittedResponses(drawn, left_out, handling, at.words, notes, incoherent, held_out)
+    return FittedResponses(
+        drawn,
+        left_out,
+        handling,
+        at.words,
+        (*responses.notes, *notes),
+        incoherent,
+        held_out,
+        {name: by_output[name] for name in responses.outputs},
+    )
+
+
+# Parameters of a model are a class of the user's own: they are annotated Any.
+def at_record(model: Model, params: Any, fit: Fit) -> OperatingPoint:
+    """Return the operating point of a fit's first flight at which the model is linearised, with
+    the estimated gains."""
+    signals = fit.signals[0]
+    # What acts is gain times what was logged: the mean of the log would be another point.
+    gains = {n: fit.nuisance.get(f"gain {n}") for n in signals.inputs}
+    inputs = {
+        n: np.asarray(u) * (1.0 if (gain := gains[n]) is None else gain.value)
+        for n, u in signals.inputs.items()
+    }
+    dt = float(np.diff(signals.times[:2])[0]) if signals.times.size > 1 else 1.0
+    substeps = substeps_for(dt, model.fastest)
+    return operating_point(model, params, inputs, signals.measured, dt, substeps=substeps)
 
 
 class _Curves(NamedTuple):
@@ -176,24 +204,23 @@ def _sd(estimate: Estimate, fit: Fit) -> float:
     return max(half / _Z95, e.sd)
 
 
-def _coherent(responses: FlightResponses) -> dict[tuple[str, str], float]:
-    """By input and output the sum of the coherence, a mean over an octave, where it is worth
-    showing."""
-    means = {
+def _octave_means(responses: FlightResponses) -> dict[tuple[str, str], np.ndarray]:
+    """By input and output the mean coherence (k,) over an octave."""
+    return {
         (input, name): octave_mean(responses.omega, pair.coherence)
         for name, output in responses.outputs.items()
         for input, pair in output.pairs.items()
     }
-    return {names: float(np.sum(c[c >= COHERENT])) for names, c in means.items()}
 
 
 def _pairs(
-    responses: FlightResponses, curves: _Curves, coherent: Mapping[tuple[str, str], float]
+    responses: FlightResponses, curves: _Curves, means: Mapping[tuple[str, str], np.ndarray]
 ) -> list[FittedPair]:
     """Return the pairs of input and output that are coherent anywhere, by the sum of their
     coherence."""
     ranked = []
-    for (input, name), total in coherent.items():
+    for (input, name), mean in means.items():
+        total = float(np.sum(mean[mean >= COHERENT]))
         if not total:
             continue
         pair = responses.outputs[name].pairs[input]
@@ -217,7 +244,7 @@ def _of_held_out(
         responses = flight_responses(held, settings)
     except ValueError as e:
         return (), (note("responses.none-held-out", f"no responses of the flights held out: {e}"),)
-    pairs = tuple(_pairs(responses, curves, _coherent(responses))[:MOST_PAIRS])
+    pairs = tuple(_pairs(responses, curves, _octave_means(responses))[:MOST_PAIRS])
     if pairs:
         return pairs, ()
     words = (
@@ -236,6 +263,6 @@ def _of_model(curves: _Curves, pair: HandlingPair) -> HandlingQualities:
     beyond = "w180" if w180.value > last else "2 w180"
     words = (
         f"{beyond} lies beyond the band of the flights' responses, {last / (2.0 * np.pi):.3g} Hz: "
-        "what hangs on it is the model's word alone"
+        "values there are the model's, extrapolated"
     )
     return qualities._replace(sentences=(*qualities.sentences, words))

@@ -165,44 +165,36 @@ def transfer_status(fit: TransferFit | str) -> str:
 
 def _content(request: Wanted, fit: TransferFit | str, window: float) -> dict[str, Any]:
     """One entry of transfer_functions.json; what the response does not determine has no number."""
-    status = transfer_status(fit)
-    content: dict[str, Any] = {
+    status, found = transfer_status(fit), None if isinstance(fit, str) else fit
+    numerator: list[dict[str, float]] = [{}] * (request.zeros + 1)
+    denominator: list[dict[str, float]] = [{}] * request.poles
+    delay: dict[str, float] | None = {} if request.delay else None
+    if found is not None:
+        numerator, denominator = (
+            [_number(c) for c in of] for of in (found.numerator, found.denominator)
+        )
+        delay = None if found.delay is None else _number(found.delay)
+    return {
         "input": request.input,
         "output": request.output,
-        "numerator": [{}] * (request.zeros + 1),
-        "denominator": [{"value": 1.0}, *([{}] * request.poles)],
-        "delay_s": {} if request.delay else None,
-        "poles": None,
-        "zeros": None,
-        "chi_squared_per_degree": None,
-        "J": None,
+        "numerator": numerator,
+        "denominator": [{"value": 1.0}, *denominator],
+        "delay_s": delay,
+        "poles": _roots_of(found.poles, found.denominator) if found else None,
+        "zeros": _roots_of(found.zeros, found.numerator) if found else None,
+        "chi_squared_per_degree": found.chi_squared if found else None,
+        "J": found.J if found else None,
         "status": status,
         "converged": status == "converged",
-        "determined": False,
-        "windows_taken_off": False,
+        "determined": bool(found and found.determined),
+        "windows_taken_off": bool(found and forgets(found, window)),
         "sentences": fit_sentences(fit, window),
     }
-    if isinstance(fit, str):
-        return content
-    # Roots of coefficients that are not known are no numbers either.
-    roots = {}
-    for name, root, of in (
-        ("poles", fit.poles, fit.denominator),
-        ("zeros", fit.zeros, fit.numerator),
-    ):
-        known = all(c.determined for c in of)
-        roots[name] = [[r.real, r.imag] for r in root] if known else None
-    return {
-        **content,
-        **roots,
-        "numerator": [_number(c) for c in fit.numerator],
-        "denominator": [{"value": 1.0}, *(_number(c) for c in fit.denominator)],
-        "delay_s": None if fit.delay is None else _number(fit.delay),
-        "chi_squared_per_degree": fit.chi_squared,
-        "J": fit.J,
-        "determined": fit.determined,
-        "windows_taken_off": forgets(fit, window),
-    }
+
+
+def _roots_of(roots: np.ndarray, of: Sequence[Coefficient]) -> list[list[float]] | None:
+    """Real and imaginary part of each; roots of coefficients that are not known are no numbers."""
+    return [[r.real, r.imag] for r in roots] if all(c.determined for c in of) else None
 
 
 def _number(c: Coefficient) -> dict[str, float]:
@@ -356,49 +348,41 @@ def write_netcdf(path: Path, responses: FlightResponses, units: Mapping[str, str
     # Here: it takes long to load, for this file alone.
     import xarray as xr
 
-    outputs = responses.outputs.values()
-    inputs = list(next(iter(outputs)).pairs)
-    unit = [[quotient(units[o], units[i]) for i in inputs] for o in responses.outputs]
-    one = {u for row in unit for u in row}
-    # An attribute is that of all pairs; where these differ the coordinate `unit` has each.
-    of_H = {"units": one.pop()} if len(one) == 1 else {}
-    parts = "in the coordinate unit, output over input"
+    outputs = responses.outputs
+    inputs = list(next(iter(outputs.values())).pairs)
+    pairs = [[o.pairs[i] for i in inputs] for o in outputs.values()]
+    unit = [[quotient(units[o], units[i]) for i in inputs] for o in outputs]
+    of_pairs, of_outputs = ("output", "input", "frequency"), ("output", "frequency")
 
     def stacked(name: str) -> np.ndarray:
-        return np.stack([[getattr(o.pairs[i], name) for i in inputs] for o in outputs])
+        return np.array([[getattr(pair, name) for pair in row] for row in pairs])
 
-    H = stacked("H")
+    def each(name: str) -> np.ndarray:
+        return np.array([getattr(o, name) for o in outputs.values()])
+
+    H, parts = stacked("H"), "in the coordinate unit, output over input"
+    sd = f"of the real and of the imaginary part, {parts}"
+    # An attribute is that of all pairs; where these differ the coordinate `unit` has each.
+    every = {u for row in unit for u in row}
+    one = every.pop() if len(every) == 1 else None
+    together = "coherence with all inputs together"
     # NetCDF 3 has no complex numbers.
-    of_pairs = {
-        "real": (np.real(H), f"real part, {parts}", of_H),
-        "imaginary": (np.imag(H), f"imaginary part, {parts}", of_H),
-        "sd": (stacked("sd"), f"of the real and of the imaginary part, {parts}", of_H),
-        "coherence": (stacked("coherence"), "partial coherence", {"units": "1"}),
-    }  # fmt: skip
-    of_outputs = {
-        "multiple_coherence": ("multiple", "coherence with all inputs together", "1"),
-        "noise": ("noise", "density of what the inputs leave", "SI^2/Hz"),
+    variables = {
+        "real": (of_pairs, np.real(H), f"real part, {parts}", one),
+        "imaginary": (of_pairs, np.imag(H), f"imaginary part, {parts}", one),
+        "sd": (of_pairs, stacked("sd"), sd, one),
+        "coherence": (of_pairs, stacked("coherence"), "partial coherence", "1"),
+        "half95": ("output", stacked("half95")[:, 0], "half of a 95 % interval in sd", "1"),
+        "multiple_coherence": (of_outputs, each("multiple"), together, "1"),
+        "noise": (of_outputs, each("noise"), "density of what the inputs leave", "SI^2/Hz"),
     }
-    half95 = [next(iter(o.pairs.values())).half95 for o in outputs]
-    words = {"long_name": "half of a 95 % interval in sd", "units": "1"}
     data = xr.Dataset(
         {
-            **{
-                name: (("output", "input", "frequency"), values, {"long_name": words, **unit})
-                for name, (values, words, unit) in of_pairs.items()
-            },
-            "half95": ("output", half95, words),
-            **{
-                name: (
-                    ("output", "frequency"),
-                    np.stack([getattr(o, field) for o in outputs]),
-                    {"long_name": words, "units": unit},
-                )
-                for name, (field, words, unit) in of_outputs.items()
-            },
+            name: (dims, v, {"long_name": words} | ({"units": u} if u else {}))
+            for name, (dims, v, words, u) in variables.items()
         },
         {
-            "output": list(responses.outputs),
+            "output": list(outputs),
             "input": inputs,
             "unit": (("output", "input"), unit),
             "frequency": ("frequency", responses.omega / (2.0 * np.pi), {"units": "Hz"}),
@@ -406,7 +390,7 @@ def write_netcdf(path: Path, responses: FlightResponses, units: Mapping[str, str
         {
             "window_s": responses.window,
             "instruments": " ".join(responses.instruments),
-            "units_of_outputs": " ".join(units[n] for n in responses.outputs),
+            "units_of_outputs": " ".join(units[n] for n in outputs),
             "units_of_inputs": " ".join(units[n] for n in inputs),
             "notes": json.dumps([as_data(f) for f in responses.notes]),
         },

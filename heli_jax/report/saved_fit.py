@@ -103,36 +103,10 @@ def load_fit(directory: str | Path) -> SavedFit:
             f"{directory}: expected the run directory of a fit (heli-jax fit --out DIR), got {got}"
         )
     data = read_regular(directory / "fit.json", "the fit.json of a run directory", _LIMIT_BYTES)
+    table = directory / "signals.csv"
+    text = read_regular(table, "the signals.csv of a run directory", _LIMIT_BYTES)
     try:
-        content = checked(data)
-        # Fixed ones are listed for who looks for them; they are no estimates.
-        estimates = _estimates(
-            {n: e for n, e in content["parameters"].items() if not e.get("fixed", False)}
-        )
-        # Others were asked for, or the estimates hold the Gaussian ones.
-        asked = content["intervals"]
-        return SavedFit(
-            directory=directory,
-            model=content["model"],
-            method=content["method"],
-            status=content["status"],
-            verdict=content["verdict"]["text"],
-            identifiable=content["identifiable"],
-            adequate=content["adequate"],
-            estimates=estimates,
-            nuisance=_estimates(content["nuisance"]),
-            intervals=_gaussian(estimates) if asked is None else _intervals(asked),
-            metrics=_metrics(content["metrics"]),
-            validation=_metrics(content["validation"]),
-            signals=_signals(directory / "signals.csv", content),
-            notes=tuple(
-                f["sentence"] for f in content.get("findings", ()) if f["severity"] != "ok"
-            ),
-            untrusted=tuple(content.get("untrusted", {})),
-            content=content,
-        )
-    except InputError:
-        raise
+        return _saved(directory, checked(data), text.decode("utf-8"))
     # A key is missing or holds another kind, a row is cut off, a cell is no number.
     except (
         LookupError,
@@ -149,56 +123,67 @@ def load_fit(directory: str | Path) -> SavedFit:
         ) from e
 
 
-# By name and these fields alone: a file may have keys that a later version added.
+def _saved(directory: Path, content: dict[str, Any], table: str) -> SavedFit:
+    # Fixed ones are listed for who looks for them; they are no estimates.
+    free = {n: e for n, e in content["parameters"].items() if not e.get("fixed", False)}
+    estimates = _records(Estimate, free)
+    by_method = {n: {"gaussian": (e.lower95, e.upper95)} for n, e in estimates.items()}
+    if content["intervals"] is not None:
+        by_method = content["intervals"]["by_parameter"]
+    intervals = {
+        name: {how: (_number(low), _number(high)) for how, (low, high) in by.items()}
+        for name, by in by_method.items()
+    }
+    return SavedFit(
+        directory=directory,
+        model=content["model"],
+        method=content["method"],
+        status=content["status"],
+        verdict=content["verdict"]["text"],
+        identifiable=content["identifiable"],
+        adequate=content["adequate"],
+        estimates=estimates,
+        nuisance=_records(Estimate, content["nuisance"]),
+        intervals=intervals,
+        metrics=_records(Metrics, content["metrics"]),
+        validation=_records(Metrics, content["validation"]),
+        signals=_signals(table, content),
+        notes=tuple(f["sentence"] for f in content.get("findings", ()) if f["severity"] != "ok"),
+        untrusted=tuple(content.get("untrusted", {})),
+        content=content,
+    )
 
 
-def _estimates(saved: Mapping[str, Mapping[str, Any]]) -> dict[str, Estimate]:
-    # What the data do not determine has no number in the file.
-    made = {n: Estimate(*(e[field] for field in Estimate._fields)) for n, e in saved.items()}
-    return {n: e._replace(value=_number(e.value)) for n, e in made.items()}
-
-
-def _metrics(saved: Mapping[str, Mapping[str, float | None]]) -> dict[str, Metrics]:
-    return {n: Metrics(*(_number(m[f]) for f in Metrics._fields)) for n, m in saved.items()}
+def _records[R: (Estimate, Metrics)](
+    kind: type[R], saved: Mapping[str, Mapping[str, Any]]
+) -> dict[str, R]:
+    """By name; by these fields alone, since a later version may have added keys."""
+    # JSON has no NaN: what the data do not determine is null in fit.json.
+    numbers = ("value", *Metrics._fields)
+    made = {}
+    for name, e in saved.items():
+        values: list[Any] = [_number(e[f]) if f in numbers else e[f] for f in kind._fields]
+        made[name] = kind(*values)
+    return made
 
 
 def _number(value: float | None) -> float:
-    # JSON has no NaN: fit.json says null.
     return math.nan if value is None else float(value)
 
 
-def _intervals(saved: Mapping[str, Any]) -> dict[str, dict[str, tuple[float, float]]]:
-    return {
-        name: {method: (_number(low), _number(high)) for method, (low, high) in by.items()}
-        for name, by in saved["by_parameter"].items()
-    }
-
-
-def _gaussian(estimates: Mapping[str, Estimate]) -> dict[str, dict[str, tuple[float, float]]]:
-    return {
-        name: {"gaussian": (e.lower95, e.upper95)}
-        for name, e in estimates.items()
-        if e.lower95 is not None and e.upper95 is not None
-    }
-
-
-def _signals(path: Path, content: Mapping[str, Any]) -> tuple[Signals, ...]:
+def _signals(text: str, content: Mapping[str, Any]) -> tuple[Signals, ...]:
     """The flights of signals.csv, as the fit had them; NaN where a cell is empty."""
     # The table itself does not say which flights were held out.
     held_out = {flight["flight"]: flight.get("hold_out", False) for flight in content["data"]}
     # An output may have been measured in the flights held out alone.
-    outputs = [
-        *content["metrics"],
-        *(n for n in content["validation"] if n not in content["metrics"]),
-    ]
-    rows: dict[str, list[list[str]]] = {}
-    text = read_regular(path, "the signals.csv of a run directory", _LIMIT_BYTES).decode("utf-8")
+    outputs = list(dict.fromkeys([*content["metrics"], *content["validation"]]))
     # A reader, not split(","): flights' names come from files and may hold commas.
     lines = csv.reader(text.splitlines())
     head = next(lines, [])
     if head[:2] != ["flight", "time"]:
-        raise InputError(f"{path}: expected the columns flight and time, got {head[:2]}")
+        raise ValueError(f"signals.csv: expected the columns flight and time, got {head[:2]}")
     # Flights lie one after the other; rows are told apart by name and not by place.
+    rows: dict[str, list[list[str]]] = {}
     for line in lines:
         rows.setdefault(line[0], []).append(line[1:])
     return tuple(
@@ -213,21 +198,12 @@ def _flight(
     table = np.array([[float(c) if c else math.nan for c in row] for row in cells])
     # A flight without some signal has an empty column there.
     columns = {n: v for n, v in zip(head, table.T, strict=True) if not np.isnan(v).all()}
-    # What belongs to no output is an input: the file does not say which columns are.
-    of_outputs = {f"{o}_{w}" for o in outputs for w in _OF_AN_OUTPUT}
-    inputs = {n: v for n, v in columns.items() if n not in (*_TIMES, *of_outputs)}
     measured, simulated, _, innovations = (
-        {o: columns[f"{o}_{what}"] for o in outputs if f"{o}_{what}" in columns}
-        for what in _OF_AN_OUTPUT
+        {o: columns.pop(f"{o}_{what}") for o in outputs if f"{o}_{what}" in columns}
+        for what in ("measured", "simulated", "residual", "innovation")
     )
-    log = columns.get("log_time")  # runs of earlier versions, and flights without a log, have none
-    start = None if log is None else float(log[0] - columns["time"][0])
-    times = columns["time"]
-    return Signals(name, hold_out, times, inputs, measured, simulated, innovations or None, start)
-
-
-_TIMES = ("time", "log_time")
-"""what is neither an input nor of an output"""
-
-
-_OF_AN_OUTPUT = ("measured", "simulated", "residual", "innovation")
+    times = columns.pop("time")
+    log = columns.pop("log_time", None)  # of earlier versions, and without a log, there is none
+    start = None if log is None else float(log[0] - times[0])
+    # What is left is no time and of no output: the inputs.
+    return Signals(name, hold_out, times, columns, measured, simulated, innovations or None, start)

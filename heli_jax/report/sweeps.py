@@ -11,7 +11,7 @@ import itertools
 import json
 import re
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,8 +19,7 @@ import matplotlib
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
-from matplotlib.colors import LogNorm, PowerNorm
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import ArrayLike
@@ -37,10 +36,12 @@ RESULTS = 6
 """results with figures of their own"""
 DRAWN = 1 << 16
 """elements that are drawn at most, by lot: more change no quantile that the eye could see"""
-_DOTS, _MARKS, _LINES = 2000, 300, 300
-"""dots, red marks and faint lines of a panel at most"""
-_SLICES, _PAIRS, _VARIABLES, _UPRIGHT = 8, 6, 7, 12
-"""panels of slices and of maps, rows of the corner, axes side by side, at most"""
+_DOTS, _MARKS = 2000, 300
+"""dots and red marks of a panel at most"""
+_SLICES, _PAIRS = 8, 6
+"""panels of slices and of maps at most"""
+_TICKS = 6
+"""of an axis at most"""
 _WIDE = 30.0
 """Factor over which numbers of one sign are drawn logarithmically: on a linear scale the lower half
 of that range, in decades, would lie within a sixth of the panel."""
@@ -49,17 +50,10 @@ _BINS, _A_BIN = 20, 5
 _CELLS, _GRID = 24, 180
 """cells along an axis at most, and distinct values that are cells of their own: a grid is seen at
 its own resolution"""
-_BARS = 30
-"""bars of a histogram at most"""
-_LETTERS = 24
-"""of a name at most"""
 _DPI = 160
 """of what is pixels in an SVG"""
 _OK = 0
 """the status of an element that counts; that of heli_jax.sweeps, whose import takes JAX"""
-# As many results as colours, as many elements of each as dashes.
-_COLOURS = (style.BLUE, style.GREEN, style.PURPLE, style.ORANGE, style.BLACK, style.SKY)
-_DASHES = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (1, 1)), (0, (5, 1, 1, 1)))
 
 type Which = Literal["x", "y"]
 
@@ -95,7 +89,7 @@ class Column:
         first, last = (low, high) if axis else np.quantile(seen, [0.01, 0.99])
         declared = axis and variable.attrs.get("scale") == "log"
         wide = max(abs(first), abs(last)) > _WIDE * min(abs(first), abs(last))
-        self.log = low * high > 0.0 and (declared or (wide and (axis or not self.whole)))
+        self.log = low > 0.0 and (declared or (wide and (axis or not self.whole)))
         if not (axis or self.log):
             beyond = 0.3 * (last - first)
             low, high = max(low, first - beyond), min(high, last + beyond)
@@ -110,42 +104,34 @@ class Column:
         if self.few and self.distinct.size > 1:
             between = 0.5 * (self.distinct[1:] + self.distinct[:-1])
             first, last = 2 * self.distinct[0] - between[0], 2 * self.distinct[-1] - between[-1]
-            if not (self.log and first * last <= 0.0):
+            if not self.log or first > 0.0:
                 return np.array([first, *between, last])
         return (np.geomspace if self.log else np.linspace)(*self.view, count + 1)
 
-    def scale(
-        self, ax: Axes, which: Which, ends: ArrayLike, ticks: int, letters: int = _LETTERS
-    ) -> None:
+    def scale(self, ax: Axes, which: Which, ends: ArrayLike) -> None:
         """Give an axis of a panel its scale, limits, ticks and label."""
         low, *_, high = map(float, np.asarray(ends))
+        ax.set(**{f"{which}lim": (low, high)})
         axis = ax.xaxis if which == "x" else ax.yaxis
         if self.log:
-            # Matplotlib's log scale has no negative numbers; the linear part of this one is unseen.
-            kind = {"value": "log"} if low > 0.0 else {"value": "symlog", "linthresh": -0.5 * high}
-            (ax.set_xscale if which == "x" else ax.set_yscale)(**kind)  # type: ignore[arg-type]
-            axis.set_major_locator(FixedLocator(_log_ticks(low, high, ticks)))
-            axis.set_minor_locator(NullLocator())
-            axis.set_major_formatter(FuncFormatter(lambda v, _: number(v, 3)))
-        elif self.whole and self.distinct.size <= ticks:
+            ax.set(**{f"{which}scale": "log"})
+            style.plain_log_ticks(ax, which)
+        elif self.whole and self.distinct.size <= _TICKS:
             axis.set_major_locator(FixedLocator([float(v) for v in self.distinct]))
         else:
-            style.few_ticks(ax, which, ticks, integer=self.whole)
-        (ax.set_xlim if which == "x" else ax.set_ylim)(low, high)
-        axis.set_label_text(style.label(_short(self.name, letters), self.unit))
+            style.few_ticks(ax, which, _TICKS, integer=self.whole)
+        axis.set_label_text(style.label(style.short(self.name), self.unit))
 
 
 class Table:
     """Results of a sweep to draw, read once: all of them, or a random part of many."""
 
-    def __init__(self, ds: xr.Dataset, named: Iterable[np.ndarray] = ()) -> None:
-        """`named` are elements that are drawn in any case."""
+    def __init__(self, ds: xr.Dataset) -> None:
         self._ds = ds
         ok = ds["status"].to_numpy() == _OK
         self.size, self.n_ok = ok.size, int(np.count_nonzero(ok))
         lots = _by_lot(np.flatnonzero(ok), DRAWN), _by_lot(np.flatnonzero(~ok), DRAWN // 2)
-        also = [np.asarray(e, np.int64) for e in named]
-        self.elements = np.unique(np.concatenate([*lots, *also]))
+        self.elements = np.sort(np.concatenate(lots))
         """which elements, ascending, (n,)"""
         self.ok = ok[self.elements]
         self.results = results(ds)
@@ -174,7 +160,7 @@ class Table:
         lot = f"{self.elements.size} drawn, by lot" if self.elements.size < self.size else ""
         marks = "red marks: not ok" + (f" ({_MARKS} of {failed})" if failed > _MARKS else "")
         words = "; ".join(filter(None, (lot, *notes, marks if failed else "")))
-        title = f"{_short(what, 60)}: {self.n_ok} of {self.size} elements ok"
+        title = f"{style.short(what)}: {self.n_ok} of {self.size} elements ok"
         figure.suptitle(f"{title}\n{textwrap.fill(words, 105)}", x=0.01, ha="left", fontsize=9)
 
     @property
@@ -183,41 +169,35 @@ class Table:
         return "no finite value" if self.n_ok else "no element is ok"
 
 
-def write_figures(directory: Path, ds: xr.Dataset, worst: Mapping[str, np.ndarray]) -> list[Path]:
-    """Write all figures as PNG and SVG into a directory, which is made; returns the files.
-
-    They are slices-RESULT, maps-RESULT (the first six results), corner and worst; what a file
-    should not be called becomes `_`.
+def write_figures(directory: Path, ds: xr.Dataset) -> list[Path]:
+    """Write slices-RESULT and maps-RESULT of the first six results as PNG and SVG into a
+    directory, which is made; returns the files.
     """
     # One table for all figures: each column is read once.
-    table = Table(ds, worst.values())
-    draw: dict[str, Callable[[], Figure | None]] = {}
-    for result, stem in stems(table.results[:RESULTS]).items():
-        draw[f"slices-{stem}"] = functools.partial(slices, table, result)
-        draw[f"maps-{stem}"] = functools.partial(maps, table, result)
-    draw["corner"] = functools.partial(corner, table)
-    draw["worst"] = functools.partial(worst_elements, table, worst)
+    table, written = Table(ds), []
     directory.mkdir(parents=True, exist_ok=True)
-    written = []
     # One after another: a figure that is written is let go before the next is drawn.
-    for name, draw_figure in draw.items():
-        path = directory / name
-        with matplotlib.rc_context({"savefig.dpi": _DPI}):
-            saved = style.save(draw_figure, path)
-        if saved:
-            written += [path.with_suffix(".png"), path.with_suffix(".svg")]
+    for result, stem in stems(table.results[:RESULTS]).items():
+        for draw in (slices, maps):
+            path = directory / f"{draw.__name__}-{stem}"
+            with matplotlib.rc_context({"savefig.dpi": _DPI}):
+                saved = style.save(functools.partial(draw, table, result), path)
+            if saved:
+                written += [path.with_suffix(".png"), path.with_suffix(".svg")]
     return written
 
 
 def stems(names: Sequence[str]) -> dict[str, str]:
     """A different file name for each name, on file systems that fold case too."""
     stems: dict[str, str] = {}
-    taken: set[str] = set()
     for name in names:
-        first = re.sub(r"[^\w-]", "_", name)[:50]
-        every = itertools.chain([first], (f"{first}-{k}" for k in itertools.count(2)))
-        stems[name] = next(stem for stem in every if stem.casefold() not in taken)
-        taken.add(stems[name].casefold())
+        first = stem = re.sub(r"[^\w-]", "_", name)[:50]
+        taken = {other.casefold() for other in stems.values()}
+        for k in itertools.count(2):
+            if stem.casefold() not in taken:
+                break
+            stem = f"{first}-{k}"
+        stems[name] = stem
     return stems
 
 
@@ -258,12 +238,12 @@ def slices(table: Table, result: str) -> Figure | None:
         failed = table.failed(x)
         foot = np.full(failed.size, 0.03)
         _crosses(ax, x.values[failed], foot, transform=ax.get_xaxis_transform(), marker="|")
-        x.scale(ax, "x", x.edges(1), 6)
+        x.scale(ax, "x", x.edges(1))
         if y.empty:
             ax.set_yticks([])
             ax.text(0.5, 0.5, table.nothing, transform=ax.transAxes, ha="center", color=style.GREY)
             continue
-        y.scale(ax, "y", _with_margin(y), 6)
+        y.scale(ax, "y", _with_margin(y))
         if k % columns:
             ax.set_ylabel("")
             ax.tick_params(axis="y", labelleft=False)
@@ -285,8 +265,8 @@ def _with_margin(y: Column) -> tuple[float, float]:
     """A view with some room to either side: the marks of what failed lie there."""
     low, high = y.view
     if y.log:
-        wide = (max(abs(low), abs(high)) / min(abs(low), abs(high))) ** 0.07
-        return (low / wide, high * wide) if low > 0.0 else (low * wide, high / wide)
+        wide = (high / low) ** 0.07
+        return low / wide, high * wide
     return low - 0.07 * (high - low), high + 0.07 * (high - low)
 
 
@@ -336,8 +316,8 @@ def maps(table: Table, result: str) -> Figure | None:
         ax.grid(visible=False)
         failed = table.failed(x, y)
         _crosses(ax, x.values[failed], y.values[failed])
-        x.scale(ax, "x", ex, 6)
-        y.scale(ax, "y", ey, 6)
+        x.scale(ax, "x", ex)
+        y.scale(ax, "y", ey)
         if values.size:
             mesh = ax.pcolormesh(ex, ey, m.T, cmap="viridis", rasterized=True, **colours)
         else:
@@ -347,7 +327,7 @@ def maps(table: Table, result: str) -> Figure | None:
         bar = figure.colorbar(mesh, ax=panels, extend="both" if beyond else "neither", shrink=0.8)
         bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda v, _: number(v, 4)))
         bar.ax.yaxis.set_minor_locator(NullLocator())
-        bar.set_label(style.label(_short(z.name), z.unit))
+        bar.set_label(style.label(style.short(z.name), z.unit))
     table.head(
         figure,
         z.title,
@@ -365,134 +345,6 @@ def _medians(x: Column, y: Column, z: Column, grid: tuple[np.ndarray, np.ndarray
         return np.full([e.size - 1 for e in grid], np.nan)
     points = x.values[use], y.values[use], z.values[use]
     return binned_statistic_2d(*points, "median", bins=grid).statistic  # pyright: ignore
-
-
-def corner(table: Table) -> Figure | None:
-    """Histograms of axes and results, and densities of each two of them. None without an axis."""
-    considered = [table.column(r) for r in table.results[:_VARIABLES]]
-    drawn = [c for c in considered if not c.empty]
-    # Four axes in any case: without them the results are seen, but not what they come from.
-    axes = table.axes[: max(4, _VARIABLES - len(drawn))]
-    if not axes:
-        return None
-    shown = [*axes, *drawn][:_VARIABLES]
-    n = len(shown)
-    figure = style.figure(0.9 + min(6.5, 1.9 * n), constrained=True)
-    grid = figure.subplots(n, n, squeeze=False, sharex="col")
-    # Rice's rule; and about ten elements a cell, or a density is mostly empty.
-    count = np.count_nonzero(table.ok)
-    bars = int(np.clip(2.0 * count ** (1.0 / 3.0), 4, _BARS))
-    dense = int(np.clip(np.sqrt(count / 10), 4, _BARS))
-    for row, column in itertools.product(range(n), range(n)):
-        ax, x, y = grid[row, column], shown[column], shown[row]
-        if column > row:
-            ax.remove()
-            continue
-        x.scale(ax, "x", x.edges(bars), 4, 72 // n)
-        ax.tick_params(axis="x", labelbottom=row == n - 1, labelrotation=40, labelsize=7.0)
-        if row < n - 1:
-            ax.set_xlabel("")
-        ax.grid(visible=False)
-        if row == column:
-            ax.hist(x.values[x.used], bins=list(x.edges(bars)), color=style.BLUE, alpha=0.75)
-            ax.set_yticks([])
-            ax.spines["left"].set_visible(False)
-            continue
-        y.scale(ax, "y", y.edges(bars), 5, 72 // n)
-        ax.tick_params(axis="y", labelleft=column == 0, labelsize=7.0)
-        if column:
-            ax.set_ylabel("")
-        _density(ax, x, y, dense)
-        if x.axis and y.axis:
-            failed = table.failed(x, y)
-            _crosses(ax, x.values[failed], y.values[failed])
-    there = len(table.axes) + len(table.results) - len(considered) + len(drawn)
-    empty = ", ".join(_short(c.name) for c in considered if c.empty)
-    table.head(
-        figure,
-        "Axes and results",
-        *[f"results are means over {c.mean_over} flights" for c in drawn if c.mean_over][:1],
-        f"{table.nothing}: {empty}" if empty else "",
-        _first(n, there, "variables"),
-    )
-    return figure
-
-
-def _density(ax: Axes, x: Column, y: Column, k: int) -> None:
-    """Dots of few elements, or how many are in each cell."""
-    both = x.used & y.used
-    if np.count_nonzero(both) <= _DOTS:
-        _dots(ax, x.values[both], y.values[both])
-        return
-    grid = x.edges(k), y.edges(k)
-    count = np.histogram2d(x.values[both], y.values[both], bins=grid)[0]
-    # The root, or a few full cells would leave all others white; and lighter than its darkest, so
-    # that the marks of what failed can be seen.
-    norm = PowerNorm(0.5, 0.0, 1.3 * max(1.0, float(count.max())))
-    count[count == 0] = np.nan
-    ax.pcolormesh(*grid, count.T, cmap="Blues", norm=norm, rasterized=True)
-
-
-def worst_elements(table: Table, by_result: Mapping[str, np.ndarray]) -> Figure | None:
-    """Draw the worst elements of each result over parallel axes, a line for each.
-
-    `by_result` has those of each result, worst first. None where it has none.
-    """
-    axes = table.axes[:_UPRIGHT]
-    chosen = [
-        (table.column(name), np.asarray(elements)[: len(_DASHES)])
-        for name, elements in by_result.items()
-        if name in table.results and len(elements)
-    ][: len(_COLOURS)]
-    if not axes or not chosen:
-        return None
-    entries = sum(e.size for _, e in chosen)
-    figure, [ax] = _panels(1, 1, 3.2 + 0.175 * -(-entries // 2))
-    # Each axis by its own scale, from 0 to 1: they have no unit in common.
-    even = np.linspace(0.0, 1.0, 201)
-    places = np.stack(
-        [np.interp(c.values, (np.geomspace if c.log else np.linspace)(*c.view, 201), even)
-         for c in axes]
-    )  # fmt: skip
-    x = np.arange(len(axes), dtype=float)
-    lot = _by_lot(np.flatnonzero(table.ok), _LINES)
-    # One collection: hundreds of artists of their own are slow to draw.
-    lines = [np.column_stack([x, p]) for p in places[:, lot].T]
-    ax.add_collection(LineCollection(lines, colors=style.PALE, linewidths=0.6, alpha=0.5))
-    failed = table.failed()
-    _crosses(ax, np.repeat(x, failed.size), places[:, failed].ravel())
-    for k, (column, elements) in enumerate(chosen):
-        unit = "" if pretty(column.unit) == "–" else f" {pretty(column.unit)}"
-        for dashes, e in zip(_DASHES, elements, strict=False):
-            here = int(np.searchsorted(table.elements, e))
-            value = number(float(column.values[here]))
-            # Thinner for each further result: where lines coincide the one below still shows.
-            look = {"color": _COLOURS[k], "ls": dashes, "lw": 2.6 - 0.3 * k, "ms": 5.0 - 0.5 * k}
-            text = f"{_short(column.name)}: element {e}, {value}{unit}"
-            ax.plot(x, places[:, here], marker="o", label=text, zorder=4 + k, **look)
-    size, digits = (8.0, 3) if len(axes) < 8 else (7.0, 2)
-    names = [_short(c.name, 80 // len(axes)) for c in axes]
-    units = ["" if c.unit is None else f"\n[{pretty(c.unit)}]" for c in axes]
-    ax.set_xticks(x, [n + u for n, u in zip(names, units, strict=True)], size=size)
-    ax.set_xlim(-0.3, len(axes) - 0.7)
-    ax.set_ylim(-0.09, 1.09)
-    ax.set_yticks([])
-    ax.grid(visible=False)
-    ax.spines[["left", "bottom"]].set_visible(False)
-    for k, c in enumerate(axes):
-        ax.vlines(k, 0.0, 1.0, color="#444444", lw=0.8, zorder=2)
-        for value, y, va in ((c.view[0], -0.03, "top"), (c.view[1], 1.03, "bottom")):
-            end = number(float(f"{value:.{digits}g}"), digits)
-            ax.text(k, y, end, size=size, ha="center", va=va, color=style.GREY)
-    figure.legend(loc="outside lower left", ncols=2, handlelength=2.6)
-    table.head(
-        figure,
-        "Worst elements",
-        "grey: elements that are ok" + (f", {_LINES} by lot" if table.n_ok > _LINES else ""),
-        *[f"values are means over {c.mean_over} flights" for c, _ in chosen if c.mean_over][:1],
-        _first(len(axes), len(table.axes), "axes"),
-    )
-    return figure
 
 
 def _panels(count: int, columns: int, height: float) -> tuple[Figure, list[Axes]]:
@@ -530,26 +382,6 @@ def _not_finite(table: Table, y: Column) -> str:
     return f"{count} not finite" if count and not y.empty else ""
 
 
-def _short(text: str, most: int = _LETTERS) -> str:
-    """Text of at most so many letters, without its middle if need be."""
-    most = max(most, 5)
-    return text if len(text) <= most else f"{text[: most // 2]}…{text[len(text) - most // 2 + 1 :]}"
-
-
-def _log_ticks(low: float, high: float, most: int) -> list[float]:
-    """1, 2, 5 of each decade, or 1 of each or of each second one ...: at most so many."""
-    near, far = sorted((abs(low), abs(high)))
-    decades = 10.0 ** np.arange(np.floor(np.log10(near)), np.ceil(np.log10(far)) + 1)
-    ticks = np.outer(decades, [1.0, 2.0, 5.0]).ravel()
-    ticks = ticks[(ticks >= near) & (ticks <= far)]
-    if ticks.size < 2:  # less than a decade
-        ticks = np.linspace(near, far, 5)[1:-1]
-    elif ticks.size > most:
-        ticks = decades[(decades >= near) & (decades <= far)]
-        ticks = ticks[:: -(-ticks.size // most)]
-    return np.sort(np.sign(high) * ticks).tolist()
-
-
 def _by_lot(elements: np.ndarray, most: int) -> np.ndarray:
     """At most so many of the elements, drawn by lot."""
     if elements.size <= most:
@@ -583,10 +415,6 @@ _KINDS = {
     "maps": ("{} over pairs of axes", "colours: median of the elements in each cell"),
 }
 """by what a figure's file begins with: its title, and what it draws"""
-_OTHERS = {
-    "corner": ("Axes and results together", "histograms, and densities of each two of them"),
-    "worst": ("Where the worst elements lie", "a line through the axes for each"),
-}
 
 
 def write_page(path: Path, directory: Path, title: str) -> None:
@@ -636,23 +464,13 @@ def _elements(content: dict[str, Any]) -> tables.Table:
 
 def _pictures(content: dict[str, Any], folder: Path) -> Iterator[tuple[Picture, str]]:
     """The figures with their captions: titles in words, and what they show in numbers."""
-    results = {stem: name for name, stem in stems(list(content["results"])).items()}
-    for png in sorted(folder.glob("*.png")):
-        kind, _, stem = png.stem.partition("-")
-        name = results.get(stem, stem)
-        title, words = _OTHERS.get(png.stem) or _KINDS.get(kind, (png.stem, ""))
-        title = title.format(name)
-        names = [name] if kind in _KINDS else list(content["results"])
-        numbers = "; ".join(_range(n, content["results"][n]) for n in names[:_TOLD])
-        alt = f"{title}: {words}. Over the sweep {numbers}."
-        yield of_file(png, title, alt), f"{title}: {words}. (figures/{png.stem}.svg, .png)"
-
-
-_TOLD = 6
-"""results whose numbers a figure's words give"""
-
-
-def _range(name: str, result: dict[str, Any]) -> str:
-    unit = pretty(result.get("unit"))
-    ends = f"{number(result.get('min'), 3)} to {number(result.get('max'), 3)}"
-    return f"{name} {ends}{'' if unit == NOTHING else f' {unit}'}"
+    for name, stem in stems(list(content["results"])).items():
+        result = content["results"][name]
+        unit, ends = pretty(result.get("unit")), (number(result.get(k), 3) for k in ("min", "max"))
+        numbers = f"{name} {' to '.join(ends)}{'' if unit == NOTHING else f' {unit}'}"
+        for kind, (title, words) in _KINDS.items():
+            png = folder / f"{kind}-{stem}.png"
+            if png.is_file():
+                words = f"{title.format(name)}: {words}."
+                made = of_file(png, title.format(name), f"{words} Over the sweep {numbers}.")
+                yield made, f"{words} (figures/{png.stem}.svg, .png)"

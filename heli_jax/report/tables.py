@@ -11,8 +11,7 @@ from heli_jax.analysis.attitude_responses import Handling
 from heli_jax.analysis.handling_qualities import NUMBERS, UNITS, HandlingQualities, Number
 from heli_jax.analysis.response_agreement import USUAL_J, ResponseAgreement
 from heli_jax.finding import sentences
-from heli_jax.flights.flight import Flight
-from heli_jax.flights.origins import in_words
+from heli_jax.flights.flight import in_words
 from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.equation_error.start import EquationErrorStart
 from heli_jax.identification.frequency_start import FrequencyErrorStart
@@ -38,9 +37,8 @@ from heli_jax.numbers import (
 )
 from heli_jax.report.card import Gate, shown
 from heli_jax.report.style import pretty
+from heli_jax.summaries import NOT_DETERMINED, cells_of
 from heli_jax.vehicle import Constant
-
-NOT_DETERMINED = "not determined"
 
 
 class Table(NamedTuple):
@@ -82,46 +80,29 @@ class Bars(NamedTuple):
 def bars(fit: Fit) -> Bars:
     """The free parameters, and the combinations that the data determine in place of them, each
     with its interval in parts of its estimate."""
-    stopped, rows = fit.status == "not-converged", []
-    shown = [(n, e, pretty(e.unit)) for n, e in fit.estimates.items()]
-    shown += [(c.name, c, "") for c in (() if stopped else fit.verdict.combinations)]
-    for name, e, unit in shown:
-        cells = (where_it_stopped(e), "", "", "") if stopped else _cells(e)
-        known = not stopped and e.sd is not None and e.lower95 is not None
-        ends = (e.lower95, e.upper95) if known else None
-        interval = "" if cells[3] == NOTHING else cells[3]
-        rows.append((Bar(name, cells[0], unit, None, None, interval), ends, e.value))
-    return _on_one_axis(rows)
-
-
-def interval_bars(comparison: Intervals, fit: Fit) -> Bars:
-    """The intervals by every method, as `bars`; a row for each parameter and method."""
-    rows = []
-    for name, by_method in comparison.by_parameter.items():
-        e = fit.estimates[name]
-        for method, ends in by_method.items():
-            low, high, _ = measured(e.sd, *ends)
-            words = f"{low} to {high}"
-            rows.append((Bar(name, _METHODS[method], "", None, None, words), ends, e.value))
-    return _on_one_axis(rows)
-
-
-def _on_one_axis(rows: Sequence[tuple[Bar, Any, float]]) -> Bars:
-    """Bars with their places, by their ends and estimates."""
+    stopped = fit.status == "not-converged"
+    rows = [(n, e, pretty(e.unit)) for n, e in fit.estimates.items()]
+    rows += [(c.name, c, "") for c in determined(fit)]
     parts = []
-    for _, ends, value in rows:
-        pair = [end / value - 1.0 for end in ends or () if end is not None and value]
-        parts.append(sorted(pair) if len(pair) == 2 and all(map(math.isfinite, pair)) else None)
+    for _, e, _ in rows:
+        known = not stopped and e.sd is not None and e.value
+        ends = [end / e.value - 1.0 for end in (e.lower95, e.upper95) if known and end is not None]
+        parts.append(sorted(ends) if len(ends) == 2 and all(map(math.isfinite, ends)) else None)
     most = max((abs(v) for pair in parts if pair for v in pair), default=0.0)
     # A vague one must not press the others flat: beyond the axis a bar is cut off.
     reach = next((r for r in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5) if most <= r), 1.0)
     placed = []
-    for (bar, _, _), pair in zip(rows, parts, strict=True):
-        if pair is not None:
-            low, high = (50.0 + 50.0 * min(max(v / reach, -1.0), 1.0) for v in pair)
-            bar = bar._replace(low=low, high=high)
-        placed.append(bar)
+    for (name, e, unit), pair in zip(rows, parts, strict=True):
+        value, _, interval = cells_of(e, stopped=stopped)
+        at = (50.0 + 50.0 * min(max(v / reach, -1.0), 1.0) for v in pair or ())
+        low, high = at if pair else (None, None)
+        placed.append(Bar(name, value, unit, low, high, interval))
     return Bars(tuple(placed), percent(reach, 0) if any(parts) else "")
+
+
+def determined(fit: Fit) -> Sequence[Combination]:
+    """Return the combinations that the data determine; none without an optimum."""
+    return () if fit.status == "not-converged" else fit.verdict.combinations
 
 
 def correlation(fit: Fit) -> list[tuple[str, list[tuple[str, float]]]]:
@@ -136,64 +117,28 @@ def correlation(fit: Fit) -> list[tuple[str, list[tuple[str, float]]]]:
     return rows
 
 
-_SHARE = 0.005
-"""of the posterior variance: less is 0 % in the table, or 0.00"""
-
-
 def parameters(fit: Fit) -> Table:
     """The free parameters; where the data do not determine one, that is said in place of it."""
     head = ("parameter", "estimate", "sd", "sd / value", fit.interval, "unit", "start")
-    stopped = fit.status == "not-converged"
-    rows = [_estimate(n, e, stopped=stopped) for n, e in fit.estimates.items()]
-    if fit.coloured:
-        # What the sd would be if residuals were white, so that the price of their autocorrelation
-        # can be seen.
-        rows = [
-            (*row, NOTHING if e.sd_white is None else measured(e.sd_white, e.sd_white)[0])
-            for row, e in zip(rows, fit.estimates.values(), strict=True)
-        ]
-        return Table((*head, "prior share", "at bound", "sd if white"), rows)
-    return Table((*head, "prior share", "at bound"), rows)
+    stopped, rows = fit.status == "not-converged", []
+    for name, e in fit.estimates.items():
+        share, bound = percent(e.prior_share, 0), "yes" if e.at_bound else "no"
+        cells = _cells(e, stopped=stopped)
+        row = (name, *cells, pretty(e.unit), number(e.start, 5), share, bound)
+        if fit.coloured:
+            # What the sd would be if residuals were white, so that the price of their
+            # autocorrelation can be seen.
+            white = NOTHING if e.sd_white is None else measured(e.sd_white, e.sd_white)[0]
+            row = (*row, white)
+        rows.append(row)
+    return Table((*head, "prior share", "at bound", *["sd if white"] * fit.coloured), rows)
 
 
-def prior_note(problem: Problem, fit: Fit) -> str:
-    """Explain the prior share of parameters without a prior; empty if none has one."""
-    # A prior share without a prior would look like a mistake of the table.
-    names = [
-        n
-        for n, e in fit.estimates.items()
-        if problem.free[n].prior is None and e.prior_share >= _SHARE
-    ]
-    if not names:
-        return ""
-    others = [n for n, free in problem.free.items() if free.prior is not None]
-    of = f"the prior of {' and '.join(others)} and " if others else ""
-    return (
-        f"{', '.join(names)}: the prior share is that of {of}the weak priors of biases, initial "
-        "states and input offsets (ten times the signal)."
-    )
-
-
-def where_it_stopped(e: Estimate | Combination) -> str:
-    """The cell of an estimate of a fit that did not converge: a number that is no result."""
-    return f"{number(e.value, 3)} (no result)" if math.isfinite(e.value) else NOT_DETERMINED
-
-
-def _estimate(name: str, e: Estimate, *, stopped: bool) -> tuple[str, ...]:
-    cells = (where_it_stopped(e), *[NOTHING] * 3) if stopped else _cells(e)
-    share, bound = percent(e.prior_share, 0), "yes" if e.at_bound else "no"
-    return (name, *cells, pretty(e.unit), number(e.start, 5), share, bound)
-
-
-def _cells(e: Estimate | Combination) -> tuple[str, str, str, str]:
-    """Value, sd, sd over value and interval of what is determined."""
-    # Where the optimiser stopped in a direction that nothing determines is an accident: no number.
-    # Nor is there one beside an interval without an end, which says that nothing is known.
-    if e.sd is None or not math.isfinite(e.sd):
-        return NOT_DETERMINED, NOTHING, NOTHING, NOTHING
-    value, low, high, sd = measured(e.sd, e.value, e.lower95, e.upper95)
-    interval = "not trusted" if e.lower95 is None else f"{low} to {high}"
-    return value, sd, relative(e.sd, e.value), interval
+def _cells(e: Estimate | Combination, *, stopped: bool = False) -> tuple[str, str, str, str]:
+    """Value, sd, sd over value and interval."""
+    value, sd, interval = cells_of(e, stopped=stopped)
+    share = relative(e.sd, e.value) if sd else NOTHING
+    return value, sd or NOTHING, share, interval or NOTHING
 
 
 def _signed(value: float | None, digits: int) -> str:
@@ -201,35 +146,21 @@ def _signed(value: float | None, digits: int) -> str:
     return NOTHING if value is None else f"{value:+.{digits}f}".replace("-", "−")
 
 
-class Nuisances(NamedTuple):
-    """Gains, time shifts and biases; initial states apart, for there may be many."""
-
-    shown: Table
-    folded: Table
-
-
-def nuisances(fit: Fit) -> Nuisances:
-    """Return the table of nuisance parameters."""
+def nuisances(fit: Fit) -> tuple[Table, Table]:
+    """Gains, time shifts and biases; and initial states, of which windows have many."""
     head = ("unknown", "estimate", "sd", "95 % interval", "unit")
-    rows = {n: _nuisance(n, e) for n, e in fit.nuisance.items()}
-    # With windows there is one for each window and state, which would bury the gains and biases.
-    folded = [row for n, row in rows.items() if "/initial " in n]
-    return Nuisances(
-        Table(head, [row for n, row in rows.items() if "/initial " not in n]), Table(head, folded)
-    )
-
-
-def _nuisance(name: str, e: Estimate) -> tuple[str, ...]:
-    known = e if e.lower95 is not None and e.upper95 is not None else e._replace(sd=None)
-    value, sd, _, interval = _cells(known)
-    return (name, value, sd, interval, pretty(e.unit))
+    rows = []
+    for name, e in fit.nuisance.items():
+        known = e if e.lower95 is not None and e.upper95 is not None else e._replace(sd=None)
+        value, sd, _, interval = _cells(known)
+        rows.append((name, value, sd, interval, pretty(e.unit)))
+    states = [row for row in rows if "/initial " in row[0]]
+    return Table(head, [row for row in rows if row not in states]), Table(head, states)
 
 
 def combinations(fit: Fit) -> Table:
     """Return the table of combinations that the data determine."""
-    # Where no optimum was reached nothing is determined.
-    every = () if fit.status == "not-converged" else fit.verdict.combinations
-    rows = [(c.name, *_cells(c)) for c in every]
+    rows = [(c.name, *_cells(c)) for c in determined(fit)]
     return Table(("combination", "estimate", "sd", "sd / value", "95 % interval"), rows)
 
 
@@ -322,12 +253,10 @@ def starts(fit: Fit) -> Table:
     return Table(("", *ends, "cost", "steps", "led to", "run of"), rows)
 
 
-def agreement(
-    fit: Fit, baseline: Baseline | None, logged: Mapping[str, tuple[str, float]] | None = None
-) -> Table:
+def agreement(fit: Fit, baseline: Baseline | None) -> Table:
     """The same metrics for fit, held-out flights and RLS, output by output."""
     head = ("output", "of", "VAF", "fit", "RMSE", "Theil")
-    rows, units = [], logged or {}
+    rows = []
     sources = (
         ("fit, simulated", fit.metrics),
         ("fit, one step ahead", fit.one_step),
@@ -342,19 +271,17 @@ def agreement(
         for of, metrics in sources:
             if (m := metrics.get(output)) is None:
                 continue
-            unit, factor = units.get(output, ("", math.nan))
             cells = (
                 *(vaf_percent(share) for share in (m.vaf, m.nrmse_fit_percent / 100)),
                 number(m.rmse),
                 number(m.tic, 3),
-                *([f"{number(m.rmse * factor)} {unit}".strip()] if units else ()),
             )
             if of == _IN_ONE_PIECE and diverges(m):
                 # Its numbers grow with the length of the record: they would say nothing of the
                 # model.
                 cells = ("diverges", *[NOTHING] * (len(cells) - 1))
             rows.append((output, of, *cells))
-    return Table((*head, "RMSE as logged") if units else head, rows)
+    return Table(head, rows)
 
 
 _IN_ONE_PIECE = "held out, in one piece"
@@ -586,21 +513,6 @@ def first_guess(start: Start) -> Table:
     return Table(("parameter", "start", "unit", "from", "F-ratio"), rows)
 
 
-def selection_steps(start: Start) -> Table:
-    """The steps of a stepwise selection of terms; no rows where there was none."""
-    steps = () if start.selection is None else start.selection.steps
-    rows = [
-        (
-            str(i + 1),
-            f"{s.parameter} {'in' if s.entered else 'out'}",
-            number(s.f_ratio, 3),
-            percent(s.r_squared),
-        )
-        for i, s in enumerate(steps)
-    ]
-    return Table(("step", "term", "F-ratio", "explained"), rows)
-
-
 def methods(comparison: MethodComparison) -> Table:
     """Estimates with 95 % intervals by parameter and method, differences in joint sd."""
     main, *others = comparison.results
@@ -647,8 +559,6 @@ _NO_RESULT = (
     "the parameters that it depends on are not determined or not trusted, or no optimum was "
     "reached."
 )
-_HEADLINES = ("bandwidth", "phase_delay", "crossover", "phase_margin", "gain_margin")
-"""what the terminal shows"""
 _AS_READ = {"s": ("ms", 1e3)}
 """by SI unit the one that is shown, and how many make it: delays are milliseconds"""
 
@@ -701,69 +611,42 @@ def handling_sentences(entries: Sequence[Handling]) -> list[str]:
     return said
 
 
-def handling_lines(entries: Sequence[Handling]) -> list[str]:
-    """One line each: `lat to phi: bandwidth [rad/s] model 5.1 (5 to 5.3), 0.812 Hz`"""
-    sources = _sources(entries)
-    lines = []
-    for entry in entries:
-        parts = []
-        for name in _HEADLINES:
-            if name in NUMBERS[entry.pair.kind]:
-                cells = ", ".join(f"{s} {_cell(getattr(entry, s), name)}" for s in sources)
-                parts.append(f"{_WORDS[name]} [{_unit(name)[0]}] {cells}")
-        lines.append(f"{entry.pair.words}: {'; '.join(parts)}")
-    return lines
-
-
-class Origin(NamedTuple):
-    """Origin of one flight."""
-
-    flight: str
-    facts: Table
-    notes: tuple[str, ...]
-
-
-def origins(fit: Fit, problem: Problem) -> list[Origin]:
-    """The flights, in order: the fitted ones first."""
+def origins(fit: Fit, problem: Problem) -> list[tuple[str, Table, list[str]]]:
+    """Name, facts and notes of each flight, in order: the fitted ones first."""
     # The order of fit.signals, which is not that of the configuration.
     flights = [*problem.training, *(f for f in problem.flights if f.hold_out)]
     listed = []
     for signals, flight in zip(fit.signals, flights, strict=True):
-        rows = [
-            ("used for", "validation alone" if flight.hold_out else "the fit"),
-            (
-                "samples",
-                f"{flight.n_samples} at {1 / flight.dt:g} Hz, {flight.duration:.6g} s",
-            ),
-        ]
-        if flight.source:
+        source, rows = (
+            flight.source,
+            [
+                ("used for", "validation alone" if flight.hold_out else "the fit"),
+                ("samples", f"{flight.n_samples} at {1 / flight.dt:g} Hz, {flight.duration:.6g} s"),
+            ],
+        )
+        if source:
             start, end = flight.window
             rows.append(("window", f"{start:.6g} s to {end:.6g} s from the log's beginning"))
             # An autopilot's clock rarely begins at zero: by this a moment is found in the raw log.
-            first = f"{flight.source.first_time:.15g} s of the log's own clock"
+            first = f"{source.first_time:.15g} s of the log's own clock"
             rows.append(("log's beginning", first))
         if flight.known:
             values = ", ".join(f"{n} = {number(v, 6)}" for n, v in flight.known.items())
             rows.append(("differs in", values))
-        rows += [(f"{n} between samples", words) for n, words in _holds(flight).items()]
-        source = flight.source
+        # Only what was read off the log has a reason; the rest was stated in the configuration.
+        rows += [
+            (f"{n} between samples", f"{hold} ({flight.hold_reason.get(n, 'as stated')})")
+            for n, hold in flight.hold.items()
+        ]
         if source:
-            listed_signals = (*source.inputs.items(), *source.outputs.items())
-            rows += [(f"{n} in the log", in_words(signal)) for n, signal in listed_signals]
-        rows.append(("file", source.path if source else "given in memory, no file"))
-        if source:
-            rows.append(("sha256", source.sha256))
-        notes = tuple(sentences(source.notes)) if source else ()
-        listed.append(Origin(signals.flight, Table(("", ""), rows), notes))
+            logged = (*source.inputs.items(), *source.outputs.items())
+            rows += [(f"{n} in the log", in_words(signal)) for n, signal in logged]
+            rows += [("file", source.path), ("sha256", source.sha256)]
+        else:
+            rows.append(("file", "given in memory, no file"))
+        notes = sentences(source.notes) if source else []
+        listed.append((signals.flight, Table(("", ""), rows), notes))
     return listed
-
-
-def _holds(flight: Flight) -> dict[str, str]:
-    """By input what it is taken to do between samples, and why."""
-    # Only what was read off the log has a reason; the rest was stated in the configuration.
-    return {
-        n: f"{hold} ({flight.hold_reason.get(n, 'as stated')})" for n, hold in flight.hold.items()
-    }
 
 
 def constants(problem: Problem, vehicle_constants: Mapping[str, Constant]) -> Table:

@@ -131,7 +131,7 @@ def whole_seeds(values: np.ndarray) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Design:
-    """Which values the axes of a sweep take."""
+    """Values that the axes of a sweep take."""
 
     names: tuple[str, ...]
     """the axes"""

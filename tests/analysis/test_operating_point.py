@@ -13,8 +13,7 @@ from heli_jax import Flight, Free, Helicopter, Model, Problem, models
 from heli_jax.analysis.operating_point import operating_point
 from heli_jax.identification.result import Signals
 from heli_jax.identification.validation.logging_rate import fast_modes
-from heli_jax.report import frequency
-from heli_jax.report.frequency import FittedFlight
+from heli_jax.report.fitted_responses import at_record
 from tests.dynamics import whole_helicopter as oracle
 from tests.responses import continuous
 
@@ -47,14 +46,12 @@ def signals(outputs, inputs=STILL):
     return Signals("flight 1", False, t, inputs, outputs, outputs)
 
 
-NO_NUISANCE = SimpleNamespace(nuisance={})
-
-
 @pytest.mark.slow
 def test_the_response_of_a_hovering_helicopter_is_that_of_hover(xcell, hovering):
     # At zero throttle, where the rotor stands still, it is nothing at all.
     model = models.helicopter("consistent")
-    at = frequency.at_record(FittedFlight(model, xcell, NO_NUISANCE, signals({"z": np.zeros(N)})))
+    fit = SimpleNamespace(nuisance={}, signals=(signals({"z": np.zeros(N)}),))
+    at = at_record(model, xcell, fit)
     assert at.words == "the trim in hover"
     H = continuous(model, xcell, "z", "x_throttle", at)
     assert abs(hovering(1.0)) > 10.0
@@ -125,7 +122,6 @@ def test_own_models_are_linearised_at_the_records_mean():
     H = continuous(sled, Params(drag), "speed", "force", at)
     pole = 2.0 * drag * run.y[0].mean()
     assert H(np.array([1.0]))[0] == pytest.approx(1.0 / (1j + pole), rel=1e-3)
-    assert frequency.memory(sled, Params(drag), at, 1e6) == pytest.approx(4.0 / pole, rel=1e-3)
 
 
 def test_where_the_simulation_diverges_the_initial_state_serves():

@@ -57,15 +57,6 @@ def test_clocks_of_one_length_are_told_apart(tmp_path: Path, names, of) -> None:
         np.testing.assert_allclose(log.channel(name).times, (1 + names.index(clock)) * SLOW)
 
 
-def test_of_two_clocks_the_one_of_the_other_groups(tmp_path: Path) -> None:
-    gps = {"time_week": 6200 + SLOW, "t": SLOW, "speed": STICK}
-    content = {"imu": {"t": FAST, "gx": RATE}, "gps": gps}
-    scipy.io.savemat(tmp_path / "a.mat", content)
-    log = by_clocks(open_mat(tmp_path / "a.mat"))
-    assert log is not None
-    np.testing.assert_allclose(log.channel("gps.speed").times, SLOW)
-
-
 def test_one_clock_is_none_of_several(tmp_path: Path) -> None:
     scipy.io.savemat(tmp_path / "a.mat", {"t": SLOW, "u": STICK, "p": STICK})
     assert by_clocks(open_mat(tmp_path / "a.mat")) is None

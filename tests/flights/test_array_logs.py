@@ -84,27 +84,18 @@ def linked(file, secret):
     file["x"] = h5py.ExternalLink(str(secret.with_name("other.h5")), "/y")
 
 
-def referred(file, secret):
-    """Letters that no name leads to, of a cell."""
-    hidden = file.create_dataset(None, (8,), "u2", external=[(str(secret), 0, 16)])
-    hidden.attrs["MATLAB_class"] = np.bytes_("char")
-    cell = file.create_dataset("names", data=np.array([hidden.ref], h5py.ref_dtype))
-    cell.attrs["MATLAB_class"] = np.bytes_("cell")
-
-
 @pytest.mark.parametrize(
     ("name", "add"),
     [
         ("flight.nc", external),
         ("flight.h5", virtual),
         ("flight.h5", linked),
-        ("flight.mat", referred),
     ],
 )
 def test_a_log_reads_no_other_file(tmp_path, name, add):
     secret = tmp_path / "secret"
     secret.write_bytes(b"password" * 8)
-    with h5py.File(tmp_path / name, "w", userblock_size=512 if ".mat" in name else 0) as file:
+    with h5py.File(tmp_path / name, "w") as file:
         file["t"] = T
         add(file, secret)
     with pytest.raises(InputError):
@@ -155,42 +146,6 @@ def test_a_matlab_file_that_claims_much(tmp_path):
         open_log(path)
 
 
-def signals_of(labels, fields=("values", "label", "unit"), units=("deg", "deg/s", "")):
-    """As Simulink saves structures with time: an array of structures, each with its label."""
-    made = np.empty((1, 3), [(f, object) for f in (*fields, "dimensions")])
-    for i, (label, unit) in enumerate(zip(labels, units, strict=True)):
-        made[0, i] = (np.sin((i + 1) * T), label, unit, 1)
-    return made
-
-
-@pytest.mark.parametrize("fields", [("values", "label", "unit"), ("Data", "Name", "Unit")])
-@pytest.mark.parametrize("packed", [False, True])
-def test_labels_in_arrays_of_structures_are_names(tmp_path, fields, packed):
-    path = tmp_path / "flight.mat"
-    out = {"time": T, "signals": signals_of(["phi", "Rollrate", "Knüppel"], fields)}
-    scipy.io.savemat(path, {"out": out}, do_compression=packed)
-    table = open_table(path)
-    wanted = {"out.signals.phi": "deg", "out.signals.Rollrate": "deg/s", "out.signals.Knüppel": ""}
-    for i, (name, unit) in enumerate(wanted.items()):
-        np.testing.assert_array_equal(table.numbers([name])[name], np.sin((i + 1) * T))
-        assert table.units[name] == unit
-    info = describe_log(path)
-    assert info.time is not None
-    assert info.time.column == "out.time"
-
-
-def test_labels_that_tell_nothing_apart_are_no_names(tmp_path):
-    path = tmp_path / "flight.mat"
-    signals = signals_of(["x", "x", "lat"])
-    # Two arrays beside one label, which may be that of either.
-    two = {"imu": {"t": T, "gyro": T**2, "unit": "rad/s", "label": "gyro"}}
-    scipy.io.savemat(path, {"out": {"time": T, "signals": signals}, **two})
-    table = open_table(path)
-    assert {"out.signals[0].values", "out.signals[1].values", "out.signals.lat"} < set(table.names)
-    assert {"imu.t", "imu.gyro"} < set(table.names)
-    assert not table.units["imu.t"]
-
-
 def an_object(name: str, kind: str) -> bytes:
     """A variable of MATLAB whose class is its own, as 'MAT-File Format' leaves it undescribed."""
 
@@ -218,3 +173,17 @@ def test_objects_of_matlab_are_left_out(tmp_path, name, kind):
     said = [("channels.left-out", (name,)), ("channels.left-out", ("z",))]
     assert [(n.code, n.subjects) for n in table.notes] == said
     np.testing.assert_array_equal(table.numbers(["t"])["t"], np.arange(9.0))
+
+
+def test_structures_of_matlab_7_3_have_the_paths_of_older_ones(tmp_path):
+    t = 0.01 * np.arange(50)
+    with h5py.File(tmp_path / "log.mat", "w", userblock_size=512) as file:
+        file["out/time"], file["out/roll/data"] = t[None, :], np.cos(t)[None, :]
+        letters = file.create_dataset("out/title", data=np.array([[97], [98]], np.uint16))
+        letters.attrs["MATLAB_class"] = np.bytes_("char")
+        # Of a cell the elements are kept apart, by names that mean nothing.
+        cell = file.create_dataset("C", (1, 1), dtype=h5py.ref_dtype)
+        cell[0, 0] = file.create_dataset("#refs#/c", data=t[None, :]).ref
+    log = open_table(tmp_path / "log.mat")
+    assert set(log.names) == {"out.time", "out.roll.data"}
+    np.testing.assert_array_equal(log.numbers(["out.roll.data"])["out.roll.data"], np.cos(t))

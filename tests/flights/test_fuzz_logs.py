@@ -48,7 +48,7 @@ FORMATS = {
     "flight.parquet": lambda path: pyarrow.parquet.write_table(pa.table({"t": T, "x": X}), path),
     "flight.feather": lambda path: pyarrow.feather.write_feather(pa.table({"t": T, "x": X}), path),
     "flight.npz": lambda path: np.savez_compressed(path, t=T, x=X),
-    "flight.npy": lambda path: np.save(path, np.stack([T, X], axis=1)),
+    "flight.npy": lambda path: np.save(path, np.rec.fromarrays([T, X], names="t,x")),
     "flight.json": lambda path: path.write_text(json.dumps({"t": T.tolist(), "x": X.tolist()})),
     "flight.mat": lambda path: scipy.io.savemat(path, {"log": {"t": T, "x": X}}),
     "flight.nc": lambda path: xarray.Dataset({"t": ("n", T), "x": ("n", X)}).to_netcdf(

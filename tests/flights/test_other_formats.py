@@ -55,13 +55,9 @@ def test_columns_are_what_was_stored(tmp_path: Path, name) -> None:
     assert (info.time.column, info.time.duration) == ("t", pytest.approx(T[-1]))
 
 
-def test_matrices_and_their_names(tmp_path: Path) -> None:
+def test_matrices(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.stack([T, P]))
     assert open_table(tmp_path / "a.npy").names == ("data[0]", "data[1]")
-    np.savez(tmp_path / "a.npz", data=np.stack([T, P], axis=1), columns=["t", "p"])
-    np.testing.assert_array_equal(open_table(tmp_path / "a.npz").numbers(["data.p"])["data.p"], P)
-    FRAME.to_json(tmp_path / "a.json", orient="split", double_precision=15)
-    assert {"data.t", "data.p"} <= set(open_table(tmp_path / "a.json").names)
 
 
 def test_records_within_records_gaps_in_them_and_dates(tmp_path: Path) -> None:

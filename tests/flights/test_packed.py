@@ -66,34 +66,15 @@ def test_all_files_are_unpacked_as_xarray_does(tmp_path, name):
     np.testing.assert_allclose(made, np.degrees(0.3 * np.sin(T)), atol=0.006)
 
 
-RANGES = [
-    # The range of packed numbers has their type.
-    ({"valid_range": np.int16([-100, 100])}, [-100, 0, 100]),
-    ({"valid_min": np.int16(0)}, [0, 100, 101]),
-    ({"valid_max": np.int16(0)}, [-101, -100, 0]),
-    ({"valid_range": np.int16([-100, 100]), "scale_factor": 0.1}, [-10, 0, 10]),
-    # In the wider type of the scale it is one of unpacked numbers.
-    ({"valid_range": [-10.0, 10.0], "scale_factor": 0.1}, [-10, 0, 10]),
-    ({"valid_min": np.float32(0.0), "scale_factor": np.float32(0.5)}, [0, 50, 50.5]),
-]
-
-
-@pytest.mark.parametrize(("attributes", "left"), RANGES)
-def test_values_outside_the_valid_range_are_missing(attributes, left):
-    found, _ = unpack(np.int16([-101, -100, 0, 100, 101]), attributes)
-    np.testing.assert_allclose(found[np.isfinite(found)], left)
-
-
-def test_marks_of_all_kinds_and_a_range_of_unsigned_numbers():
+def test_marks_of_all_kinds_and_unsigned_numbers():
     several, _ = unpack(np.int16([1, -1, -9, 4]), {"missing_value": np.int16([-1, -9])})
     np.testing.assert_array_equal(several, [1, np.nan, np.nan, 4])
     # A mark that is no number of the type is none of its values; a NaN needs no mark.
     assert unpack(np.int8([0, 1]), {"_FillValue": np.nan, "missing_value": 300.5})[1] == 0
     assert unpack(np.float64([0, np.nan]), {"_FillValue": np.nan})[1] == 0
     assert unpack(np.int16([0, 1]), {"missing_value": "none"})[1] == 0
-    signs = {"_Unsigned": "true", "valid_range": np.int8([1, -2])}
-    found, _ = unpack(np.int8([0, 1, -2, -1]), signs)
-    np.testing.assert_array_equal(found, [np.nan, 1, 254, np.nan])
+    found, _ = unpack(np.int8([0, 1, -2, -1]), {"_Unsigned": "true"})
+    np.testing.assert_array_equal(found, [0, 1, 254, 255])
 
 
 def test_a_scale_that_is_none_leaves_its_data_set_out(tmp_path):

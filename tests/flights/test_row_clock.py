@@ -1,10 +1,9 @@
-"""Logs without times: the rate at which their rows were sampled is stated, or in the file."""
+"""Logs without times: the rate at which their rows were sampled is stated."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
-import scipy.io
 
 from heli_jax.config.schema import TimeConfig
 from heli_jax.errors import InputError
@@ -50,42 +49,9 @@ def test_frames_that_were_lost_are_missed(tmp_path: Path) -> None:
     path = written(tmp_path / "a.csv", "Frame,u,p", (frames, U[frames], P[frames]))
     with pytest.raises(InputError):
         read(path, by_rate(RATE, "Frame"))
-    info = describe_log(path, rate=RATE)
+    info = describe_log(path, "Frame", rate=RATE)
     assert info.time is not None
     assert (info.time.column, len(info.time.gaps)) == ("Frame", 1)
-
-
-@pytest.mark.parametrize(
-    ("name", "number"), [("Ts", 0.025), ("dt", 0.025), ("fs", 40.0), ("sample_rate", 40.0)]
-)
-@pytest.mark.parametrize("turned", [False, True])
-def test_a_single_number_in_the_file_is_its_rate(tmp_path: Path, name, number, turned) -> None:
-    y = np.stack([P, 2 * P], axis=1)
-    path = tmp_path / "z.mat"
-    scipy.io.savemat(path, {"y": y.T if turned else y, "u": U, name: number})
-    info = describe_log(path)
-    assert info.time is not None
-    assert (info.time.counted, info.time.said) == (RATE, f"'{name}' = {number:g}")
-    converted = convert_log(path, Selection())
-    assert [n.value for n in converted.notes if n.code == "clock.rate-of-file"] == [40]
-    assert read(path, by_rate(RATE), p="y[1]").outputs["p"][7] == pytest.approx(2 * P[7])
-
-
-def test_of_two_rates_none_is_taken(tmp_path: Path) -> None:
-    path = tmp_path / "z.mat"
-    scipy.io.savemat(path, {"u": U, "y": P, "Ts": 0.02, "fs": 40.0})
-    assert describe_log(path).time is None
-
-
-def test_in_a_table_the_rate_stands_in_one_row(tmp_path: Path) -> None:
-    lines = written(tmp_path / "a.csv").read_text().splitlines()
-    more = [
-        f"{line},{'Ts' if i == 0 else '0.025' if i == 1 else ''}" for i, line in enumerate(lines)
-    ]
-    (tmp_path / "a.csv").write_text("\n".join(more) + "\n")
-    info = describe_log(tmp_path / "a.csv")
-    assert info.time is not None
-    assert info.time.counted == RATE
 
 
 def test_the_configuration_has_one_clock() -> None:

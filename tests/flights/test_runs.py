@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from heli_jax import cli
 from heli_jax.errors import InputError
 from heli_jax.flights import Signal, read_flight, read_parts
 from heli_jax.flights.clock import by_rate, restarts
@@ -51,20 +50,9 @@ def test_a_column_numbers_runs_of_a_time_that_goes_on(tmp_path: Path) -> None:
     check(read_parts(path, time=by_rate(1 / DT), runs="run", **SIGNALS))
     info = describe_log(path)
     assert info.time is not None
-    assert (info.time.runs, info.time.numbering) == (1, "run")
+    assert info.time.runs == 1
     # Without it, what was never one flight is one.
     assert read_flight(path, time="t", **SIGNALS).n_samples == T.size
-
-
-def test_new_makes_flights_of_both(tmp_path: Path) -> None:
-    for name, columns in {
-        "a": {"t": T, "aileron": U / 3, "p": P},
-        "b": {"segment": RUN, "t": DT * np.arange(T.size), "aileron": U / 3, "p": P},
-    }.items():
-        path, out = written(tmp_path / f"{name}.csv", **columns), tmp_path / f"{name}.yaml"
-        assert cli.main(["new", str(path), "--out", str(out)]) == 0
-        words = "gaps: split" if name == "a" else "time: {signal: t, runs: segment}"
-        assert words in out.read_text()
 
 
 def test_info_and_convert_put_them_apart_and_say_so(tmp_path: Path) -> None:

@@ -71,18 +71,6 @@ def test_a_stack_without_times_needs_its_numbers(tmp_path: Path) -> None:
         flights(path, time=rows, **signals)
 
 
-@pytest.mark.parametrize("zeros", [True, False])
-def test_what_fills_up_short_segments_is_left_out(tmp_path: Path, zeros: bool) -> None:
-    lengths = (300, 250, 220)
-    content = {"t": TIMES.copy(), "x": X.copy(), "u": U.copy()}
-    for values in content.values():
-        for k, length in enumerate(lengths):
-            values[k, length:] = 0.0 if zeros else np.nan
-    read = flights(written(tmp_path, ".npz", content), time="t")
-    assert tuple(f.n_samples for f in read) == lengths
-    np.testing.assert_array_equal(read[2].outputs["p"], X[2, :220, 1])
-
-
 def test_what_is_no_stack_is_named(tmp_path: Path) -> None:
     # Images, a matrix of inertia, a rotation matrix a sample: beside signals of one run.
     others = {"img": np.ones((300, 8, 9)), "J": np.ones((3, 3, 3)), "R": np.ones((300, 3, 3))}

@@ -258,11 +258,3 @@ def test_an_acceleration_that_is_no_faster_than_the_grid_cannot_follow_a_faster_
     request = Request("log", None, stick, {"az": Signal("a", "1", "1")}, options)
     made = at_times(request, signals, {"col": Decision("zero-order", "")}, slow)
     assert made.holds["col"].hold == "zero-order"
-    assert (made.notes[0].code, made.notes[0].value) == (
-        "resampling.jumps-averaged",
-        pytest.approx(200.0),
-    )
-    # Where the stick is no faster nothing is between.
-    signals["col", "input"] = Timed(slow + 0.004, np.sign(np.sin(7.3 * slow)))
-    again = at_times(request, signals, made.holds, slow[1:])
-    assert "resampling.jumps-averaged" not in {n.code for n in again.notes}

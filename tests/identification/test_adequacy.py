@@ -29,7 +29,7 @@ def judged(measured, simulated, *, against=None, ahead=None):
     params = Params(-2.0, 5.0)
     flight = Flight(dt=DT, inputs={"d": D}, outputs={"p": measured})
     problem = Problem(LAG, params, [flight], {"Lp": Free(-2.0)})
-    record = Record("flight 1", DT, {"p": measured}, {"p": simulated})
+    record = Record("flight 1", {"p": measured}, {"p": simulated})
     white = {"flight 1/p": whiteness(measured - simulated)}
     against = None if against is None else {"p": against}
     evidence = Evidence(
@@ -39,7 +39,7 @@ def judged(measured, simulated, *, against=None, ahead=None):
         against,
         ahead=ahead,
     )
-    return Judged(problem, evidence, assess(problem, params, evidence))
+    return Judged(problem, assess(problem, params, evidence))
 
 
 class Judged:
@@ -47,8 +47,8 @@ class Judged:
 
     fitted, free = True, ("Lp",)
 
-    def __init__(self, problem, evidence, adequacy):
-        self.problem, self.records, self.adequacy = problem, evidence.records, adequacy
+    def __init__(self, problem, adequacy):
+        self.problem, self.adequacy = problem, adequacy
 
     @property
     def findings(self):

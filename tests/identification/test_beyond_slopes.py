@@ -46,7 +46,7 @@ def test_one_sine_does_not_determine_three_parameters():
 def test_what_steps_determine_keeps_its_gaussian_intervals():
     result = fit(problem(steps(20.0, 1), 0.01, 1))
     assert result.status == "converged"
-    assert (result.verdict.undetermined, result.verdict.factors) == ((), {})
+    assert (result.verdict.undetermined, result.verdict.roughly) == ((), ())
     assert "uncertainty.profile-interval" not in {f.code for f in result.findings}
     for name, truth in TRUTH.items():
         assert result.estimates[name].lower95 < truth < result.estimates[name].upper95

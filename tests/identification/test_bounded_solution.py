@@ -9,7 +9,8 @@ from heli_jax.flights.flight import own_instruments
 from heli_jax.identification.estimation.frequency_lines import Driving, Matrices, orthonormal
 from heli_jax.identification.estimation.frequency_response import (
     bounded_outputs,
-    resolved,
+    effects_of_ends,
+    inverses,
 )
 
 
@@ -26,9 +27,9 @@ def test_every_run_of_a_machine_is_its_bounded_solution_and_what_the_ends_add():
     for k in range(samples):
         y[:, k] = C @ x + D @ U[k]
         x = A @ x + B @ U[k]
-    at = resolved(machine, samples)
-    left = (y - np.asarray(bounded_outputs(machine, signals, at, None))).ravel()
-    basis = np.moveaxis(np.asarray(at.ends(samples)), 1, 0).reshape(3, -1).T
+    at = inverses(machine, samples)
+    left = (y - np.asarray(bounded_outputs(machine, signals, at))).ravel()
+    basis = np.moveaxis(np.asarray(effects_of_ends(machine, at, samples)), 1, 0).reshape(3, -1).T
     ends = np.linalg.lstsq(basis, left, rcond=None)[0]
     whole = np.asarray(bounded_outputs(machine, signals, at, jnp.asarray(ends)))
     np.testing.assert_allclose(whole, y, atol=1e-8 * np.max(np.abs(y)))
@@ -58,7 +59,7 @@ def test_slopes_of_the_bounded_solution_are_those_of_the_whole_expression():
 
     def outputs(*v):
         m, signals = Matrices(*v[:4]), Driving(*v[4:])
-        return bounded_outputs(m, signals, resolved(m, 60), ends)
+        return bounded_outputs(m, signals, inverses(m, 60), ends)
 
     def plain(A, B, C, D, U, acting):
         lines = jnp.fft.fft(U * turns.conj()[:, None], axis=0)

@@ -10,7 +10,7 @@ from heli_jax.analysis.spectra import ResponseOptions
 from heli_jax.identification.diagnostics.loop import inputs_follow_response
 from heli_jax.identification.diagnostics.search import band_unused
 from heli_jax.identification.estimation.data import data_of
-from heli_jax.identification.estimation.frequency_error import _weighed, projected
+from heli_jax.identification.estimation.frequency_error import _weighed, products, projected
 from heli_jax.identification.estimation.frequency_instrument import (
     as_instruments_have_it,
     following,
@@ -79,11 +79,8 @@ def test_the_rows_solve_the_equations_and_have_their_covariance():
     e, Q = rng.standard_normal(50), np.linalg.qr(rng.standard_normal((50, 4)))[0]
 
     def weighed(Z):
-        # Parts of complex errors, of half their variance; derivatives of what is taken off.
-        r, z, j = (v / 2**0.5 for v in (e[:, None], -Z.T, -J.T))
-        left, right = np.concatenate([z, r, Q], axis=1), np.concatenate([j, z, r], axis=1)
-        G = jnp.asarray(left.T @ right)
-        return [np.asarray(v) for v in _weighed(projected(G, jnp.eye(4)))]
+        columns = (jnp.asarray(v.T) for v in (-Z, -J, e - Q @ Q.T @ e, Q.T))
+        return [np.asarray(v) for v in _weighed(projected(products(*columns), jnp.eye(4)))]
 
     r, M = weighed(Z)
     # The same with the ends projected out of everything by hand.

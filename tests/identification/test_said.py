@@ -131,41 +131,31 @@ def test_what_is_determined_in_a_wide_interval_is_so_only_roughly():
     sensitivity = np.diag([100.0, 1.0 / 0.8])
     verdict = analyse(sensitivity, unknowns("L", "B"))
     assert verdict.identifiable
-    assert tuple(verdict.factors) == ("B",)
+    assert verdict.roughly == ("B",)
     around = Around(reported=np.diag([0.64, 1e-4]))
     verdict = analyse(np.diag([2.5, 100.0]), unknowns("L", "B"), around=around)
-    assert tuple(verdict.factors) == ("L",)
+    assert verdict.roughly == ("L",)
     # Of either sign the interval is -0.57 to 2.57 times the value: no factor.
     first, second = unknowns("L", "B")
     verdict = analyse(sensitivity, (first, second._replace(symmetric=True)))
-    assert verdict.through_zero == ("B",)
+    assert verdict.roughly == ("B",)
     # So it is where the value is small beside the start, in whose units the coordinate is then.
     near = second._replace(symmetric=True, logarithmic=False, reference=500.0)
     for sd, zero in ((0.0009, ()), (0.0011, ("B",))):
         verdict = analyse(np.diag([100.0, 1.0 / sd]), (first, near))
         assert verdict.identifiable
-        assert verdict.through_zero == zero
+        assert verdict.roughly == zero
 
 
 def test_of_a_time_shift_at_its_end_is_not_said_that_it_has_no_effect():
     # Searched through a tanh, whose slope vanishes there: a record that wants it beyond.
     [parameter] = unknowns("L")
-    shift = Unknown("time_shift", 0.5, False, 1.0, 0.0, is_parameter=False, at_bound=True, room=0.0)
+    shift = Unknown("time_shift", 0.5, False, 1.0, 0.0, is_parameter=False, at_bound=True)
     verdict = analyse(np.array([[100.0, 0.0]]), (parameter, shift))
     assert verdict.without_effect == ("time_shift",)
 
 
-def test_a_time_shift_up_to_the_end_of_its_search_is_known_only_roughly():
-    [parameter] = unknowns("L")
-    for sd, said in ((10.0, ("time_shift",)), (5.0, ())):
-        # 0.2 s in samples of 20 ms, searched up to 0.5 s: 15 samples further.
-        shift = Unknown("time_shift", 0.2, False, 1.0, 0.0, is_parameter=False, room=15.0)
-        verdict = analyse(np.diag([100.0, 1.0 / sd]), (parameter, shift))
-        assert verdict.identifiable
-        assert tuple(verdict.factors) == said
-
-
-def test_an_input_whose_unit_is_in_doubt_takes_the_intervals_that_it_scales():
+def test_an_input_whose_unit_is_in_doubt_takes_the_intervals():
     flight = record(1, 0.0, 0.02)
     percent = {"d": 100.0 * flight.inputs["d"] / np.max(np.abs(flight.inputs["d"]))}
     source = Source("log.csv", "", inputs={"d": Signal("stick", "1", "1")})
@@ -173,7 +163,6 @@ def test_an_input_whose_unit_is_in_doubt_takes_the_intervals_that_it_scales():
     found = fit(problem(read, Lp=Free(-1.0), Ld=Free(2.0)))
     [one] = of(found, "units.input-in-doubt")
     assert one.subjects == ("d",)
-    # Per cent or not, L is the same; B is a hundredth or not.
-    assert found.untrusted == one.distrusts == ("Ld",)
-    assert found.estimates["Lp"].lower95 is not None
+    # Per cent or not, Ld is a hundredth or not.
+    assert set(found.untrusted) == set(one.distrusts) == {"Lp", "Ld"}
     assert found.exit_code == 3

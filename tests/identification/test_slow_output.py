@@ -43,7 +43,7 @@ def record(seed, *, slow):
     if slow:
         at = 200 * np.arange(1, 149) + rng.integers(-20, 21, 148)
         values = made["roll"][at] + NOISE["roll"] * rng.standard_normal(at.size)
-        roll = at_nearest(Timed(at * DT / FINE, values), DT * np.arange(N)).samples
+        roll = at_nearest(Timed(at * DT / FINE, values), DT * np.arange(N))
     return Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll": roll, "roll_rate": rate})
 
 

@@ -18,7 +18,7 @@ def test_a_sound_fit_passes(sound):
         "identifiability", "trust", "adequacy",
         "Cramér-Rao", "insensitivity", "condition number", "largest correlation", "VAF",
         "NRMSE fit", "Theil coefficient", "Theil bias part", "Theil variance part",
-        "Theil covariance part", "whiteness of residuals, p-value", "coherence",
+        "Theil covariance part", "whiteness of residuals, p-value",
     } == asked  # fmt: skip
     by = {(g.what, g.of): g for g in lines}
     for name, estimate in fit.estimates.items():

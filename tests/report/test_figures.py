@@ -4,18 +4,14 @@ import matplotlib
 import matplotlib.image
 import numpy as np
 import pytest
-import scipy.signal
 from hypothesis import given
 from hypothesis import strategies as st
 
-from heli_jax.analysis.lti import c2d
-from heli_jax.analysis.operating_point import EVERYWHERE
-from heli_jax.dynamics.roll import roll_transfer_function
-from heli_jax.identification.fit import Signals, StartRow
+from heli_jax.identification.fit import Signals
 from heli_jax.identification.validation.metrics import lags_for
-from heli_jax.report import card, figures, frequency, style
+from heli_jax.report import figures, style
 from heli_jax.report.charts import thinned
-from heli_jax.report.frequency import Coherence, _spectra
+from heli_jax.report.figures.bode import baseline_response, phase
 from tests.responses import continuous
 
 
@@ -77,7 +73,6 @@ def test_every_figure_has_something_in_it(sound, tmp_path):
     drawn = {
         "response": figures.response(s, "roll", problem.model),
         "residual": figures.residual_correlation(s, "roll"),
-        "starts": figures.waterfall(fit.starts),
         "rls": figures.rls_history(baseline),
     }
     for name, made in drawn.items():
@@ -89,60 +84,11 @@ def test_every_figure_has_something_in_it(sound, tmp_path):
         assert pixels.std() > 0.02
 
 
-def test_waterfall_marks_failures_and_spans_decades():
-    rows = tuple(
-        StartRow({}, {}, cost, 1, ok, k)
-        for cost, ok, k in [(1e3, False, 0), (1.0, True, 1), (np.inf, False, 0), (9.0, True, 2)]
-    )
-    [panel] = figures.waterfall(rows).panels
-    assert panel.logarithmic
-    joined, converged, failed = (s.y for s in panel.series)
-    assert joined.tolist() == [1.0, 9.0, 1e3]
-    assert converged.tolist() == [1.0, 9.0]
-    assert failed[0] == 1e3
-    assert np.isfinite(failed).all()
-    assert figures.waterfall(rows[:1]) is None
-    # A search that overflowed may end just below infinity, which no axis holds.
-    [panel] = figures.waterfall((*rows, StartRow({}, {}, 1e308, 1, True, 3))).panels
-    assert 1e3 < panel.limits[1] < 1e6
-
-
-def test_sampled_response_is_that_of_c2d(sound):
-    _, problem, _ = sound
-    p, dt = problem.vehicle, 0.05
-    matrices = frequency.linear_matrices(problem.model, p, EVERYWHERE)
-    omega = np.geomspace(0.1, 0.99 * np.pi / dt, 50)
-    num, den = (np.array([float(v) for v in c]) for c in roll_transfer_function(p, stand=True))
-    z = np.exp(1j * omega * dt)
-    num, den = c2d(num, den, dt)
-    sampled = frequency.held(matrices, 0, 0, dt, omega)
-    assert sampled == pytest.approx(np.polyval(num, z) / np.polyval(den, z), rel=1e-6)
-
-
-def test_a_slow_mode_leaves_the_response_from_two_periods_of_a_segment_on():
-    dt, n = 0.04, 3000
-    rng = np.random.default_rng(2)
-    u = np.repeat(rng.uniform(-1.0, 1.0, n // 20), 20)
-    # A spiral of 0.013 1/s beside a roll of 2 1/s: the record is remembered whole.
-    b, a, _ = scipy.signal.cont2discrete(([1.0, 1.0], np.polymul([1.0, 0.013], [1.0, 2.0])), dt)
-    y = scipy.signal.lfilter(np.ravel(b), a, u)
-    noisy = y + 0.01 * np.std(y) * rng.standard_normal(n)
-    s = Signals("f", False, np.arange(n) * dt, {"u": u}, {"y": noisy}, {"y": y})
-    found, lowest = _spectra(s, ["u"], "y", dt, 4.0 / 0.013)
-    # The longest even segments of which eight fit: 2 (N // 9) samples.
-    assert lowest == pytest.approx(4.0 * np.pi / (666 * dt))
-    assert found.omega[0] == pytest.approx(lowest)
-    # Asked, not asked since the simulation has none either, and of an input that hardly acts.
-    for expected, share in ((0.9, 0.5), (0.3, 0.5), (0.9, 0.01)):
-        said = card._of_coherence("u to y", Coherence(0.9, expected, share, 8, 0, lowest))
-        assert f"Hz ({lowest:.2g} rad/s) on" in said.remark
-
-
 def test_the_baseline_s_response_is_drawn_without_its_hold(sound):
     fit, problem, baseline = sound
     omega = np.geomspace(1.0, 6.0, 20)
     H = continuous(problem.model, fit.params, "roll", "x_roll")(omega)
-    ratio = frequency.discrete(baseline, omega) / H
+    ratio = baseline_response(baseline, omega) / H
     # Half a sample of delay at 6 rad/s would be 8.6 deg.
     assert np.max(np.abs(np.degrees(np.angle(ratio)))) < 5.0
     assert np.abs(ratio) == pytest.approx(np.ones(20), abs=0.15)
@@ -150,6 +96,6 @@ def test_the_baseline_s_response_is_drawn_without_its_hold(sound):
 
 def test_phase_begins_on_one_branch():
     turns = np.exp(1j * np.radians(np.linspace(-180.0, -900.0, 200)))
-    assert frequency.phase(turns)[0] == pytest.approx(-180.0)
-    assert frequency.phase(turns)[-1] == pytest.approx(-900.0)
-    assert frequency.phase(-turns)[0] == pytest.approx(0.0, abs=1e-9)
+    assert phase(turns)[0] == pytest.approx(-180.0)
+    assert phase(turns)[-1] == pytest.approx(-900.0)
+    assert phase(-turns)[0] == pytest.approx(0.0, abs=1e-9)

@@ -1,15 +1,18 @@
 """A fitted model's responses over those of its flights: numbers, figure, page and fit.json."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from heli_jax import naming
 from heli_jax.analysis.attitude_responses import handling_pairs
 from heli_jax.analysis.flight_responses import Settings
+from heli_jax.report.card import card
 from heli_jax.report.files import SupplementaryAnalyses, fit_json
 from heli_jax.report.fit_page import Analysis, drawings, render
 from heli_jax.report.fitted_responses import NO_RESPONSES, fitted_responses
-from heli_jax.report.tables import handling_lines
+from heli_jax.report.tables import handling
 from tests import responses
 
 
@@ -59,11 +62,25 @@ def test_they_are_drawn_told_and_written(sound, shown):
     assert [p.label for p in chart.panels][2:] == ["coherence", "error [dB]", "error [deg]"]
     page = render(analysis, "title", {}, [])
     assert "Handling qualities" in page
-    (line,) = handling_lines(shown.handling)
-    assert line.startswith("x_roll to roll: bandwidth [rad/s] model")
+    first = handling(shown.handling).rows[0]
+    assert (first[0], first[1], first[-1]) == ("x_roll to roll", "bandwidth", "rad/s")
     (content,) = fit_json(fit, problem, baseline, supplementary)["handling_qualities"]
     model, data = (content[s]["numbers"]["phase_bandwidth"] for s in ("model", "data"))
     assert data["lower95"] < model["value"] < data["upper95"]
+
+
+def test_the_card_asks_each_output_for_a_coherent_input(sound, shown):
+    fit, problem, _ = sound
+    [gate] = [g for g in card(problem, fit, shown) if g.what == "coherence"]
+    assert (gate.of, gate.passed) == ("x_roll to roll", True)
+    dead = 0.1 * np.random.default_rng(1).standard_normal(problem.flights[0].n_samples)
+    flight = dataclasses.replace(problem.flights[0], outputs={"roll": dead})
+    of_noise = fitted_responses(
+        fit, dataclasses.replace(problem, flights=(flight,)), Settings(window=10.0), ()
+    )
+    [gate] = [g for g in card(problem, fit, of_noise) if g.what == "coherence"]
+    assert gate.passed is False
+    assert of_noise.incoherent == ("x_roll to roll",)
 
 
 def test_flights_that_are_too_short_say_so(sound):

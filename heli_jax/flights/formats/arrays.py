@@ -1,4 +1,4 @@
-"""Named arrays as a table: names and units that stand beside them, packed numbers, stacked runs.
+"""Named arrays as a table: packed numbers, stacked runs, clocks of their own.
 
 The readers of MATLAB, NetCDF, HDF5, NumPy and JSON files collect `DataSets`; an array's name is its
 path, `log.roll.data` in MATLAB's structures, `log/roll` in HDF5.
@@ -8,7 +8,6 @@ conventions of the NetCDF User's Guide.
 """
 
 import hashlib
-import itertools
 import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,16 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from heli_jax import units
 from heli_jax.errors import InputError
 from heli_jax.finding import LEFT_OUT, Finding, note
-from heli_jax.flights.channel_names import words_in
-from heli_jax.flights.clock import contradicted_rate
-from heli_jax.flights.log import ChannelLog, Topic, sharing_clocks
-from heli_jax.flights.table import (
+from heli_jax.flights.clock import SECONDS, is_called_time, likely_unit, split_unit, time_unit
+from heli_jax.flights.log import (
     Budget,
+    ChannelLog,
     Survey,
     Table,
+    Topic,
     column,
     listed,
     require_columns,
@@ -35,16 +33,12 @@ from heli_jax.flights.table import (
     shown,
     wrong,
 )
-from heli_jax.flights.time_units import SECONDS, TIME_NAMES, likely_unit, split_unit, time_unit
 
 LARGEST = 10**9
 """bytes of a file"""
 MOST_ELEMENTS = 100
 """columns of a matrix, or elements of a list: more are data of another shape than a log's"""
-PACKING = (
-    *("scale_factor", "add_offset", "_FillValue", "missing_value", "_Unsigned"),
-    *("valid_range", "valid_min", "valid_max"),
-)
+PACKING = ("scale_factor", "add_offset", "_FillValue", "missing_value", "_Unsigned")
 """attributes that say how numbers are packed"""
 UNIT_ATTRIBUTES = ("units", "unit", "Units", "Unit")
 SEGMENT = "segment"
@@ -53,17 +47,6 @@ _DEEPEST = 3
 """dimensions of an array that may be a stack of runs"""
 _FEWEST = 10
 """samples of a run, below which matrices of a few numbers are no stack"""
-_FEWEST_SHARED = 3
-"""letters by which a matrix and a list of names belong together: OutputData, OutputName"""
-_LABELS, _UNITS = ("label", "name", "signalname"), ("unit", "units")
-_NAMES = {
-    *("name", "names", "label", "labels", "columns", "column", "channel", "channels", "items"),
-    *("header", "headers", "fields", "signals", "variables", "varnames", "legend", "colheaders"),
-    *("ch", "component", "components", "axis", "state", "states", "output", "outputs", "input"),
-    *("inputs", "sensor", "sensors", "var", "vars", "param", "params", "parameters"),
-}
-"""words in the name of a list of texts that names columns"""
-_INDEXED = re.compile(r"(.*)\[\d+\]")
 _LEVEL = re.compile(r"[./]")
 
 
@@ -125,11 +108,8 @@ class DataSets:
     def __init__(self, budget: Budget) -> None:
         self.budget = budget
         self.notes: list[Finding] = []
-        self.labels: dict[str, str] = {}
-        """single texts; those of `names[0]`, `names[1]` are a list too"""
         self._stored: dict[str, np.ndarray] = {}
         self._units: dict[str, str] = {}
-        self._texts: dict[str, list[str]] = {}
         self._missing: dict[str, int] = {}
         self._left_out: dict[str, str] = {}
 
@@ -167,10 +147,6 @@ class DataSets:
         if shape and kind.kind in "biuf":
             self._left_out[name] = f"which has {len(shape)} dimensions"
 
-    def add_texts(self, name: str, texts: Sequence[Any]) -> None:
-        """Add a list of texts, by which columns may be called."""
-        self._texts[name] = [text_of(text).strip("\0 ") for text in texts]
-
     def table(self, path: str, kind: str, data: bytes) -> ArrayTable:
         """All of them."""
         return ArrayTable(path, kind, data, *self.vectors())
@@ -186,20 +162,11 @@ class DataSets:
         if self._left_out:
             words = listed(f"{shown(n)}, {why}" for n, why in self._left_out.items())
             notes.append(note(LEFT_OUT, f"left out: {words}", *self._left_out))
-        texts = dict(self._texts)
-        for path, text in self.labels.items():
-            match = _INDEXED.fullmatch(path)
-            texts.setdefault(match[1] if match else path, []).append(text)
-        whole, units_beside = _labelled(self._stored, self.labels)
-        stated = self._units | units_beside
-        flat, of_stacks = _unstacked(whole)
+        flat, of_stacks = _unstacked(self._stored)
         arrays, units_of = {}, {}
         for name, values in flat.items():
-            names, beside = _named_columns(name, values, texts)
-            for i, (part, vector) in enumerate(_vectors(name, values)):
-                called = f"{name}.{names[i]}" if names else part
-                arrays[called] = vector
-                units_of[called] = (beside[i] if beside else "") or stated.get(name, "")
+            for part, vector in _vectors(name, values):
+                arrays[part], units_of[part] = vector, self._units.get(name, "")
         return arrays, units_of, (*notes, *of_stacks)
 
 
@@ -236,81 +203,6 @@ def guarded[T](path: Path, what: str, read: Callable[[], T]) -> T:
         raise wrong(str(path), f"is no whole {what} ({type(e).__name__})") from e
 
 
-# Names and units that a file has as texts beside its arrays. Simulink's structures with time have
-# `values` and `label`, dSPACE's `Data`, `Name` and `Unit`; identification toolboxes keep
-# `OutputData` beside `OutputName`, ground stations `ATT` beside `ATT_label`, pandas `block0_values`
-# beside `block0_items`.
-
-
-def _labelled(
-    arrays: Mapping[str, np.ndarray], texts: Mapping[str, str]
-) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Arrays of structures' elements called by their labels, `out.signals.phi`, where all labels
-    differ, and the units that stand beside them."""
-    beside: dict[str, dict[str, str]] = {}
-    for path, text in texts.items():
-        element, _, field = path.rpartition(".")
-        beside.setdefault(element, {})[field.casefold()] = text
-    samples: dict[str, list[str]] = {}
-    for path, values in arrays.items():
-        if values.size > 1:
-            samples.setdefault(path.rpartition(".")[0], []).append(path)
-    names, stated = {}, {}
-    for element, (path, *others) in samples.items():
-        said = beside.get(element, {})
-        # Of an element with several arrays of samples label and unit may be those of any.
-        if others or not said:
-            continue
-        if unit := next((said[u] for u in _UNITS if u in said), ""):
-            stated[path] = unit
-        label = next((said[n] for n in _LABELS if n in said), "")
-        if label and (match := _INDEXED.fullmatch(element)):
-            names[path] = f"{match[1]}.{label}"
-    taken = [names.get(path, path) for path in arrays]
-    names = {path: name for path, name in names.items() if taken.count(name) == 1}
-    return (
-        {names.get(path, path): values for path, values in arrays.items()},
-        {names.get(path, path): unit for path, unit in stated.items()},
-    )
-
-
-def _named_columns(
-    path: str, array: np.ndarray, texts: Mapping[str, Sequence[str]]
-) -> tuple[Sequence[str], Sequence[str]]:
-    """The names and the units of a matrix's columns, each empty where nothing states them."""
-    if array.dtype.kind not in "biuf" or array.ndim > 2 or array.size < 2:
-        return (), ()
-    count, own = 1 if array.ndim < 2 else min(array.shape), _LEVEL.split(path)
-    names, units_of = {}, {}
-    for other, each in texts.items():
-        *group, leaf = _LEVEL.split(other)
-        if group != own[:-1] or len(each) != count:
-            continue
-        words = set(words_in(leaf))
-        if words & set(_UNITS):
-            if any(time_unit(t) or units.is_unit(t) for t in each):
-                units_of[leaf.casefold()] = each
-        elif words & _NAMES and all(each) and len(set(each)) == count:
-            names[leaf.casefold()] = each
-    leaf = own[-1].casefold()
-    return _belonging(leaf, count, names), _belonging(leaf, count, units_of)
-
-
-def _belonging(own: str, count: int, lists: Mapping[str, Sequence[str]]) -> Sequence[str]:
-    """The list that belongs to an array: the one called most alike; empty where several might."""
-    shared = {}
-    for leaf in lists:
-        pairs = zip(own, leaf, strict=False)
-        shared[leaf] = sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], pairs))
-    # The whole name of an array may be a letter: y and y_names.
-    shared = {p: max(n, _FEWEST_SHARED) if n == len(own) else n for p, n in shared.items()}
-    most = max(shared.values(), default=0)
-    near = [texts for p, texts in lists.items() if shared[p] == most >= _FEWEST_SHARED]
-    # A vector's own name says as much as a single text that happens to stand beside it.
-    different = {tuple(texts) for texts in near or (() if count == 1 else lists.values())}
-    return different.pop() if len(different) == 1 else ()
-
-
 class Packing(ValueError):
     """An attribute that says how numbers are packed cannot be understood; in words which."""
 
@@ -342,17 +234,6 @@ def unpack(stored: np.ndarray, attributes: Mapping[str, object]) -> tuple[np.nda
     values = stored
     if (scale, offset) != (1.0, 0.0):
         values = stored.astype(np.float64) * scale + offset
-    both = _numbers(attributes.get("valid_range", ()))
-    for i, (name, beyond) in enumerate((("valid_min", np.less), ("valid_max", np.greater))):
-        limits = _numbers(attributes.get(name, both[[i]] if both.size == 2 else ()))
-        if limits.size == 1:
-            # The range has the type of the packed numbers, or of the unpacked ones.
-            of = stored if limits.dtype.kind in "iu" or values is stored else values
-            limit = limits[0]
-            if of.dtype.kind == "u" and limit < 0:
-                limit = int(limit) + 2 ** (8 * of.dtype.itemsize)
-            with np.errstate(invalid="ignore"):
-                missing |= beyond(of, limit)
     count = int(np.count_nonzero(missing))
     return (np.where(missing, np.nan, values.astype(np.float64)) if count else values), count
 
@@ -393,74 +274,37 @@ def _numbers(attribute: object) -> np.ndarray:
 
 def _unstacked(
     arrays: Mapping[str, np.ndarray],
-) -> tuple[dict[str, np.ndarray], tuple[Finding, ...]]:
+) -> tuple[Mapping[str, np.ndarray], tuple[Finding, ...]]:
     """Arrays of at most two dimensions, stacks as matrices (segment times sample, channel) with a
     column that numbers the segments; and notes."""
-    numeric = {n: x for n, x in arrays.items() if x.dtype.kind in "biuf"}
-    cubes = {n: x for n, x in numeric.items() if x.ndim == _DEEPEST and x.size}
+    cubes = {n: x for n, x in arrays.items() if x.ndim == _DEEPEST and x.size}
     if not cubes:
-        return dict(arrays), ()
-    # One time for each sample of one or more runs.
-    times = {
-        n: x
-        for n, x in numeric.items()
-        if _is_called_time(n) and 1 <= x.ndim <= 2 and max(x.shape) >= _FEWEST
-    }
-    shapes = {x.shape[:2] for x in cubes.values()}
-    shape = shapes.pop() if len(shapes) == 1 else None
-    # Images and rotation matrices, (sample, row, column), stand beside times or signals of one run.
-    alone = (x for n, x in arrays.items() if x.ndim == 1 and n not in times)
-    if shape is not None and (
+        return arrays, ()
+    shape = next(iter(cubes.values())).shape[:2]
+    clocks = {n: x for n, x in arrays.items() if is_called_time(n) and x.ndim < _DEEPEST}
+    # Images and rotation matrices, (sample, row, column), stand beside times of other lengths.
+    if (
         shape[1] < _FEWEST
-        or any(x.shape != shape and x.size != shape[1] for x in times.values())
-        or any(x.size == shape[1] for x in alone)
+        or any(x.shape[:2] != shape for x in cubes.values())
+        or any(x.shape != shape and x.size != shape[1] for x in clocks.values() if x.size > 1)
     ):
-        shape = None
-    notes, made = [], {}
-    if shape is not None:
-        for name, values in numeric.items():
-            if name in times and values.size == shape[1]:
-                made[name] = np.tile(values.ravel(), shape[0])
-            elif values.shape[:2] == shape:
-                made[name] = values.reshape(shape[0] * shape[1], -1)
-        stacked = [n for n in made if n != SEGMENT]
-        made = _without_padding(made, times, shape)
-        padding = shape[0] * shape[1] - next(iter(made.values())).shape[0]
-        words = f"{shape[0]} segments of {shape[1]} samples, put one after another"
-        words += f" without {padding} that pad them" if padding else ""
-        words = f"stacked arrays, {_shapes(stacked, arrays)}: {words}; {SEGMENT!r} numbers them"
-        notes.append(note("channels.stacked", words, *stacked, value=shape[0]))
-    left = [n for n in cubes if n not in made]
-    if left:
         why = "runs are read of arrays (run, sample, channel), with a time for each sample"
-        notes.append(note(LEFT_OUT, f"left out, since {why}: {_shapes(left, arrays)}", *left))
-    kept = {n: x for n, x in {**arrays, **made}.items() if n not in left}
-    return kept, tuple(notes)
-
-
-def _is_called_time(name: str) -> bool:
-    words = words_in(split_unit(_LEVEL.split(name)[-1])[0])
-    return bool(words and TIME_NAMES & {words[0], words[-1]})
-
-
-def _without_padding(
-    made: Mapping[str, np.ndarray], times: Mapping[str, np.ndarray], shape: tuple[int, int]
-) -> dict[str, np.ndarray]:
-    """The stacked arrays with a number for each row's segment, without rows that fill up short
-    segments."""
-    # Behind a segment's last sample there are no values, or no times but zeros.
-    values = [x.reshape((*shape, -1)) for n, x in made.items() if n not in times]
-    used = [np.any([np.isfinite(x).any(axis=2) for x in values], axis=0)] if values else []
-    used += [np.nan_to_num(x.reshape(shape)) != 0 for n, x in made.items() if n in times]
-    lengths = np.min([shape[1] - np.argmax(is_used[:, ::-1], axis=1) for is_used in used], axis=0)
-    kept = np.ravel(np.arange(shape[1]) < lengths[:, None])
-    numbers = np.repeat(np.arange(1.0, shape[0] + 1.0), shape[1])
-    own = {SEGMENT: numbers} if shape[0] > 1 and SEGMENT not in made else {}
-    return {name: x[kept] for name, x in {**made, **own}.items()}
-
-
-def _shapes(names: Sequence[str], arrays: Mapping[str, np.ndarray]) -> str:
-    return listed(f"{shown(n)} {arrays[n].shape}" for n in names)
+        shapes = listed(f"{shown(n)} {x.shape}" for n, x in cubes.items())
+        said = note(LEFT_OUT, f"left out, since {why}: {shapes}", *cubes)
+        return {n: x for n, x in arrays.items() if n not in cubes}, (said,)
+    made = dict(arrays)
+    for name, values in arrays.items():
+        if values.shape[:2] == shape:
+            made[name] = values.reshape(shape[0] * shape[1], -1)
+        elif name in clocks and values.size == shape[1]:
+            made[name] = np.tile(values.ravel(), shape[0])
+    if shape[0] > 1:
+        made.setdefault(SEGMENT, np.repeat(np.arange(1.0, shape[0] + 1.0), shape[1]))
+    words = (
+        f"stacked arrays: {shape[0]} segments of {shape[1]} samples, put one after another; "
+        f"{SEGMENT!r} numbers them"
+    )
+    return made, (note("channels.stacked", words, *cubes, value=shape[0]),)
 
 
 # Arrays that have clocks of their own by where they stand in a file: `log.imu.t` is the time of
@@ -473,7 +317,7 @@ def by_clocks(table: ArrayTable) -> ChannelLog | None:
     arrays = {s.name: s.values for s in table.survey() if s.values is not None}
     clocks: dict[str, np.ndarray] = {}
     for name, stamps in arrays.items():
-        if _is_called_time(name) and stamps.size > 1 and np.all(stamps[1:] > stamps[:-1]):
+        if is_called_time(name) and stamps.size > 1 and np.all(stamps[1:] > stamps[:-1]):
             leaf = _LEVEL.split(name)[-1]
             unit = table.time_unit(name) or split_unit(leaf)[1] or likely_unit(stamps)
             with np.errstate(over="ignore"):  # of a damaged file
@@ -481,40 +325,29 @@ def by_clocks(table: ArrayTable) -> ChannelLog | None:
     of_clock: dict[str, list[str]] = {}
     without = []
     for name, x in arrays.items():
-        clock = _clock_of(name, x.size, clocks)
-        if clock is None and x.size > 1:
-            without.append(name)
-        elif clock is not None and name not in clocks:
-            of_clock.setdefault(clock, []).append(name)
+        if name not in clocks and x.size > 1:
+            clock = _clock_of(name, x.size, clocks)
+            of_clock.setdefault(clock, []).append(name) if clock else without.append(name)
     if len(of_clock) < 2:
         return None
-    notes, topics, cautions = table.notes, [], []
+    notes, topics = table.notes, []
     for clock, names in of_clock.items():
         units_of = {n: table.units.get(n, "") for n in names}
-        columns = {n: arrays[n] for n in names}
-        topics.append(Topic(clock, clocks[clock], columns, units_of, clock))
-        cautions += contradicted_rate(table, clock, 1.0 / float(np.median(np.diff(clocks[clock]))))
+        topics.append(Topic(clock, clocks[clock], {n: arrays[n] for n in names}, units_of, clock))
     if without:
         each = listed(f"{shown(n)} ({sample_count(arrays[n].size)})" for n in without)
         words = "no time of their length, or several, stand in their groups"
         notes = (*notes, note(LEFT_OUT, f"left out, since {words}: {each}", *without))
-    return ChannelLog.of_table(table, tuple(topics), notes=notes, cautions=tuple(cautions))
+    return ChannelLog.of_table(table, tuple(topics), notes=notes)
 
 
 def _clock_of(name: str, size: int, clocks: Mapping[str, np.ndarray]) -> str | None:
-    """The clock of an array; None where its group has none of its length, or several of which not
-    one alone shares the other groups' time."""
+    """The clock of an array; None where the groups above it have none of its length, or several."""
     group = _LEVEL.split(name)[:-1]
-    groups = {c: _LEVEL.split(c)[:-1] for c in clocks}
     for depth in range(len(group), -1, -1):
-        near = [c for c, g in groups.items() if g == group[:depth] and clocks[c].size == size]
-        others = [clocks[c] for c, g in groups.items() if g != group[:depth]]
-        if len(near) > 1 and others:
-            # GPS time of week beside the board's time.
-            times = max(others, key=lambda x: x.size)
-            shared = (float(times[0]), float(times[-1]))
-            on_it = sharing_clocks({c: clocks[c] for c in near}, shared)
-            near = [c for c in near if c in on_it]
+        near = [
+            c for c, t in clocks.items() if _LEVEL.split(c)[:-1] == group[:depth] and t.size == size
+        ]
         if near:
             return near[0] if len(near) == 1 else None
     return None

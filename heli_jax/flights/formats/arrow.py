@@ -8,15 +8,8 @@ from typing import TYPE_CHECKING, BinaryIO
 import numpy as np
 
 from heli_jax.finding import Finding
+from heli_jax.flights.log import Budget, Survey, column, require_columns, require_few_columns, wrong
 from heli_jax.flights.progress import Digest
-from heli_jax.flights.table import (
-    Budget,
-    Survey,
-    column,
-    require_columns,
-    require_few_columns,
-    wrong,
-)
 from heli_jax.regular_file import open_regular, read_regular, size_words
 
 # Imported again within the functions that need it, as in `csv_text`.

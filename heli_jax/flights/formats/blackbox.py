@@ -25,15 +25,13 @@ from heli_jax.flights.formats.blackbox_frames import (
     Frames,
     Header,
     find_frames,
-    narrowed,
     read_header,
 )
-from heli_jax.flights.log import ChannelLog, Topic
-from heli_jax.flights.table import wrong
+from heli_jax.flights.log import ChannelLog, Topic, wrong
 from heli_jax.regular_file import read_regular
 
-_LARGEST = 10**9
-"""bytes: opened it takes about three times as much"""
+_LARGEST = 4 * 10**8
+"""bytes: opened it takes about ten times as much"""
 _MOST_FLIGHTS = 1000
 _DEGREES_PER_SECOND = "0x3f800000"
 """gyro_scale of firmware whose gyro counts are degrees per second: the float 1.0"""
@@ -135,12 +133,15 @@ def _slow(frames: Frames, head: Header, main: MainFrames) -> Topic | None:
     last = np.maximum(np.searchsorted(main.starts, frames.starts["S"]) - 1, 0)
     # A field may stand in several kinds of frames; a channel's name has to be one topic's alone.
     columns = {
-        f"slow.{name}" if name in main.columns else name: narrowed(
-            (values[:, i] & 0xFFFFFFFF).astype(np.uint32).view(np.int32 if has_sign else np.uint32)
-        )
+        f"slow.{name}" if name in main.columns else name: _signed(values[:, i], has_sign)
         for i, (name, has_sign) in enumerate(zip(layout.names, layout.signed, strict=True))
     }
     return Topic("slow", main.times[last] * 1e-6, columns, {}, "time of the main frame before")
+
+
+def _signed(values: np.ndarray, has_sign: bool) -> np.ndarray:
+    """The lowest 32 bits of numbers (N,), with a sign or without."""
+    return values.astype(np.int64).astype(np.uint32).view(np.int32 if has_sign else np.uint32)
 
 
 def _losses(frames: Frames, main: MainFrames) -> tuple[Finding, ...]:
@@ -183,38 +184,27 @@ def main_frames(frames: Frames, head: Header) -> MainFrames:
     """The frames I and P with predictions added, in the order of the file."""
     # The finder keeps each kind apart. A difference needs the frame that stood before it in the
     # file, so the two kinds are merged by their positions.
-    intra, inter = frames.starts["I"], frames.starts["P"]
-    is_first = np.zeros(intra.size + inter.size, bool)
-    is_first[np.searchsorted(inter, intra) + np.arange(intra.size)] = True
-    starts = np.empty(is_first.size, intra.dtype)
-    starts[is_first], starts[~is_first] = intra, inter
+    starts = np.concatenate([frames.starts["I"], frames.starts["P"]])
+    order = np.argsort(starts, kind="stable")
+    starts, is_first = starts[order], order < frames.starts["I"].size
     runs = _runs(starts, is_first, np.asarray(frames.damage, np.int64))
-    layout = head.layouts["I"]
-    stamps = _numbers(frames, layout.names.index("time"), runs, is_first, head)
-    keep, times = _plausible(stamps.view(np.uint32), runs, frames, starts)
-    columns = {}
-    for i, (name, has_sign) in enumerate(zip(layout.names, layout.signed, strict=True)):
-        numbers = _numbers(frames, i, runs, is_first, head)
-        kept = numbers if keep is None else numbers[keep]
-        columns[name] = narrowed(kept if has_sign else kept.view(np.uint32))
-    dropped = 0 if keep is None else starts.size - keep.size
-    return MainFrames(columns, times, starts if keep is None else starts[keep], dropped)
+    names = head.layouts["I"].names
 
+    def numbers(i: int, motor: np.ndarray) -> np.ndarray:
+        written = np.concatenate([frames.rows[letter][:, i] for letter in "IP"])[order]
+        add_predictions(written, i, runs, is_first, motor, head)
+        return written
 
-def _numbers(frames: Frames, i: int, runs: Runs, is_first: np.ndarray, head: Header) -> np.ndarray:
-    """The numbers (M,) int32 of the i-th field of all frames, those in no run included."""
-    numbers = np.empty(is_first.size, np.int32)
-    numbers[is_first] = frames.packed["I"].column(i)
-    numbers[~is_first] = frames.packed["P"].column(i)
-    names, told = head.layouts["I"].names, np.zeros_like(numbers)
-    # A motor that is told from itself, as no firmware writes, stays as it is.
-    motor = names.index("motor[0]") if "motor[0]" in names else i
-    if motor != i and any(
-        head.layouts[letter].predictors[i] == frames_of.MOTOR_0 for letter in "IP"
-    ):
-        told = _numbers(frames, motor, runs, is_first, head)
-    add_predictions(numbers, i, runs, is_first, told, head)
-    return numbers
+    none = np.zeros(starts.size, np.int32)
+    motor = numbers(names.index("motor[0]"), none) if "motor[0]" in names else none
+    stamps = numbers(names.index("time"), motor).view(np.uint32)
+    keep, times = _plausible(stamps, runs, frames, starts)
+    keep = np.arange(starts.size) if keep is None else keep
+    columns = {
+        name: numbers(i, motor)[keep].view(np.int32 if has_sign else np.uint32)
+        for i, (name, has_sign) in enumerate(zip(names, head.layouts["I"].signed, strict=True))
+    }
+    return MainFrames(columns, times, starts[keep], starts.size - keep.size)
 
 
 def _runs(starts: np.ndarray, is_first: np.ndarray, damage: np.ndarray) -> Runs:

@@ -13,11 +13,10 @@ version 2.
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 import numpy as np
 
-from heli_jax.flights.table import shown, wrong
+from heli_jax.flights.log import shown, wrong
 
 Decoded = tuple[np.ndarray, np.ndarray]
 
@@ -364,61 +363,12 @@ def _listed_numbers(path: str, settings: dict[str, str], name: str, count: int) 
     return tuple(int(number) for number in text.split(","))
 
 
-def narrowed(column: np.ndarray) -> np.ndarray:
-    """Whole numbers (N,) of 32 bits in the fewest bits that hold them."""
-    if not column.size:
-        return column
-    low, high = int(column.min()), int(column.max())
-    kinds = (np.int8, np.int16) if column.dtype.kind == "i" else (np.uint8, np.uint16)
-    for kind in kinds:
-        if np.iinfo(kind).min <= low and high <= np.iinfo(kind).max:
-            return column.astype(kind)
-    return column
-
-
-class Rows:
-    """Numbers of M frames as written, in the order of the file, by field: packed.
-
-    Most are differences, of a byte each, and many are zero throughout. As 32 bits the frames of a
-    log are five times its size.
-    """
-
-    def __init__(self, width: int) -> None:
-        self.width, self.size = width, 0
-        # By field its pieces, each the numbers or the one number that all of them are.
-        self._pieces: list[list[np.ndarray]] = [[] for _ in range(width)]
-        self._edges = [0]
-
-    def append(self, values: np.ndarray) -> None:
-        """Add frames (M, F) int32."""
-        if not len(values):
-            return
-        for i, pieces in enumerate(self._pieces):
-            packed = narrowed(np.ascontiguousarray(values[:, i]))
-            pieces.append(packed[:1].copy() if np.all(packed == packed[0]) else packed)
-        self.size += len(values)
-        self._edges.append(self.size)
-
-    def column(self, i: int) -> np.ndarray:
-        """The numbers (M,) int32 of the i-th field."""
-        numbers = np.empty(self.size, np.int32)
-        for piece, (begin, end) in zip(self._pieces[i], pairwise(self._edges), strict=True):
-            numbers[begin:end] = piece
-        return numbers
-
-    def frames(self) -> np.ndarray:
-        """All frames (M, F) int32."""
-        return np.stack([self.column(i) for i in range(self.width)], axis=1)
-
-
 # Frames have no length: each ends where the next begins, and which that is shows only once its
 # fields are decoded. To do that frame by frame is a hundred times too slow in Python. So every
 # byte that might begin a frame is taken for one, all are decoded at once with NumPy, and a walk
 # from end to beginning keeps those that are frames. What is no frame where one should be is
 # damage; the walk goes on at the next byte from which a frame leads to the beginning of another.
 
-MAIN = "IP"
-"""letters of the control loop's frames"""
 LONGEST_FRAME = 256
 """bytes, as firmware's own tools have it: what goes on for longer is damage"""
 _CELLS_AT_ONCE = 1 << 25
@@ -435,17 +385,14 @@ _ADJUSTMENT, _RESUME, _CUSTOM, _END = 13, 14, (100, 101), 255
 
 @dataclass
 class Frames:
-    """The frames of one flight, by kind in the order of the file.
+    """The frames of one flight, by the letter of their kind in the order of the file.
 
-    `rows` (M, F) int32 by letter are the numbers as written, before any prediction, those of the
-    control loop (I and P, nearly all) packed in `packed`; `starts` (M,) where each frame begins
-    [bytes]. `damage` (D,) are the places where something was no frame,
-    `resumes` where the firmware says that it went on after a pause, `end` says that it closed the
-    log.
+    `rows` (M, F) int32 are the numbers as written, before any prediction; `starts` (M,) where each
+    frame begins [bytes]. `damage` (D,) are the places where something was no frame, `resumes` where
+    the firmware says that it went on after a pause, `end` says that it closed the log.
     """
 
     rows: dict[str, np.ndarray]
-    packed: dict[str, Rows]
     starts: dict[str, np.ndarray]
     damage: list[int] = field(default_factory=list)
     resumes: list[int] = field(default_factory=list)
@@ -464,6 +411,9 @@ class _Candidates:
     starts: np.ndarray
     ends: np.ndarray
     values: np.ndarray
+
+    def at(self, rows: np.ndarray) -> "_Candidates":
+        return _Candidates(self.starts[rows], self.ends[rows], self.values[rows])
 
 
 class _Chain:
@@ -524,23 +474,19 @@ class _Walk:
         # one, each with as many numbers as the widest frame has fields.
         widest = max(len(layout.names) for layout in layouts.values())
         self.piece = max(1024, min(_LONGEST_PIECE, _CELLS_AT_ONCE // widest))
-        self.frames = Frames({}, {}, {})
-        self.kept = {letter: Rows(len(layout.names)) for letter, layout in layouts.items()}
-        self.starts: dict[str, list[np.ndarray]] = {letter: [] for letter in layouts}
+        self.frames = Frames({}, {})
+        self.kept: dict[str, list[_Candidates]] = {letter: [] for letter in layouts}
         self.in_damage = False
 
     def run(self) -> Frames:
         while self.at < self.size and not self.frames.end:
             self._walk_piece(self.at, min(self.at + self.piece, self.size))
-        for letter, rows in self.kept.items():
-            if letter in MAIN:
-                self.frames.packed[letter] = rows
-            else:
-                self.frames.rows[letter] = rows.frames()
-            self.frames.starts[letter] = np.concatenate(
-                [np.zeros(0, np.uint32), *self.starts[letter]]
-            )
-            self.starts[letter].clear()
+        for letter, pieces in self.kept.items():
+            none = np.zeros((0, len(self.layouts[letter].names)), np.int32)
+            self.frames.rows[letter] = np.concatenate([none, *(p.values for p in pieces)])
+            starts = [p.starts for p in pieces]
+            self.frames.starts[letter] = np.concatenate([np.zeros(0, np.int64), *starts])
+            pieces.clear()
         return self.frames
 
     def _walk_piece(self, first: int, last: int) -> None:
@@ -569,10 +515,7 @@ class _Walk:
         is_frame = np.zeros(last - first, bool)
         is_frame[chain.visited() - first] = True
         for letter, each in candidates.items():
-            i = np.flatnonzero(is_frame[each.starts - first])
-            self.kept[letter].append(each.values[i])
-            # A file has less than 2^32 bytes.
-            self.starts[letter].append(each.starts[i].astype(np.uint32))
+            self.kept[letter].append(each.at(np.flatnonzero(is_frame[each.starts - first])))
 
     def _candidates(self, letter: str, first: int, last: int) -> _Candidates:
         starts = first + np.flatnonzero(self.bytes[first:last] == ord(letter))
@@ -582,8 +525,8 @@ class _Walk:
         # A single byte is a letter by chance often enough. That another letter stands just where
         # the frame would end is what makes it likely to be one.
         follows = self.is_letter[self.bytes.take(ends, mode="clip")]
-        i = np.flatnonzero(whole & (follows | (ends == self.size)))
-        return _Candidates(starts[i], ends[i], values[i])
+        found = _Candidates(starts, ends, values)
+        return found.at(np.flatnonzero(whole & (follows | (ends == self.size))))
 
     def _note_damage(self) -> None:
         rest = self.data[self.at : self.at + LONGEST_FRAME]

@@ -1,8 +1,7 @@
 """Logs in delimited text, of which pyarrow reads the numbers.
 
-A clean file takes the fast way, all columns through pyarrow. Where anything is not plain - a quote,
-a row of another number of cells, a cell that is no number - cells are looked at as text, and
-`CsvTable._records` walks the lines again to say where an error is.
+A clean file takes the fast way, all columns at once as numbers. Where a cell is no plain number the
+columns are read as text; where a row has another number of cells, its line is told.
 """
 
 import codecs
@@ -20,11 +19,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from heli_jax import units
+from heli_jax.errors import InputError
 from heli_jax.finding import Finding, note
 from heli_jax.flights import progress
+from heli_jax.flights.clock import is_date, seconds_of_dates, time_unit
 from heli_jax.flights.formats.arrow import floats
-from heli_jax.flights.progress import Digest
-from heli_jax.flights.table import (
+from heli_jax.flights.log import (
     Budget,
     Survey,
     column,
@@ -34,7 +34,7 @@ from heli_jax.flights.table import (
     shown,
     wrong,
 )
-from heli_jax.flights.time_units import is_date, seconds_of_dates, time_unit
+from heli_jax.flights.progress import Digest
 from heli_jax.regular_file import read_regular, size_words
 
 # Imported again within the functions that need it: it takes a quarter of a second, which
@@ -45,15 +45,13 @@ if TYPE_CHECKING:
 _LARGEST = 8 * 10**9
 """bytes: the file is held in memory, and the columns that are asked for"""
 _LARGEST_TEXT = 10**9
-"""bytes of cells that are looked at as text, in which they take many times as much"""
+"""bytes of cells that are looked at as text"""
 _LOOKED_AT, _MOST_LINES = 1 << 20, 20_000
 """bytes and lines in which a table is sought"""
 _FEWEST = 3
 """rows that make a table"""
 _FOREIGN = 0.1
 """part of the bytes that are none of ASCII, from which on they are no text of a log"""
-_SAMPLE = 1 << 20
-"""bytes by which the decimal sign and the columns of numbers are told"""
 _DELIMITERS = ("\t", "|", ";", ",")
 """the surest first: a tab stands in no number and in hardly any name, a comma may be decimal"""
 _MARK = re.compile(r"\s*(?:#+|//+|%+(?=[\s%]|[^,;\t]*$))\s*")
@@ -64,7 +62,6 @@ MISSING = (
     *("1.#QNAN", "-1.#QNAN", "1.#IND", "-1.#IND", "NaT", "<NA>"),
 )
 """cells that say that there is no value, beside NaN, which is a number"""
-_NOTHING = frozenset(("", *MISSING))
 _SIGN = "[+\u2212-]?"
 _NUMBER = re.compile(
     rf"{_SIGN}(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eEdD]{_SIGN}[0-9]+)?|{_SIGN}(?:nan|inf|infinity)",
@@ -72,14 +69,6 @@ _NUMBER = re.compile(
 )
 """float() would also take 1_000, and digits of any script"""
 _WITH_COMMA = re.compile(r"[+-]?[0-9]*,[0-9]+(?:[eEdD][+-]?[0-9]+)?")
-_OF_NO_MODEL = {
-    *("degc", "°c", "celsius", "degf", "°f", "kelvin", "bar", "mbar", "hpa", "psi", "inhg", "mmhg"),
-    *("gauss", "mgauss", "mg", "ut", "µt", "nt", "tesla", "db", "dbm", "mah", "ah", "wh", "ppm"),
-    *("raw", "counts", "count", "adc", "lsb", "bool", "boolean", "enum", "flag", "flags", "bits"),
-    *("norm", "normalized", "none", "nd", "n-d", "non-dim", "unitless", "ratio", "pwm", "us"),
-    *("gs", "g's", "m/s/s", "ft/s/s", "ft/sec^2", "m/sec^2", "m/s2", "ft/s2", "kts"),
-}
-"""units that stand in rows of units too, and no model asks for"""
 
 
 class _Head(NamedTuple):
@@ -113,7 +102,8 @@ def open_csv(path: Path) -> "CsvTable":
     packed = read_regular(path, "a log in CSV", _LARGEST)
     digest, size = Digest(packed), len(packed)
     data = as_text(where, unpacked(where, packed) if is_gzipped(path) else packed)
-    head = _find_head(where, data, blanks=inner_ending(path) not in (".csv", ".tsv"))
+    blanks = inner_ending(path) not in (".csv", ".tsv")
+    head = _find_head(where, data, (*_DELIMITERS, " ") if blanks else _DELIMITERS)
     line = f"line {head.number}"
     if not data[head.begin : head.begin + _LOOKED_AT].strip() and not data[head.begin :].strip():
         raise wrong(where, "holds a header alone, expected rows of numbers", line)
@@ -122,14 +112,18 @@ def open_csv(path: Path) -> "CsvTable":
         lines = (b"\t".join(row.split()) for row in bytes(rows).split(b"\n"))
         head, rows = head._replace(delimiter="\t"), memoryview(b"\n".join(lines))
     require_few_columns(where, len(head.names), line)
-    _require_names(where, head)
+    if any(map(is_date, head.names)) or all(map(_NUMBER.fullmatch, head.names)):
+        names = ["time", *(f"column{i}" for i in range(2, len(head.names) + 1))][:6]
+        between = ", with tabs between" if head.delimiter == "\t" else ""
+        example = shown((" " if between else head.delimiter).join(names))
+        problem = "got numbers or times, expected the names of the columns; write a line of names"
+        raise wrong(where, f"{problem} above, such as {example}{between}", line)
     rows, notes = _whole(rows, head)
     if any(head.units):
         each = listed(f"{n} [{u}]" for n, u in zip(head.names, head.units, strict=True))
-        words = f"a line of units stands beside {line} and is no sample: {each}"
+        words = f"a line of units stands below {line} and is no sample: {each}"
         notes = (*notes, note("text.units-line", words, value=head.first_line - 1))
-    quotes = data.find(b'"', head.begin) >= 0
-    return CsvTable(where, size, digest, rows, head, notes, quotes)
+    return CsvTable(where, size, digest, rows, head, notes, data.find(b'"', head.begin) >= 0)
 
 
 def is_gzipped(path: Path) -> bool:
@@ -188,10 +182,9 @@ def as_text(path: str, data: bytes) -> bytes:
 # Where the table is: a line of names right above rows of as many cells, most of them numbers.
 
 
-def _find_head(path: str, data: bytes, blanks: bool) -> _Head:
+def _find_head(path: str, data: bytes, delimiters: Sequence[str]) -> _Head:
     """Find the header of the table, below what stands above it: titles, settings, comments."""
     lines = list(_lines(data))
-    delimiters = (*_DELIMITERS, " ") if blanks else _DELIMITERS
     if lines and (separator := _SEPARATOR.fullmatch(lines[0].text)):
         # Excel's own word for what stands between cells.
         delimiters, lines = (separator[1],), lines[1:]
@@ -199,13 +192,10 @@ def _find_head(path: str, data: bytes, blanks: bool) -> _Head:
     if not plain:
         raise wrong(path, "holds no header, expected names of columns and rows of numbers")
     for delimiter in delimiters:
-        head = _head(lines, delimiter)
-        if head is not None:
+        if (head := _head(lines, delimiter)) is not None:
             return head
-    header, *below = plain
-    first = below[0].text if below else ""
-    agreed = (d for d in delimiters if header.text.count(d) == first.count(d) > 0)
-    delimiter = next(agreed, max(reversed(delimiters), key=header.text.count))
+    header = plain[0]
+    delimiter = max(reversed(delimiters), key=header.text.count)
     names = tuple(cell.strip() for cell in _cells_of(header.text, delimiter))
     return _Head(names, header.number, delimiter, header.after, header.number + 1, (), False)
 
@@ -236,41 +226,28 @@ def _head(lines: Sequence[_Line], delimiter: str) -> _Head | None:
         return 0 if lines[i].is_comment or not _is_row(cells[i]) else len(cells[i])
 
     # A file may end before there are so many.
-    for at in range(1, len(lines)):
-        run = range(at, min(at + _FEWEST, len(lines)))
-        if width(at) > 1 and all(width(i) == width(at) for i in run):
-            head = _above(lines, cells, at, delimiter)
-            if head is not None:
-                return head
+    for row in range(1, len(lines)):
+        run = range(row, min(row + _FEWEST, len(lines)))
+        if width(row) < 2 or any(width(i) != width(row) for i in run):
+            continue
+        # A rule, or a word on what follows, between names and rows.
+        at = row - 1 - (row > 1 and len(cells[row - 1]) == 1)
+        stated: tuple[str, ...] = ()
+        # To know all units takes a quarter of a second, so that they are looked for last.
+        if at > 0 and _names_fit(cells[at - 1], cells[row]):
+            stated = row_of_units(cells[at])
+            at -= bool(stated)
+        if not _names_fit(cells[at], cells[row]):
+            continue
+        # A delimiter at the end of each row, or a column for comments that rows need not have.
+        names, units_of = (
+            (*(cell.strip() for cell in one), *[""] * width(row))[: width(row)]
+            for one in (cells[at], stated)
+        )
+        last = lines[row - 1]
+        units_of = units_of if stated else ()
+        return _Head(names, lines[at].number, delimiter, last.after, last.number + 1, units_of)
     return None
-
-
-def _above(
-    lines: Sequence[_Line], cells: Sequence[list[str]], row: int, delimiter: str
-) -> _Head | None:
-    """The header of rows that begin at a line; None where no names stand above them."""
-    at = row - 1
-    # A rule, or a word on what follows, between names and rows.
-    at -= at > 0 and len(cells[at]) == 1
-    near = [i for i in (at, at - 1) if i >= 0]
-    fit = [i for i in near if _names_fit(cells[i], cells[row])]
-    # One of two lines of words has units, the other names; words that are units may be names too.
-    # Alone it has the names, and units are not looked for: to know all takes a quarter of a second.
-    beside_names = near if len(near) > 1 else ()
-    stated = {
-        i: made for i in beside_names if len(cells[i]) > 1 and (made := row_of_units(cells[i]))
-    }
-    found = next((i for i in fit if i not in stated), fit[0] if fit else -1)
-    if found < 0 or at not in (found, *stated):
-        return None
-    beside = next((made for i, made in stated.items() if i != found), ())
-    # A delimiter at the end of each row, or a column for comments that rows need not have.
-    names, units_of = (
-        (*(cell.strip() for cell in one), *[""] * len(cells[row]))[: len(cells[row])]
-        for one in (cells[found], beside)
-    )
-    last, number = lines[row - 1], lines[found].number
-    return _Head(names, number, delimiter, last.after, last.number + 1, units_of if beside else ())
 
 
 def _cells_of(line: str, delimiter: str) -> list[str]:
@@ -313,7 +290,7 @@ def _names_fit(names: Sequence[str], row: Sequence[str]) -> bool:
 
 
 def row_of_units(cells: Sequence[str]) -> tuple[str, ...]:
-    """The units in a row beside the names, brackets taken off; empty where it is no such row."""
+    """The units in a row below the names, brackets taken off; empty where it is no such row."""
     bare = [re.sub(r"^[\[(](.*)[\])]$", r"\1", cell.strip().strip('"')).strip() for cell in cells]
     # A row of marks for nothing says nothing of units.
     words = [word for word in bare if word not in ("", "-", "1", "--", *MISSING)]
@@ -323,47 +300,30 @@ def row_of_units(cells: Sequence[str]) -> tuple[str, ...]:
     # there are too many: P is pressure, rate and pitch.
     known = {}
     for word in words:
-        small = word.casefold()
-        if time_unit(word) or units.is_unit(word) or small in _OF_NO_MODEL:
+        if time_unit(word) or units.is_unit(word):
             known[word] = word
-        elif len(word) > 1 and units.is_unit(small):
-            known[word] = small
-    # One of them may be written as only its author does.
-    if 2 * sum(word in known for word in words) <= len(words):
+        elif len(word) > 1 and units.is_unit(word.casefold()):
+            known[word] = word.casefold()
+    # Some of them may be written as only their author does.
+    if 2 * sum(word in known for word in words) < len(words):
         return ()
     return tuple(known.get(word, word) for word in bare)
-
-
-def _require_names(path: str, head: _Head) -> None:
-    """Refuse a first line that holds a sample, and rows that commas cut at their decimal signs."""
-    if any(map(is_date, head.names)) or all(map(_NUMBER.fullmatch, head.names)):
-        names = ["time", *(f"column{i}" for i in range(2, len(head.names) + 1))][:6]
-        # A tab would be shown as an escape, which nobody types.
-        tabs = head.delimiter == "\t"
-        example = shown((" " if tabs else head.delimiter).join(names))
-        problem = "got numbers or times, expected the names of the columns"
-        between = " with tabs between" if tabs else ""
-        remedy = f"write a line of names above, such as {example}{between}"
-        raise wrong(path, f"{problem}; {remedy}", f"line {head.number}")
 
 
 def _whole(rows: memoryview, head: _Head) -> tuple[memoryview, tuple[Finding, ...]]:
     """The rows without those of empty cells at the end, as spreadsheets write them, and without a
     last line that ends before its last cells, as where a logger lost its power; and a note."""
-    of_nothing, size = b" \t\n" + head.delimiter.encode(), 1 << 16
-    while not (end := bytes(rows[-size:])).rstrip(of_nothing) and size < len(rows):
-        size *= 16
-    if kept := len(end.rstrip(of_nothing)):
-        after = end.find(b"\n", kept)
-        rows = rows if after < 0 else rows[: len(rows) - len(end) + after + 1]
-    at = end[:kept].rfind(b"\n") + 1
+    end = bytes(rows[-(1 << 16) :])
+    kept = len(end.rstrip(b" \t\n" + head.delimiter.encode()))
+    if kept and (after := end.find(b"\n", kept)) >= 0:
+        return rows[: len(rows) - len(end) + after + 1], ()
+    at = end.rfind(b"\n") + 1
     cells = end[at:].count(head.delimiter.encode()) + 1
     # Of quotes a delimiter may stand within; an only line is told as what it is.
-    if at == 0 or b"\n" in end[kept:] or cells >= len(head.names) or b'"' in end[at:]:
+    if at == 0 or cells >= len(head.names) or b'"' in end[at:]:
         return rows, ()
     words = f"the last line is cut off ({cells} of {len(head.names)} cells): it is left out"
-    cut = note("text.line-cut-off", words, value=cells)
-    return rows[: len(rows) - len(end) + at], (cut,)
+    return rows[: len(rows) - len(end) + at], (note("text.line-cut-off", words, value=cells),)
 
 
 class CsvTable:
@@ -385,8 +345,13 @@ class CsvTable:
         self.units: Mapping[str, str] = dict(zip(head.names, head.units, strict=False))
         self._digest, self._rows, self._head = digest, rows, head
         self._dates: set[str] = set()
-        self._has_quotes = has_quotes
-        self._sign = self._decimal_sign()
+        self._quote = '"' if has_quotes else False
+        # The decimal sign of the file, by its first rows: `1.577` beside `0,25` would else be one
+        # and a half. Between commas a decimal one stands within quotes.
+        lines = bytes(rows[:_LOOKED_AT]).decode("utf-8", "ignore").split("\n")[:2000]
+        lines = [line for line in lines if "," in line and (head.delimiter != "," or '"' in line)]
+        cells = (cell.strip() for line in lines for cell in _cells_of(line, head.delimiter))
+        self._sign = "," if any(map(_WITH_COMMA.fullmatch, cells)) else "."
 
     @property
     def sha256(self) -> str:
@@ -443,106 +408,81 @@ class CsvTable:
         return "s" if name in self._dates else time_unit(self.units.get(name, ""))
 
     def _columns(self, indices: Sequence[int]) -> list["_Column"]:
-        """Columns by index: those that look like numbers by pyarrow, the others cell by cell."""
+        """Columns by index: as numbers at once where that will do, else through their text."""
         import pyarrow as pa
 
-        # All at once where that will do, as nearly always where columns are asked for by name.
-        likely = list(dict.fromkeys(indices))
-        table = self._arrow(self._rows, dict.fromkeys(likely, pa.float64()))
+        table = self._arrow(indices, pa.float64())
+        if table is not None:
+            columns = [table.column(str(i)) for i in indices]
+            return [(floats(c), len(c) - c.null_count, 0) for c in columns]
+        if len(self._rows) > _LARGEST_TEXT:
+            problem = "has quotes, a row of other than the header's number of cells, or a cell that"
+            problem += f" is no plain number, expected at most {size_words(_LARGEST_TEXT)} then"
+            raise wrong(self.path, f"{problem}, got {size_words(len(self._rows))}")
+        table = self._arrow(indices, pa.string())
         if table is None:
-            likely = self._likely_numbers(likely)
-            table = self._arrow(self._rows, dict.fromkeys(likely, pa.float64()))
-        plain = {} if table is None else {i: table.column(str(i)) for i in likely}
-        made: dict[int, _Column] = {
-            i: (floats(c), len(c) - c.null_count, 0) for i, c in plain.items()
-        }
-        rest = [i for i in dict.fromkeys(indices) if i not in made]
-        for i, cells in zip(rest, self._texts(rest) if rest else (), strict=True):
-            made[i] = self._parsed(self.names[i], cells)
-        return [made[i] for i in indices]
+            raise self._ragged()
+        return [self._parsed(self.names[i], table.column(str(i))) for i in indices]
 
-    def _parsed(self, name: str, cells: list[str | None]) -> "_Column":
-        """A column of texts; None stands for a cell that says that there is no value."""
-        filled = [cell for cell in cells if cell is not None]
-        if filled and is_date(filled[0]):
-            self._dates.add(name)
-            seconds = seconds_of_dates(cells)
-            odd = sum(not _NUMBER.fullmatch(cell) for cell in filled)
-            return seconds, len(filled), odd if isinstance(seconds, int) else 0
-        values, wrong_row, odd = np.full(len(cells), np.nan), None, 0
-        for row, cell in enumerate(cells):
-            if cell is None:
-                continue
-            # A point beside decimal commas would be one between thousands, or a slip.
-            plain = cell.replace(",", ".") if self._sign == "," and "." not in cell else cell
-            if (self._sign == "," and "." in cell) or not _NUMBER.fullmatch(plain):
-                odd += 1
-                wrong_row = row if wrong_row is None else wrong_row
-            else:
-                # Fortran writes 1.0D+00, some a true minus.
-                plain = plain.replace("\u2212", "-").replace("D", "e").replace("d", "e")
-                values[row] = float(plain)
-        return values if wrong_row is None else wrong_row, len(filled), odd
-
-    def _decimal_sign(self) -> str:
-        """The decimal sign of the file, by its first rows.
-
-        A file has one: `1.577` beside `0,25` would else be one and a half.
-        """
-        delimiter, first = self._head.delimiter, bytes(self._rows[:_SAMPLE])
-        # A comma between cells is decimal only within quotes.
-        if b'"' not in first if delimiter == "," else b"," not in first:
-            return "."
-        lines = first.decode("utf-8", "ignore").split("\n")[:2000]
-        cells = (cell.strip() for line in lines for cell in _cells_of(line, delimiter))
-        return "," if any(map(_WITH_COMMA.fullmatch, cells)) else "."
-
-    def _likely_numbers(self, indices: Sequence[int]) -> list[int]:
-        """The columns that hold numbers as far as the first rows tell."""
+    def _parsed(self, name: str, texts: "pa.ChunkedArray") -> "_Column":
+        """A column of texts."""
         import pyarrow as pa
+        from pyarrow import compute
 
-        first = self._rows[:_SAMPLE]
-        if len(self._rows) > len(first):
-            first = first[: bytes(first).rfind(b"\n") + 1]
-        table = self._arrow(first, dict.fromkeys(indices))
-        types = () if table is None else table.schema.types
-        is_number = (pa.types.is_integer, pa.types.is_floating)
-        return [i for i, t in zip(indices, types, strict=False) if any(f(t) for f in is_number)]
+        pc: Any = compute  # whose functions are made when it is imported
+        cells: Any = pc.utf8_trim(texts, ' \t"')
+        nothing = pc.is_in(cells, pa.array(["", *MISSING]))
+        cells = pc.if_else(nothing, pa.scalar(None, pa.string()), cells)
+        filled = len(cells) - cells.null_count
+        plain = cells
+        if self._sign == ",":
+            # A point beside decimal commas would be one between thousands, or a slip.
+            mixed = pc.match_substring(plain, ".")
+            plain = pc.if_else(mixed, pa.scalar("x"), pc.replace_substring(plain, ",", "."))
+        is_number = pc.match_substring_regex(plain, f"^(?:{_NUMBER.pattern})$", ignore_case=True)
+        odd = filled - pc.sum(is_number).as_py() if filled else 0
+        if not odd:
+            # Fortran writes 1.0D+00, some a true minus; pyarrow knows no plus in front.
+            plain = pc.replace_substring(plain, "\u2212", "-")
+            plain = pc.replace_substring_regex(plain, r"^\+", "")
+            plain = pc.replace_substring_regex(plain, r"([0-9.])[dD]", r"\1e")
+            return floats(pc.cast(plain, pa.float64())), filled, 0
+        if is_date(cells.drop_null()[0].as_py()):
+            self._dates.add(name)
+            seconds = seconds_of_dates(cells.to_pylist())
+            return seconds, filled, odd if isinstance(seconds, int) else 0
+        return pc.index(is_number, False).as_py(), filled, odd
 
-    def _arrow(self, rows: memoryview, kinds: Mapping[int, Any]) -> "pa.Table | None":
-        """Columns by index, in their types (None lets pyarrow guess); None where it cannot read
-        them."""
+    def _arrow(self, indices: Sequence[int], kind: Any) -> "pa.Table | None":
+        """Columns by index, in one type; None where pyarrow cannot read them."""
         import pyarrow as pa
         from pyarrow import csv as arrow_csv
 
-        # pyarrow takes a line break within quotes for one within a cell or for the end of a row, by
-        # an option; either way the lines that it counts are not those of the file.
-        if self._has_quotes or not kinds:
-            return None
         ragged: list[Any] = []
 
         # Called for each row with other than the header's number of cells: so for blank lines too,
-        # which are no error. That there is any other is enough: `_records` finds its line.
+        # which are no error. That there is any other is enough: `_ragged` finds its line.
         def skip(row: Any) -> str:
             if not _is_blank(row.text, self._head.delimiter):
                 ragged.append(row)
             return "skip"
 
         # By number, since two columns may have one name.
-        names = [str(i) for i in range(len(self.names))]
+        names = [str(i) for i in dict.fromkeys(indices)]
         try:
             table = arrow_csv.read_csv(
-                pa.BufferReader(pa.py_buffer(rows)),
-                read_options=arrow_csv.ReadOptions(column_names=names),
+                pa.BufferReader(pa.py_buffer(self._rows)),
+                read_options=arrow_csv.ReadOptions(
+                    column_names=[str(i) for i in range(len(self.names))]
+                ),
                 parse_options=arrow_csv.ParseOptions(
                     delimiter=self._head.delimiter,
-                    quote_char=False,
-                    double_quote=False,
+                    quote_char=self._quote,
                     invalid_row_handler=skip,
                 ),
                 convert_options=arrow_csv.ConvertOptions(
-                    column_types={str(i): k for i, k in kinds.items() if k is not None},
-                    include_columns=[str(i) for i in kinds],
+                    column_types=dict.fromkeys(names, kind),
+                    include_columns=names,
                     # Not its own list, which has words such as #N/A N/A.
                     null_values=["", *MISSING],
                     decimal_point=self._sign,
@@ -552,67 +492,45 @@ class CsvTable:
             return None
         return None if ragged or not table.num_rows else table
 
-    def _texts(self, indices: Sequence[int]) -> list[list[str | None]]:
-        """The cells of some columns, without the blanks around them, None where nothing is left."""
-        import pyarrow as pa
-
-        if len(self._rows) > _LARGEST_TEXT:
-            problem = (
-                "has quotes, a row of other than the header's number of cells, or a cell that is "
-                f"no plain number, which is looked at in files of at most "
-                f"{size_words(_LARGEST_TEXT)}, got {size_words(len(self._rows))}"
-            )
-            raise wrong(self.path, problem)
-        columns: list[list[str | None]] = [[] for _ in indices]
-        table = self._arrow(self._rows, dict.fromkeys(indices, pa.string()))
-        if table is not None:
-            for texts, i in zip(columns, indices, strict=True):
-                cells = map(str.strip, table.column(str(i)).to_pylist())
-                texts += [None if cell in _NOTHING else cell for cell in cells]
-            return columns
-        for line, cells in self._records():
-            if len(cells) != len(self.names):
-                raise wrong(self.path, self._ragged(len(cells)), f"line {line}")
-            for texts, i in zip(columns, indices, strict=True):
-                cell = cells[i].strip()
-                texts.append(None if cell in _NOTHING else cell)
-        if not columns[0]:
-            raise wrong(self.path, "holds a header alone, expected rows of numbers")
-        return columns
-
-    def _ragged(self, count: int) -> str:
-        problem = f"{count} cell{'' if count == 1 else 's'}, expected {len(self.names)}"
-        problem += f" as in the header in line {self._head.number}"
-        if self._head.is_fitting:
-            return problem
-        return f"{problem}; no line of names stands right above rows of as many cells"
+    def _ragged(self) -> InputError:
+        """The error of a row that has another number of cells than the header."""
+        delimiter = self._head.delimiter
+        for line, text in self._records():
+            # Counted and not split: a damaged line may hold millions.
+            plain = '"' not in text
+            count = text.count(delimiter) + 1 if plain else len(self._cells(line, text))
+            if count != len(self.names):
+                problem = f"{count} cell{'' if count == 1 else 's'}, expected"
+                problem += f" {len(self.names)} as in the header in line {self._head.number}"
+                if not self._head.is_fitting:
+                    problem += "; no line of names stands right above rows of as many cells"
+                return wrong(self.path, problem, f"line {line}")
+        return wrong(self.path, "holds no rows that can be read, expected rows of numbers")
 
     def _record(self, row: int) -> tuple[int, list[str]]:
+        """A row's line and cells."""
         # From the top each time: only a message asks for one, and an index of all rows would be as
         # large as the log.
-        return next(itertools.islice(self._records(), row, None))
+        line, text = next(itertools.islice(self._records(), row, None))
+        return line, self._cells(line, text)
 
-    def _records(self) -> Iterator[tuple[int, list[str]]]:
-        """Each row's line and cells. Blank lines are passed over, as in pyarrow's reader."""
-        delimiter, first = self._head.delimiter, self._head.first_line
+    def _records(self) -> Iterator[tuple[int, str]]:
+        """Each row's line and text. Blank lines are passed over, as in pyarrow's reader."""
         # newline: what else Python takes for the end of a line, no spreadsheet and no pyarrow does.
         lines = io.TextIOWrapper(io.BytesIO(self._rows), "utf-8", newline="\n")
-        if not self._has_quotes:
-            for number, line in enumerate(lines, first):
-                if not _is_blank(line, delimiter):
-                    yield number, line.rstrip("\n").split(delimiter)
-            return
-        reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=True, strict=True)
-        # The line where a record starts, not where it ends: a quoted cell may span several.
-        start = first
+        for number, line in enumerate(lines, self._head.first_line):
+            if not _is_blank(line, self._head.delimiter):
+                yield number, line.rstrip("\n")
+
+    def _cells(self, line: int, text: str) -> list[str]:
+        delimiter = self._head.delimiter
+        if '"' not in text:
+            return text.split(delimiter)
         try:
-            for cells in reader:
-                if cells and not (len(cells) == 1 and _is_blank(cells[0], delimiter)):
-                    yield start, cells
-                start = first + reader.line_num
+            return next(csv.reader([text], delimiter=delimiter, skipinitialspace=True, strict=True))
         except csv.Error as e:
-            problem = "a quotation mark that closes nothing or is never closed, expected numbers"
-            raise wrong(self.path, problem, f"line {start}") from e
+            problem = "a quotation mark is not closed in its line, expected numbers"
+            raise wrong(self.path, problem, f"line {line}") from e
 
 
 type _Column = tuple[np.ndarray | int, int, int]

@@ -8,17 +8,17 @@ never lets it end, and it reads one message at a time.
 import array
 import hashlib
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
 from heli_jax.finding import note
 from heli_jax.flights import progress
-from heli_jax.flights.log import ChannelLog, Topic, require_samples, sharing_clocks
-from heli_jax.flights.table import wrong
+from heli_jax.flights.log import ChannelLog, Topic, require_samples, wrong
 from heli_jax.regular_file import read_regular
 
 # The first message of a log is the format of formats: two bytes with which every message begins,
@@ -39,8 +39,8 @@ FIELDS: dict[str, tuple[str, float | None]] = {
     "L": ("<i4", 1e-7), "d": ("<f8", None), "M": ("<i1", None), "q": ("<i8", None),
     "Q": ("<u8", None),
 }  # fmt: skip
-_FEWEST_ROWS = 10
-"""of a message, from which on a time that is out of order stands out"""
+_APART = 1.0
+"""s before and after the board's time that a message may have some"""
 # New firmware counts microseconds, old firmware milliseconds.
 # In old firmware's message GPS TimeMS is the time of the week, and T the board's.
 _CLOCKS = {"TimeUS": 1e-6, "TimeMS": 1e-3, "T": 1e-3}
@@ -94,13 +94,31 @@ class Part(NamedTuple):
     rows: np.ndarray
 
 
-class _Table(NamedTuple):
-    """The messages of a topic, by one description or by several that were made one."""
+class _Messages(NamedTuple):
+    """Messages of one name in the file's order, by one description or by several.
+
+    Attributes:
+        name: of the topic.
+        at: where each message stands in the file (M,).
+        columns: their fields (M,), numbers as what they mean.
+        clocks: the fields that may be the time.
+        units: by field.
+    """
 
     name: str
-    form: Format
-    rows: np.ndarray
-    units: Mapping[str, str]
+    at: np.ndarray
+    columns: Mapping[str, np.ndarray]
+    clocks: tuple[str, ...] = ()
+    units: Mapping[str, str] = MappingProxyType({})
+
+    def seconds(self, clock: str) -> np.ndarray:
+        """The times (M,) [s] of a clock."""
+        return self.columns[clock] * _CLOCKS[clock]
+
+    def rows(self, kept: np.ndarray) -> "_Messages":
+        """Return the messages of a mask or of row numbers."""
+        columns = {name: values[kept] for name, values in self.columns.items()}
+        return self._replace(at=self.at[kept], columns=columns)
 
 
 def open_dataflash(path: Path) -> ChannelLog:
@@ -212,29 +230,35 @@ def make_log(
     path: str, data: bytes, parts: Sequence[Part], damaged: int, scaled: bool = False
 ) -> ChannelLog:
     """The log that messages make."""
-    alone = {name: _joined([p for p in parts if p.form.name == name], scaled) for name in _OF_LOG}
+    of_name: dict[str, list[Part]] = {}
+    for part in parts:
+        of_name.setdefault(part.form.name, []).append(part)
+    alone = {name: _joined(name, of_name.get(name, ()), scaled) for name in _OF_LOG}
     units = _units(parts, alone)
-    tables = []
-    for name in dict.fromkeys(p.form.name for p in parts):
-        if name not in _OF_LOG:
-            tables += _tables(name, [p for p in parts if p.form.name == name], units, scaled)
-    board = _board_time(tables)
+    topics_of = [
+        each
+        for name, of_one in of_name.items()
+        if name not in _OF_LOG
+        for each in _topics_of(name, of_one, units, scaled)
+    ]
+    # The board's clock is that of the most messages of those with one time that is no GPS time.
+    certain = [m for m in topics_of if len(m.clocks) == 1 and "Week" not in m.columns]
+    board = None
+    if certain:
+        most = max(certain, key=lambda m: m.at.size)
+        board = most.seconds(most.clocks[0])
     topics = []
-    for table in tables:
-        clock = _clock(table, board)
-        for called, rows in _by_instance(table).items():
-            kept = _in_order(clock, rows)
-            damaged += rows.size - kept.size
-            topics.append(_topic(called, table, kept, clock, scaled))
+    for messages in topics_of:
+        clock = _clock(messages, board)
+        topics += [_topic(each, clock) for each in _by_instance(messages)]
     require_samples(path, topics)
     notes = []
     if damaged:
         words = f"{damaged} damaged place{'' if damaged == 1 else 's'} skipped"
         notes.append(note("damage.skipped", words, value=damaged))
     # The firmware names itself when it begins to log; messages of the flight may quote anything.
-    said = alone["MSG"].rows
-    texts = map(_text, said["Message"][:50] if "Message" in (said.dtype.names or ()) else ())
-    settings = _pairs(alone["PARM"].rows, "Name", "Value")
+    texts = map(_text, alone["MSG"].columns.get("Message", np.array([], "S1"))[:50])
+    settings = _pairs(alone["PARM"].columns, "Name", "Value")
     return ChannelLog(
         path=path,
         format="dataflash",
@@ -247,70 +271,45 @@ def make_log(
     )
 
 
-def _tables(
+def _topics_of(
     name: str, parts: Sequence[Part], units: Mapping[int, dict[str, str]], scaled: bool
-) -> list[_Table]:
-    """The messages of a name as tables: one, but where a new description has another clock or
+) -> Iterator[_Messages]:
+    """The messages of a name as topics: one, but where a new description has another clock or
     another unit."""
     groups: list[tuple[list[Part], dict[str, str]]] = []
     for part in parts:
         said = units.get(id(part), {})
         for group, known in groups:
-            clocks = [set(_CLOCKS) & set(p.form.columns) for p in (group[0], part)]
-            if clocks[0] == clocks[1] and all(known.get(c, u) == u for c, u in said.items()):
+            same = _clocks(group[0].form) == _clocks(part.form)
+            if same and all(known.get(c, u) == u for c, u in said.items()):
                 group.append(part)
                 known |= said
                 break
         else:
             groups.append(([part], dict(said)))
-    made = []
     for i, (group, said) in enumerate(groups):
-        joined = _joined(group, scaled)
-        made.append(_Table(f"{name}#{i + 1}" if i else name, joined.form, joined.rows, said))
-    return made
+        messages = _joined(f"{name}#{i + 1}" if i else name, group, scaled)
+        yield messages._replace(clocks=_clocks(group[0].form), units=said)
 
 
-def _joined(parts: Sequence[Part], scaled: bool) -> Part:
-    """Messages of one name in the file's order, by the columns of all of its descriptions; numbers
-    that one lacks are NaN."""
-    if not parts:
-        return Part(Format("", "", ()), -1, 0, np.zeros(0, np.int64), np.zeros(0, []))
-    if len(parts) == 1:
-        return parts[0]
-    kinds: dict[str, set[str]] = {}
-    for part in parts:
-        for column, kind in zip(part.form.columns, part.form.kinds, strict=True):
-            kinds.setdefault(column, set()).add(kind)
-    letters, types = [], []
-    for column, letter in kinds.items():
-        have = [p.rows.dtype[column] for p in parts if column in p.form.columns]
-        is_text = any(t.kind == "S" for t in have)
-        # Numbers of several kinds are made what they mean before they stand in one column.
-        letters.append(letter.copy().pop() if len(letter) == 1 else "Z" if is_text else "d")
-        same = len(set(have)) == 1 and (is_text or len(have) == len(parts))
-        types.append(have[0] if same else np.dtype("S64" if is_text else "<f8"))
-    form = Format(parts[0].form.name, "".join(letters), tuple(kinds))
-    rows = np.zeros(sum(p.rows.size for p in parts), list(zip(kinds, types, strict=True)))
-    begin = 0
-    for part in parts:
-        own = dict(zip(part.form.columns, part.form.kinds, strict=True))
-        block = slice(begin, begin := begin + part.rows.size)
-        for column, letter in zip(form.columns, letters, strict=True):
-            if column not in own:
-                if rows.dtype[column].kind == "f":
-                    rows[column][block] = np.nan
-                continue
-            values = part.rows[column]
-            if letter != own[column] and not scaled:
-                values = _multiplied(values, FIELDS[own[column]][1])
-            # Text and numbers, or an array and a number, are not made one another.
-            if values.shape[1:] == rows[column].shape[1:] and (
-                (values.dtype.kind == "S") == (rows.dtype[column].kind == "S")
-            ):
-                rows[column][block] = values
-    at = np.concatenate([p.at for p in parts])
-    order = np.argsort(at, kind="stable")
-    return Part(form, parts[-1].number, parts[0].since, at[order], rows[order])
+def _joined(name: str, parts: Sequence[Part], scaled: bool) -> _Messages:
+    """Messages by the fields of all of their descriptions; numbers that one lacks are NaN."""
+
+    def values(part: Part, field: str) -> np.ndarray:
+        kind = dict(zip(part.form.columns, part.form.kinds, strict=True)).get(field)
+        if kind is None:
+            return np.full(part.at.size, np.nan)
+        stored = part.rows[field]
+        return stored if scaled else _multiplied(stored, FIELDS[kind][1])
+
+    at = np.concatenate([np.zeros(0, np.int64), *(p.at for p in parts)])
+    order, columns = np.argsort(at, kind="stable"), {}
+    for field in dict.fromkeys(c for p in parts for c in p.form.columns):
+        have = [values(part, field) for part in parts]
+        # Text and numbers, or an array and a number, are not made one another.
+        if len({(x.ndim, x.dtype.kind == "S") for x in have}) == 1:
+            columns[field] = have[0] if len(have) == 1 else np.concatenate(have)[order]
+    return _Messages(name, at[order], columns)
 
 
 def _multiplied(values: np.ndarray, factor: float | None) -> np.ndarray:
@@ -320,12 +319,12 @@ def _multiplied(values: np.ndarray, factor: float | None) -> np.ndarray:
     return values / round(1.0 / factor) if factor < 1.0 else values * factor
 
 
-def _by_instance(table: _Table) -> dict[str, np.ndarray]:
-    """The rows of each instance, where the log says which field counts them."""
-    instance = next((c for c, unit in table.units.items() if unit == "#"), None)
-    if instance is None:
-        return {table.name: table.rows}
-    numbers = table.rows[instance]
+def _by_instance(messages: _Messages) -> list[_Messages]:
+    """The messages of each instance, where the log says which field counts them."""
+    instance = next((c for c, unit in messages.units.items() if unit == "#"), None)
+    if instance is None or instance not in messages.columns:
+        return [messages]
+    numbers = messages.columns[instance]
     # In text a count is read as any number is.
     whole = numbers.dtype.kind in "iu" or (
         numbers.dtype.kind == "f"
@@ -335,95 +334,67 @@ def _by_instance(table: _Table) -> dict[str, np.ndarray]:
     counts = np.unique(numbers).astype(np.int64) if whole else ()
     # A name without an index is what the user of a single sensor expects.
     if not len(counts) or (len(counts) == 1 and not counts[0]):
-        return {table.name: table.rows}
-    return {f"{table.name}[{i}]": table.rows[numbers == i] for i in counts}
+        return [messages]
+    name = messages.name
+    return [messages.rows(numbers == i)._replace(name=f"{name}[{i}]") for i in counts]
 
 
-def _in_order(clock: str, table: np.ndarray) -> np.ndarray:
-    """The rows without single ones whose time lies outside of those around them, as where a log was
-    cut off in a message: where the others are in order, and these are few."""
-    if not clock or table.size < _FEWEST_ROWS:
-        return table
-    times = table[clock].astype(np.float64)
-    back = np.flatnonzero(np.diff(times) < 0) + 1
-    if not 0 < back.size <= max(1, table.size // 1000):
-        return table
-    # A row before which the times go back is the wrong one, or the one before it is: whichever
-    # leaves the others in order.
-    wrong_rows = [
-        row if row + 1 == table.size or times[row + 1] >= times[row - 1] else row - 1
-        for row in back
-    ]
-    kept = np.delete(table, wrong_rows)
-    return kept if np.all(np.diff(kept[clock].astype(np.float64)) >= 0) else table
-
-
-def _clocks(table: _Table) -> list[str]:
+def _clocks(form: Format) -> tuple[str, ...]:
     """The fields that may be the time; some firmware puts it behind the instance."""
-    return [
-        c
-        for c, kind in zip(table.form.columns, table.form.kinds, strict=True)
-        if c in _CLOCKS and (kind in "IQ" or c != "T")
-    ]
+    named = zip(form.columns, form.kinds, strict=True)
+    return tuple(c for c, kind in named if c in _CLOCKS and (kind in "IQ" or c != "T"))
 
 
-def _board_time(tables: Sequence[_Table]) -> tuple[float, float] | None:
-    """First and last time [s] by the board's clock: that of the message with the most rows of
-    those with one time that is no GPS time."""
-    certain = [t for t in tables if len(_clocks(t)) == 1 and "Week" not in t.form.columns]
-    if not certain:
-        return None
-    most = max(certain, key=lambda t: t.rows.size)
-    times = most.rows[(clock := _clocks(most)[0])] * _CLOCKS[clock]
-    return float(np.nanmin(times)), float(np.nanmax(times))
-
-
-def _clock(table: _Table, board: tuple[float, float] | None) -> str:
-    """The field with the board's time: of GPS.TimeMS, a time of week, and GPS.T the one that shares
-    the other messages' time. Empty where there is none."""
-    clocks = _clocks(table)
-    if board is None or (len(clocks) < 2 and "Week" not in table.form.columns):
+def _clock(messages: _Messages, board: np.ndarray | None) -> str:
+    """The field with the board's time [s]: of GPS.TimeMS, a time of week, and GPS.T the one that
+    shares the other messages' time. Empty where there is none."""
+    clocks = messages.clocks
+    if board is None or (len(clocks) < 2 and "Week" not in messages.columns):
         return next(iter(clocks), "")
-    return next(iter(sharing_clocks({c: table.rows[c] * _CLOCKS[c] for c in clocks}, board)), "")
+    first, last = float(np.nanmin(board)), float(np.nanmax(board))
+    for clock in clocks:
+        times = messages.seconds(clock)
+        if np.mean((times >= first - _APART) & (times <= last + _APART)) > 0.5:
+            return clock
+    return ""
 
 
-def _topic(name: str, table: _Table, rows: np.ndarray, clock: str, scaled: bool) -> Topic:
-    columns, named, units = {}, {}, table.units
-    for column, kind in zip(table.form.columns, table.form.kinds, strict=True):
-        values, factor = rows[column], FIELDS[kind][1]
+def _topic(messages: _Messages, clock: str) -> Topic:
+    columns, units, name = {}, {}, messages.name
+    for column, values in messages.columns.items():
         # Text is no signal: a mode that is written as its name cannot be an input or an output.
         if values.dtype.kind == "S":
             continue
-        values = values if scaled else _multiplied(values, factor)
         parts = {f"[{i}]": values[:, i] for i in range(values.shape[1])} if values.ndim > 1 else {}
         for end, part in (parts or {"": values}).items():
             columns[f"{name}.{column}{end}"] = part
-            if units.get(column, "#") != "#":
-                named[f"{name}.{column}{end}"] = units[column]
+            if messages.units.get(column, "#") != "#":
+                units[f"{name}.{column}{end}"] = messages.units[column]
     # Without a clock the rows have their order alone, which `clock` says by being empty.
-    times = rows[clock] * _CLOCKS[clock] if clock else np.arange(len(rows), dtype=np.float64)
-    return Topic(name, times, columns, named, clock)
+    times = messages.seconds(clock) if clock else np.arange(messages.at.size, dtype=np.float64)
+    return Topic(name, times, columns, units, clock)
 
 
-def _units(parts: Sequence[Part], alone: Mapping[str, Part]) -> dict[int, dict[str, str]]:
+def _units(parts: Sequence[Part], alone: Mapping[str, _Messages]) -> dict[int, dict[str, str]]:
     """The units of each description's fields, by the id of its part; `#` is that of a count of
     instances."""
-    stated = alone["FMTU"]
-    if not {"FmtType", "UnitIds"} <= set(stated.rows.dtype.names or ()):
+    stated = alone["FMTU"].columns
+    if not {"FmtType", "UnitIds"} <= set(stated):
         return {}
-    labels = _pairs(alone["UNIT"].rows, "Id", "Label")
-    factors = _pairs(alone["MULT"].rows, "Id", "Mult")
+    labels = _pairs(alone["UNIT"].columns, "Id", "Label")
+    factors = _pairs(alone["MULT"].columns, "Id", "Mult")
     units: dict[int, dict[str, str]] = {}
     # A unit is told in three messages: FMTU has a letter for each field of a format, UNIT says
     # which unit the letter is, MULT what the field's number has to be multiplied with.
-    for row, at in zip(stated.rows, stated.at, strict=True):
-        of_number = [p for p in parts if p.number == int(row["FmtType"])]
+    ids = zip(stated["FmtType"], stated["UnitIds"], alone["FMTU"].at, strict=True)
+    for row, (number, unit_ids, at) in enumerate(ids):
+        of_number = [p for p in parts if p.number == int(number)]
         # Of several descriptions it is about the one that holds there.
         part = next((p for p in reversed(of_number) if p.since <= at), next(iter(of_number), None))
         if part is None:
             continue
-        marks = _text(bytes(row["UnitIds"]))
-        scales = _text(bytes(row["MultIds"])) if "MultIds" in row.dtype.names else ""
+        marks = _text(bytes(unit_ids))
+        scales = _text(bytes(stated["MultIds"][row])) if "MultIds" in stated else ""
         found = units[id(part)] = {}
         # By the letters of the format, since text has whole numbers as any other.
         for i, (column, kind) in enumerate(
@@ -451,22 +422,21 @@ def _unit(mark: str, labels: dict[str, object], scale: object, kind: str) -> str
     return prefix + label if is_count and label in ("s", "m", "V", "A", "Hz") else label
 
 
-def _pairs(table: np.ndarray, key: str, value: str) -> dict[str, object]:
+def _pairs(columns: Mapping[str, np.ndarray], key: str, value: str) -> dict[str, object]:
     """A column by another; of text both without what stands behind the end, ids as letters."""
-    if not {key, value} <= set(table.dtype.names or ()):
+    if not {key, value} <= set(columns):
         return {}
     pairs = {}
-    for row in table:
-        entry = row[value]
+    for mark, entry in zip(columns[key], columns[value], strict=True):
         # Ids are letters that are stored as signed bytes, and a damaged one may be negative. In
         # text they stand as numbers.
-        if isinstance(row[key], bytes):
-            mark = _text(row[key])
-        elif np.isfinite(row[key]):
-            mark = chr(int(row[key]) & 0xFF)
+        if isinstance(mark, bytes):
+            letter = _text(mark)
+        elif np.isfinite(mark):
+            letter = chr(int(mark) & 0xFF)
         else:
             continue
-        pairs[mark] = _text(entry) if isinstance(entry, bytes) else float(entry)
+        pairs[letter] = _text(entry) if isinstance(entry, bytes) else float(entry)
     return pairs
 
 

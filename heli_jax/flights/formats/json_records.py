@@ -13,16 +13,15 @@ from typing import Any
 import numpy as np
 
 from heli_jax.finding import LEFT_OUT, note
+from heli_jax.flights.clock import is_date, seconds_of_dates
 from heli_jax.flights.formats.arrays import ArrayTable, DataSets
-from heli_jax.flights.table import Budget, listed, shown, wrong
-from heli_jax.flights.time_units import is_date, seconds_of_dates
+from heli_jax.flights.log import Budget, listed, shown, wrong
 from heli_jax.regular_file import read_regular
 
 _LARGEST = 500 * 10**6
 _OBJECTS = {b",": 32, b"[": 64, b"{": 200, b'"': 30}
 """bytes of memory that Python takes for what begins or ends with each of these"""
 _MOST_COLUMNS = 10_000
-_MOST_TEXTS = 100
 _DEEPEST = 8
 _LONGEST_LIST = 16
 """numbers of a list within a sample"""
@@ -135,10 +134,7 @@ def _add(sets: DataSets, name: str, values: list[Any], texts: list[str]) -> None
             if not isinstance(seconds, int):
                 sets.add(name, seconds, {"units": "s"})
                 return
-        if len(values) <= _MOST_TEXTS:
-            sets.add_texts(name, values)
-        else:
-            texts.append(name)
+        texts.append(name)
         return
     sets.budget.take(8 * len(values))
     try:

@@ -13,7 +13,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ from heli_jax.flights.formats.arrays import (
     holds_numbers,
     text_of,
 )
-from heli_jax.flights.table import Budget, listed, shown, wrong
+from heli_jax.flights.log import Budget, listed, shown, wrong
 from heli_jax.regular_file import read_regular
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -47,11 +47,8 @@ _BESIDE = 10**9
 """bytes for Python and its libraries"""
 _COPIES = 4
 """times that numbers may be in memory while they are unpacked"""
-_MOST_REFERENCES = 1000
-"""of an array of references that are followed"""
 _DEEPEST = 10
-"""groups, structures and references within one another"""
-_LONGEST_TEXT = 1000
+"""groups and structures within one another"""
 _NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
 """the name that NetCDF 4 gives to a dimension without values, which stands in the file as zeros"""
 
@@ -176,10 +173,6 @@ def _matlab(path: Path, sets: DataSets) -> None:
         kind = value.dtype
         if kind.names and "_Class" in kind.names:
             objects[name] = str(value.ravel()[0]["_Class"])  # a table, a timetable, ...
-        elif kind.kind == "U":
-            texts = [text.strip("\0 ") for text in value.ravel()[:MOST_ELEMENTS].tolist()]
-            texts = [text for text in texts if len(text) <= _LONGEST_TEXT]
-            sets.labels |= dict(zip(_indexed(name, len(texts)), texts, strict=True))
         elif kind.names or kind.kind == "O":
             # Structures, or cells; in MATLAB's order, the columns first.
             elements = value.ravel("F")[:MOST_ELEMENTS]
@@ -188,7 +181,7 @@ def _matlab(path: Path, sets: DataSets) -> None:
                     take(f"{path}.{field}", element[field], depth + 1)
                 if not kind.names:
                     take(path, element, depth + 1)
-        else:
+        elif kind.kind != "U":
             sets.add(name, value, {})
 
     for name, value in loadmat(path).items():
@@ -210,87 +203,61 @@ def _indexed(name: str, count: int) -> list[str]:
     return [name] if count == 1 else [f"{name}[{i}]" for i in range(min(count, MOST_ELEMENTS))]
 
 
-class _Hdf5:
-    """The walk through a file. A structure of MATLAB has the path that it has in older versions:
-    the elements of cells and of arrays of structures are kept in a group `#refs#`, by names that
-    mean nothing, and are visited where they are referred to."""
+def _hdf5(path: Path, sets: DataSets, between: str = "/") -> None:
+    """The numbers of a file by the path of groups that leads to them, `log/roll`."""
+    import h5py as library  # pyright: ignore[reportMissingImports]
 
-    # Any: h5py's classes have no annotations.
-    def __init__(self, path: Path, sets: DataSets, is_matlab: bool) -> None:
-        import h5py  # pyright: ignore[reportMissingImports]
+    h5py: Any = library  # whose classes have no annotations
+    seen: set[int] = set()
 
-        self.path, self.sets, self.is_matlab, self.h5py = path, sets, is_matlab, h5py
-        self.seen: set[int] = set()
-        with h5py.File(path, "r") as file:
-            self.visit(file, "", 0)
-            for name in list(file.attrs)[:MOST_ELEMENTS]:
-                value = np.asarray(file.attrs[name])
-                # Single numbers, such as a rate.
-                if value.size == 1 and value.dtype.kind in "iuf" and name not in file:
-                    sets.add(name, np.float64(value).reshape(1), {})
-
-    def visit(self, item: Any, name: str, depth: int) -> None:
+    def visit(item: Any, name: str, depth: int) -> None:
         """A group with all that is in it, or a data set; each object once, whatever leads to it."""
-        address = self.h5py.h5o.get_info(item.id).addr
-        if address in self.seen or depth > _DEEPEST:
+        address = h5py.h5o.get_info(item.id).addr
+        if address in seen or depth > _DEEPEST:
             return
-        self.seen.add(address)
-        if isinstance(item, self.h5py.Dataset):
-            self.data_set(item, name, depth)
-        if not isinstance(item, self.h5py.Group):
-            return
-        for key in item:
+        seen.add(address)
+        if isinstance(item, h5py.Dataset):
+            _data_set(path, sets, item, name)
+        for key in item if isinstance(item, h5py.Group) else ():
             link = item.get(key, getlink=True)
             # Of a damaged file a name need be no text.
             leaf = key if isinstance(key, bytes) else key.encode("utf-8", "surrogateescape")
             leaf = leaf.decode("utf-8", "replace")
-            if isinstance(link, self.h5py.ExternalLink):
+            if isinstance(link, h5py.ExternalLink):
                 problem = f"links to another file, {shown(link.filename)}: expected all data in one"
-                raise wrong(str(self.path), problem, shown(leaf))
-            if isinstance(link, self.h5py.HardLink) and not (self.is_matlab and leaf[:1] == "#"):
-                between = "." if self.is_matlab else "/"
-                self.visit(item[key], f"{name}{between}{leaf}" if name else leaf, depth + 1)
+                raise wrong(str(path), problem, shown(leaf))
+            # MATLAB keeps cells and arrays of structures in a group of its own, by numbers.
+            if isinstance(link, h5py.HardLink) and not leaf.startswith("#"):
+                visit(item[key], f"{name}{between}{leaf}" if name else leaf, depth + 1)
 
-    def data_set(self, item: Any, name: str, depth: int) -> None:
-        """Take in one data set: texts, references or numbers."""
-        sets, size, kind = self.sets, int(item.size or 0), item.dtype
-        matlab_class = text_of(item.attrs.get("MATLAB_class", ""))
-        if matlab_class == "char":
-            if 0 < size <= _LONGEST_TEXT:
-                sets.labels[name] = "".join(map(chr, np.ravel(self.content(item))))
-        elif kind.kind == "O" and self.h5py.check_ref_dtype(kind) is not None:
-            if not self.is_matlab or not 0 < size <= _MOST_REFERENCES:
-                return
-            parent, _, field = name.rpartition(".")
-            # A cell has elements by itself, of structures each field has all elements'.
-            is_cell = bool(matlab_class) or not parent
-            for i, reference in enumerate(np.ravel(self.content(item))):
-                path = f"{name}[{i}]" if is_cell else f"{parent}[{i}].{field}"
-                if reference:
-                    self.visit(item.file[reference], path, depth + 1)
-        elif kind.kind in "SO":
-            if 0 < size <= MOST_ELEMENTS and kind.itemsize <= _LONGEST_TEXT:
-                texts: Sequence[Any] = list(np.ravel(self.content(item)))
-                if all(isinstance(t, bytes | str) and len(t) <= _LONGEST_TEXT for t in texts):
-                    sets.add_texts(name, texts)
-        elif not holds_numbers(kind, item.ndim):
-            sets.leave_out(name, kind, item.shape)
-        elif not text_of(item.attrs.get("NAME", "")).startswith(_NO_VARIABLE):
-            # Of one in pieces a piece is unpacked as a whole.
-            sets.budget.require(int(np.prod(item.chunks or (0,), dtype=object)) * kind.itemsize)
-            sets.budget.require(size * kind.itemsize)
-            # Of other attributes nothing is read: they may be of types that h5py does not know.
-            counting = (*PACKING, *UNIT_ATTRIBUTES)
-            attributes = {n: item.attrs[n] for n in counting if n in item.attrs}
-            for field, values, own in _fields(name, self.content(item), attributes):
-                sets.add(field, values, own)
+    with h5py.File(path, "r") as file:
+        visit(file, "", 0)
+        for name in list(file.attrs)[:MOST_ELEMENTS]:
+            value = np.asarray(file.attrs[name])
+            # Single numbers, such as a rate.
+            if value.size == 1 and value.dtype.kind in "iuf" and name not in file:
+                sets.add(name, np.float64(value).reshape(1), {})
 
-    def content(self, item: Any) -> np.ndarray:
-        """All of a data set. Nothing else here reads one."""
-        if item.is_virtual or item.external:
-            problem = "is kept in another file, expected its numbers in this one"
-            raise wrong(str(self.path), problem, f"data set {shown(str(item.name))}")
-        return np.asarray(item[()])
+
+def _data_set(path: Path, sets: DataSets, item: Any, name: str) -> None:
+    """Take in the numbers of one data set."""
+    size, kind = int(item.size or 0), item.dtype
+    if item.is_virtual or item.external:
+        problem = "is kept in another file, expected its numbers in this one"
+        raise wrong(str(path), problem, f"data set {shown(str(item.name))}")
+    if text_of(item.attrs.get("MATLAB_class", "")) == "char" or kind.kind in "SO":
+        return
+    if not holds_numbers(kind, item.ndim):
+        sets.leave_out(name, kind, item.shape)
+    elif not text_of(item.attrs.get("NAME", "")).startswith(_NO_VARIABLE):
+        # Of one in pieces a piece is unpacked as a whole.
+        sets.budget.require(int(np.prod(item.chunks or (0,), dtype=object)) * kind.itemsize)
+        sets.budget.require(size * kind.itemsize)
+        # Of other attributes nothing is read: they may be of types that h5py does not know.
+        counting = (*PACKING, *UNIT_ATTRIBUTES)
+        attributes = {n: item.attrs[n] for n in counting if n in item.attrs}
+        for field, values, own in _fields(name, np.asarray(item[()]), attributes):
+            sets.add(field, values, own)
 
 
 def _fields(
@@ -312,9 +279,9 @@ def _fields(
 _READERS: dict[str, tuple[str, Any]] = {
     "mat": ("MATLAB file", _matlab),
     "netcdf 3": ("NetCDF file", _netcdf_3),
-    "mat 7.3": ("HDF5 file", lambda path, sets: _Hdf5(path, sets, is_matlab=True)),
-    "netcdf": ("HDF5 file", lambda path, sets: _Hdf5(path, sets, is_matlab=False)),
-    "hdf5": ("HDF5 file", lambda path, sets: _Hdf5(path, sets, is_matlab=False)),
+    "mat 7.3": ("HDF5 file", lambda path, sets: _hdf5(path, sets, ".")),
+    "netcdf": ("HDF5 file", _hdf5),
+    "hdf5": ("HDF5 file", _hdf5),
 }
 """what a file is called, and what reads it, by kind"""
 

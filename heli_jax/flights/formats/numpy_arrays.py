@@ -10,13 +10,12 @@ import numpy as np
 from heli_jax.finding import LEFT_OUT, note
 from heli_jax.flights.formats.arrays import (
     LARGEST,
-    MOST_ELEMENTS,
     ArrayTable,
     DataSets,
     guarded,
     holds_numbers,
 )
-from heli_jax.flights.table import Budget, listed, shown, wrong
+from heli_jax.flights.log import Budget, listed, shown, wrong
 from heli_jax.regular_file import read_regular
 
 MAGIC = b"\x93NUMPY"
@@ -74,8 +73,6 @@ def _add(sets: DataSets, name: str, array: np.ndarray) -> None:
     if array.dtype.names is not None:
         for field in array.dtype.names:
             _add(sets, f"{name}.{field}" if name != "data" else field, array[field])
-    elif kind in "US" and 0 < array.size <= MOST_ELEMENTS:
-        sets.add_texts(name, [str(x)[:1000] for x in array.astype(str).ravel()])
     elif kind in "mM":
         unit, count = np.datetime_data(array.dtype)
         if unit in ("s", "ms", "us", "ns") and count == 1:

@@ -14,8 +14,7 @@ import numpy as np
 
 from heli_jax.finding import note
 from heli_jax.flights import progress
-from heli_jax.flights.log import ChannelLog, Topic, holds_commands, require_samples
-from heli_jax.flights.table import wrong
+from heli_jax.flights.log import ChannelLog, Topic, require_samples, wrong
 from heli_jax.regular_file import read_regular
 
 MAGIC = b"ULog\x01\x12\x35"
@@ -44,6 +43,11 @@ _PARSED = frozenset(b"FIPAB")
 _DATA, _FLAGS = b"DB"
 _HEADER = 16
 """bytes before the first message"""
+
+
+_COMMANDS = ("actuator_", "vehicle_torque_setpoint", "vehicle_thrust_setpoint")
+"""topics whose `timestamp_sample` is that of the gyro's sample that they answer; commands act from
+when they are published"""
 
 
 class _Damaged(Exception):
@@ -335,7 +339,7 @@ def _topics(content: _Content) -> tuple[Topic, ...]:
 
 def _clock(name: str, rows: np.ndarray) -> str:
     names = rows.dtype.names or ()
-    if "timestamp_sample" in names and not holds_commands(name):
+    if "timestamp_sample" in names and not any(topic in name for topic in _COMMANDS):
         stamps = rows["timestamp_sample"]
         # Some modules leave the field at zero, or publish one sample twice.
         if stamps.dtype.kind == "u" and stamps[0] > 0 and np.all(stamps[1:] > stamps[:-1]):

@@ -4,23 +4,17 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from heli_jax.dynamics.disturbance import disturbable
 from heli_jax.finding import Finding, found, note
 from heli_jax.identification.agreement import pooled_metrics
 from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.validation.adequacy import (
     EXPECTED,
     EXPLAINED,
-    FAR_FROM_WHITE,
     GATE,
     WORSE,
     OutputAdequacy,
 )
 from heli_jax.identification.validation.excitation import LEVEL
-from heli_jax.messages import sentence
-
-_DIVERGED = 10.0
-"""times the measured range, beyond which a simulation has left it"""
 
 
 def outputs_explained(c: Context) -> Iterator[Finding]:
@@ -42,33 +36,7 @@ def outputs_explained(c: Context) -> Iterator[Finding]:
             lag1=output.lag1,
             times=np.sqrt(output.against_disturbance or np.nan),
             seconds=c.adequacy.ahead or 0.0,
-            advice=_advice(c, output),
         )
-
-
-def _advice(c: Context, output: OutputAdequacy) -> str:
-    """Advice on an output that is not explained: the most useful step that is not taken yet."""
-    problem, name = c.problem, output.output
-    filtered = problem.noise_model == "disturbance"
-    diverged = any(
-        not np.max(np.abs(r.simulated[name])) <= _DIVERGED * np.nanmax(np.abs(r.measured[name]))
-        for r in c.records
-        if name in r.measured
-    )
-    if problem.window is not None and diverged:
-        return sentence("advice.shorter-windows")
-    # Filter error corrects its states at every sample, and needs no windows.
-    if problem.window is None and (diverged or c.adequacy.unstable) and not filtered:
-        return sentence(
-            "advice.windows",
-            state="" if problem.nuisance.initial_state else "fit.nuisance.initial_state",
-            shift="fit.nuisance.time_shift" if problem.nuisance.time_shift else "",
-        )
-    if output.lag1 > FAR_FROM_WHITE and not filtered:
-        axes = disturbable(problem.model)
-        code = "advice.disturbance" if axes else "advice.other-model"
-        return sentence(code, output=name, lag1=output.lag1, axis=axes[0] if axes else "")
-    return sentence("advice.columns") if output.vaf >= 0 else ""
 
 
 def _why(output: OutputAdequacy, ahead: float | None) -> str:
@@ -147,7 +115,8 @@ def responses_explained(c: Context) -> Iterator[Finding]:
 
 _SURE = 1e-4
 """p value below which a residual that follows the excitation takes all intervals away"""
-WRONG_OPTIMUM = "search.wrong-optimum"
+_DIVERGED = -10.0
+"""VAF of a simulation below which it has left the record"""
 
 
 def residual_follows_excitation(c: Context) -> Iterator[Finding]:
@@ -157,23 +126,21 @@ def residual_follows_excitation(c: Context) -> Iterator[Finding]:
     level, failed = LEVEL / max(len(c.followed), 1), c.failed
     if failed:
         bad = any(not f.explained >= EXPLAINED for f in failed.values())
-        code = "dynamics.residual-follows-excitation"
-        if c.astray:
-            code = "dynamics.residual-follows-inputs" if c.nearly else WRONG_OPTIMUM
         least = min(f.p_value for f in failed.values())
         yield found(
-            code,
+            "dynamics.residual-follows-excitation",
             "doubt",
             *failed,
             value=least,
-            denies=bad or c.astray,
+            denies=bad,
             distrusts=c.at.layout.of_interest if least < _SURE else (),
             what="the excitation" if c.instruments else "the inputs",
             explained=[max(f.explained, 0.0) for f in failed.values()],
             level=level,
         )
-    if c.left_record:
-        yield found("adequacy.simulation-leaves-record", "note", *c.left_record)
+    left = [n for n, m in c.metrics.items() if c.followed and not m.vaf >= _DIVERGED]
+    if left:
+        yield found("adequacy.simulation-leaves-record", "note", *left)
 
 
 def outputs_follow_excitation(c: Context) -> Iterator[Finding]:
@@ -207,8 +174,6 @@ def held_out_predicted(c: Context) -> Iterator[Finding]:
     ]
     if astray:
         yield found("held-out.not-finite", "note", *astray)
-    elif not held.converged:
-        yield found("held-out.nuisances-not-found", "note")
     if held.in_frequency is not None:
         for label in held.in_frequency.not_judged:
             yield found("held-out.not-judged", "note", label, flight=label)

@@ -19,21 +19,19 @@ from heli_jax.identification.estimation.evaluation import Evaluation
 from heli_jax.identification.estimation.filter_error import SECONDS, predictions_ahead
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
-from heli_jax.identification.identifiability.equivalents import Valley, second_solutions
+from heli_jax.identification.identifiability.equivalents import second_solutions
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Signals, Status
 from heli_jax.identification.uncertainty.estimates import (
-    StandardErrors,
     estimates_of,
     flight_nuisances,
     noise_by_name,
-    standard_errors,
     without_disturbance,
 )
+from heli_jax.identification.uncertainty.standard_errors import StandardErrors, standard_errors
 from heli_jax.identification.unknowns.layout import Solution, scales_of
 from heli_jax.identification.validation.adequacy import (
-    EXPLAINED,
     Adequacy,
     Evidence,
     Record,
@@ -64,7 +62,6 @@ from heli_jax.identification.validation.held_out import (
 )
 from heli_jax.identification.validation.logging_rate import (
     FastMode,
-    as_good_as_aliases,
     fast_modes,
     measurement_noise,
 )
@@ -84,16 +81,7 @@ class HeldOut(NamedTuple):
     signals: tuple[Signals, ...] = ()
     free_run: tuple[Signals, ...] = ()
     """with windows: simulated in one piece"""
-    converged: bool = True
-    """whether their initial states and biases were found"""
     in_frequency: HeldOutFrequency | None = None
-
-
-_NEARLY_ALL = 0.9
-"""part explained of each output whose residual follows the inputs, from which on a wrong optimum is
-the less likely cause"""
-_DIVERGED = -10.0
-"""VAF of a simulation below which it has left the record"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,9 +201,7 @@ class Context:
     @cached_property
     def loop(self) -> Loop:
         """Feedback, instruments, and whether somebody holds an unstable vehicle."""
-        wrong = self.astray and not self.nearly
-        asked = bool(self.moved) and not (self.unrelated or wrong)
-        held = asked and any(pole > 0.0 for pole in held_poles(self.at))
+        held = bool(self.moved) and any(pole > 0.0 for pole in held_poles(self.at))
         return Loop(self.feedback, self.instruments, held)
 
     # Whether the model explains the record.
@@ -241,24 +227,6 @@ class Context:
         """Outputs of `followed` that follow by more than chance."""
         level = LEVEL / max(len(self.followed), 1)
         return {n: f for n, f in self.followed.items() if f.p_value < level}
-
-    @property
-    def left_record(self) -> list[str]:
-        """In frequency: outputs whose simulation in time diverges from the record."""
-        return [n for n, m in self.metrics.items() if self.followed and not m.vaf >= _DIVERGED]
-
-    @property
-    def astray(self) -> bool:
-        """In frequency: True if the residual follows the inputs and the simulation diverges, with
-        no better explanation than a wrong optimum."""
-        bad = any(not f.explained >= EXPLAINED for f in self.failed.values())
-        return bool(self.left_record and self.failed) and not (bad or self.instruments)
-
-    @property
-    def nearly(self) -> bool:
-        """True if nearly all that follows the excitation is explained, so that a wrong optimum is
-        unlikely."""
-        return all(f.explained >= _NEARLY_ALL for f in self.failed.values())
 
     @cached_property
     def expected_error(self) -> dict[str, float] | None:
@@ -308,18 +276,10 @@ class Context:
         p_values = {n: f.p_value for n, f in self.excitation.outputs.items()}
         return {} if any(p < LEVEL / len(p_values) for p in p_values.values()) else p_values
 
-    @property
-    def records(self) -> tuple[Record, ...]:
-        """Records compared by flight: measured with simulated, or with predicted ahead."""
-        return self._evidence.records
-
     @cached_property
     def _evidence(self) -> Evidence:
         if not self.ahead:
-            records = tuple(
-                Record(s.flight, flight.dt, s.measured, s.simulated)
-                for s, (_, flight) in zip(self.signals, self.flights, strict=True)
-            )
+            records = tuple(Record(s.flight, s.measured, s.simulated) for s in self.signals)
             expected, unknowns = self.expected_error, self.at.layout.determined
             return Evidence(records, self.metrics, self.whiteness, expected, unknowns)
         # Predictions from the filter's states in place of a simulation.
@@ -327,7 +287,7 @@ class Context:
         for (label, flight), prediction in zip(
             self.flights, predictions_ahead(self.at), strict=True
         ):
-            records.append(Record(label, flight.dt, flight.outputs, prediction.predicted))
+            records.append(Record(label, flight.outputs, prediction.predicted))
             for n, v in prediction.predicted.items():
                 missed = float(np.nansum(np.square(flight.outputs[n] - v)))
                 error[n] = error.get(n, 0.0) + missed
@@ -353,9 +313,7 @@ class Context:
         if not self.fitted:
             return fast_modes(self.problem, {n: f.start for n, f in self.problem.free.items()})
         noise = measurement_noise(self.problem, self.at.noise.sd)
-        fast = fast_modes(self.problem, self.named, noise)
-        valley = Valley(self.problem, self.at, self.e)
-        return as_good_as_aliases(fast, valley) if self.arrived else fast
+        return fast_modes(self.problem, self.named, noise)
 
     @cached_property
     def errors(self) -> StandardErrors:
@@ -440,7 +398,7 @@ class Context:
         if self.arrived:
             feedback = (self.loop.held or self.follows) and not self.instruments
             in_frequency = validate_in_frequency(problem, at, self.e, flights, feedback=feedback)
-        return HeldOut(signals, free_run, checked.converged, in_frequency)
+        return HeldOut(signals, free_run, in_frequency)
 
     @cached_property
     def rounding(self) -> bool:

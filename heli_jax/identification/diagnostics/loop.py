@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 
-from heli_jax.dynamics.model import axes_of
 from heli_jax.finding import Finding, found
 from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.estimation.frequency_instrument import STRONG, instruments_of
@@ -14,7 +13,7 @@ from heli_jax.identification.validation.closed_loop_trust import (
     untrusted,
     weak_by_instrument,
 )
-from heli_jax.identification.validation.follows_response import LEVEL, Feedback
+from heli_jax.identification.validation.follows_response import LEVEL
 
 FEEDBACK = "loop.feedback"
 _HELD = 1.0
@@ -61,7 +60,6 @@ def inputs_follow_response(c: Context) -> Iterator[Finding]:
         late=" and ".join(late),
         free=_frees_a_delay(c.problem, late),
         method=c.problem.method,
-        advised=_advised(c.problem, present),
         level=LEVEL,
     )
 
@@ -71,19 +69,6 @@ def _frees_a_delay(problem: Problem, late: Sequence[str]) -> str:
     own = dict(problem.model.delays)
     asked = problem.nuisance.time_shift or all(own.get(name) in problem.free for name in late)
     return "" if asked or not late else "fit.nuisance.time_shift, or delays of the model"
-
-
-def _advised(problem: Problem, present: Sequence[Feedback]) -> str:
-    """Filter error with a disturbance where the response that is followed is disturbed."""
-    axes, outputs = axes_of(problem.model), {one.output for one in present}
-    own = [axis.name for axis in axes if outputs & {axis.rate, axis.angle}]
-    if not axes:
-        return "method: filter-error and process noise"
-    if len(axes) == 1 or len(own) == 1:
-        name = own[0] if own else axes[0].name
-        return f"method: filter-error with disturbance: {{axis: {name}, poles: 1}}"
-    named = ", ".join(own or [axis.name for axis in axes])
-    return f"method: filter-error with a disturbance of each axis that gusts move ({named})"
 
 
 def moved_by_feedback(c: Context) -> Iterator[Finding]:

@@ -2,14 +2,10 @@
 
 from collections.abc import Iterator
 
-import numpy as np
-
-from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.finding import Finding, found
 from heli_jax.identification.diagnostics.context import Context, no_disturbance
 from heli_jax.identification.estimation.disturbance_search import NO_DISTURBANCE
-from heli_jax.identification.unknowns.layout import disturbance_limits
 
 COLOURED, TOO_NARROW = "noise.residuals-coloured", "noise.intervals-too-narrow"
 _FAR_TOO_NARROW = 0.2
@@ -48,27 +44,11 @@ def residuals_correlated(c: Context) -> Iterator[Finding]:
 
 
 def disturbance_shows(c: Context) -> Iterator[Finding]:
-    """Disturbances that were looked for and do not show, or are not determined."""
+    """Disturbances that were looked for and do not show."""
     if c.optimum is None:
         return
-    layout, ended = c.at.layout, c.at.layout.disturbance
     if no_disturbance(c.optimum):
-        code = "noise.no-disturbance" if c.independent else "noise.other-disturbance"
-        yield found(code, "note", value=c.optimum.ratio)
-        ended = ()
-    # Those that ran to the end of what a record can show.
-    limits = disturbance_limits(layout, c.at.data)
-    for i, name in enumerate(ended):
-        at = float(c.at.z[len(layout.of_interest) + i])
-        low, high = (float(v) for v in limits[name])
-        if low < at < high or name in c.absent:
-            continue
-        # A correlation time shorter than a sample, or longer than the record.
-        short, long = (name not in layout.sigmas and end for end in (at <= low, at >= high))
-        meaning = "white noise" if short else "a random walk" if long else ""
-        unit = naming.unit(layout.model.Params, name) or ""
-        value = f"{np.exp(min(max(at, low), high)):.3g} {unit}".rstrip()
-        yield found("noise.disturbance-open", "note", name, ran_to=value, like=meaning)
+        yield found("noise.no-disturbance", "note", value=c.optimum.ratio)
     names = [d.name for d in disturbances_of(c.at.layout.model) if d.sigma in c.optimum.absent]
     if names:
         yield found("noise.disturbances-absent", "note", *names, limit=NO_DISTURBANCE)

@@ -18,12 +18,9 @@ from heli_jax.identification.validation.shifts import (
     LEAD,
     SHIFT,
     leads,
-    other_hold,
     shift_in_time,
 )
 
-_IN_MS = 2.0
-"""[Hz] at which no flight is logged: 500 Hz or more in ms, read as seconds"""
 _CODES = {
     "input": "timing.late-input",
     "output": "timing.late-output",
@@ -61,12 +58,9 @@ def inputs_late(c: Context) -> Iterator[Finding]:
 
 def signals_shifted(c: Context) -> Iterator[Finding]:
     """Signals at another time, or inputs of the other hold: what explains the record best."""
-    if not c.arrived:
+    if not (c.arrived and c.explains) or c.instruments:
         return
-    shifts = [other_hold(c.problem, c.at, c.e)]
-    if c.explains and not c.instruments and "time_shift" not in c.estimates:
-        shifts.append(shift_in_time(c.problem, c.at, c.e, _outputs_in_doubt(c)))
-    one = max((s for s in shifts if s is not None), key=lambda s: s.gain, default=None)
+    one = shift_in_time(c.problem, c.at, c.e, _outputs_in_doubt(c))
     # A lag that is missing shows in the residual too, and more closely.
     lags = any(x.drive.kind == "input" for x in c.unmodelled[0])
     if one is None or (one.kind == "response" and lags):
@@ -177,8 +171,6 @@ def of_rates(
                 needed=RATE.enough * one.mode.hz,
                 enough=RATE.enough,
                 least=one.least,
-                ms="ms" if severity == "refuse" and one.hz <= _IN_MS else "",
-                steps=one.signals[0] if one.staircase else "",
             )
             bad += [finding] if finding.bad else []
             enough += [(one.samples, finding)]

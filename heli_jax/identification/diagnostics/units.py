@@ -14,7 +14,7 @@ from heli_jax.dynamics.model import Model
 from heli_jax.finding import Finding, found
 from heli_jax.flights.channel_names import no_stick, unit_in_name
 from heli_jax.flights.flight import Flight
-from heli_jax.flights.table import shown
+from heli_jax.flights.log import shown
 from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.validation.signal_signs import (
     AGAINST,
@@ -24,7 +24,6 @@ from heli_jax.identification.validation.signal_signs import (
     inputs_in_other_units,
     oversized,
     rates_and_angles,
-    scaled_by,
     sticks_of,
 )
 
@@ -89,7 +88,7 @@ def rate_against_angle(c: Context) -> Iterator[Finding]:
                     rate,
                     angle,
                     value=1.0 / size,
-                    distrusts=() if c.status == "not-converged" else c.estimates,
+                    distrusts=_estimates(c),
                     low=low,
                     high=high,
                     limit=most,
@@ -107,7 +106,7 @@ def against_file(c: Context) -> Iterator[Finding]:
                     "units.against-file",
                     "doubt",
                     name,
-                    distrusts=_scaled(c, name),
+                    distrusts=_estimates(c),
                     flight=label,
                     unit=signal.unit or "1",
                     stated=shown(signal.contradicted),
@@ -120,26 +119,27 @@ def size_of_angles(c: Context) -> Iterator[Finding]:
     for label, flight in c.flights:
         for finding in in_degrees(c.problem.model, label, flight):
             doubted = finding.code == UNIT_IN_DOUBT and not finding.denies
-            distrusts = _scaled(c, finding.subjects[0]) if doubted else ()
-            yield finding._replace(distrusts=distrusts)
+            yield finding._replace(distrusts=_estimates(c) if doubted else ())
 
 
 def in_degrees(model: Model, label: str, flight: Flight) -> Iterator[Finding]:
     """Angles and rates of a flight that look like degrees read as radians."""
-    for one in oversized(model, flight):
+    for name, size, limit, flown, certain in oversized(model, flight):
+        assert flight.source is not None
+        signal = flight.source.outputs[name]
         yield found(
             # What was flown upside down is in its own unit as likely as not.
-            "units.flown-or-degrees" if one.flown else UNIT_IN_DOUBT,
+            "units.flown-or-degrees" if flown else UNIT_IN_DOUBT,
             "doubt",
-            one.name,
-            value=one.size,
-            denies=one.certain,
+            name,
+            value=size,
+            denies=certain,
             flight=label,
-            unit=one.signal.unit,
-            degrees=one.signal.unit.replace("rad", "deg"),
-            in_degrees=float(np.degrees(one.size)),
-            limit=one.limit,
-            channel=shown(one.signal.name),
+            unit=signal.unit,
+            degrees=signal.unit.replace("rad", "deg"),
+            in_degrees=float(np.degrees(size)),
+            limit=limit,
+            channel=shown(signal.name),
         )
 
 
@@ -155,7 +155,7 @@ def size_of_inputs(c: Context) -> Iterator[Finding]:
             "doubt",
             one.name,
             value=max(one.moved.values()),
-            distrusts=_scaled(c, one.name),
+            distrusts=_estimates(c),
             flight=one.flight,
             channel=shown(signal.name),
             unit=one.unit,
@@ -167,9 +167,9 @@ def size_of_inputs(c: Context) -> Iterator[Finding]:
         )
 
 
-def _scaled(c: Context, name: str) -> tuple[str, ...]:
-    """The parameters that another unit of a signal would change; none before an optimum."""
-    return scaled_by(c.at, name) if c.fitted and c.status != "not-converged" else ()
+def _estimates(c: Context) -> tuple[str, ...]:
+    """The estimates, of which nobody knows which another unit changes; none before an optimum."""
+    return () if c.status == "not-converged" else tuple(c.estimates)
 
 
 def no_sticks(c: Context) -> Iterator[Finding]:

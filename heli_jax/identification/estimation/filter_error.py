@@ -21,7 +21,6 @@ from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import Flight, labels
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.kalman import (
-    SMALL,
     Estimate,
     Innovations,
     begun,
@@ -322,13 +321,9 @@ def filtered_flights(
 ) -> tuple[Innovations, ...]:
     """The innovations of every flight."""
     together: dict[int, Innovations] = {}
-    small = len(naming.names(layout.model.State)) <= SMALL
     for group in layout.one_covariance:
-        # One record of a small model (5 states): written out in rows the exact filter takes four
-        # fifths of the time for a fit, with its compilation (4.9 s for 6.0) or without.
-        if not (small and len(group) == 1):
-            theirs = innovations_together(layout, data, noise, u, group)
-            together |= dict(zip(group, theirs, strict=True))
+        theirs = innovations_together(layout, data, noise, u, group)
+        together |= dict(zip(group, theirs, strict=True))
     for i in set(range(len(data.flights))) - set(together):
         positional, options = _filter_arguments(layout, data, noise, u, i)
         together[i] = innovations(*positional, options)

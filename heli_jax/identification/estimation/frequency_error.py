@@ -17,13 +17,15 @@ are weighed by the response to what of the input follows it: then feedback does 
 Sources: Pintelon and Schoukens (2012), chapters 6, 9 and 10; Klein and Morelli (2006), chapter 7.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Float
 
 from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
@@ -36,31 +38,25 @@ from heli_jax.identification.estimation.frequency_instrument import (
 )
 from heli_jax.identification.estimation.frequency_lines import (
     Driving,
+    Errors,
     FlightFacts,
     Matrices,
-    Record,
     Resolved,
     alike,
-    at_lines,
     basis_of,
-    by_block,
-    by_flight,
-    by_real,
     cut_notes,
+    discretised,
     errors_of_lines,
-    errors_of_some,
+    errors_of_record,
     lines_of,
-    machines_of,
     measured,
     other_outputs,
     parts_of,
     parts_of_group,
-    real,
     records_of,
     resolved,
     shared_of,
-    stacked,
-    states,
+    times,
     with_shared,
     without_parts,
 )
@@ -148,14 +144,14 @@ class FrequencyError(Objective):
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
     ) -> tuple[Float[Array, " q"], Noise]:
         """The spectrum that the errors show, smoothed over frequency and flights."""
-        errors, vehicle = jax.device_get(errors_of_lines(layout, data, noise, z))
+        errors, model = jax.device_get(errors_of_lines(layout, data, noise, z))
         rows = sum(2 * v.size for v in errors)
         freedom = rows / max(rows - len(layout.free), 1)
         errors = [v * freedom**0.5 for v in errors]
         # Powers of errors that overflow have no spectrum.
         with np.errstate(all="ignore"):
             try:
-                whitening = whitening_by(vehicle, errors)
+                whitening = whitening_by(model, errors)
                 sound = all(np.isfinite(W).all() for W in whitening)
             except np.linalg.LinAlgError:
                 sound = False
@@ -248,13 +244,28 @@ _NOTHING = 100.0
 
 
 class Products(NamedTuple):
-    """Rows of whitened errors e (of white noise of variance 1), their derivatives J by the
-    unknowns and instruments Z, all without what the ends of the records may add."""
+    """Products of columns: whitened errors e without what the ends of the records may add, the
+    derivatives J of the response by the unknowns, instruments Z, and what the ends may add Q."""
 
     ee: Float[Array, ""]
     Ze: Float[Array, " q"]
+    """its negative: the derivatives of e are -J"""
     ZZ: Float[Array, "q q"]
     ZJ: Float[Array, "q q"]
+    QZ: Float[Array, "m q"] | None = None
+    QJ: Float[Array, "m q"] | None = None
+
+
+def products(Z: Array, J: Array, e: Array, Q: Array) -> Products:
+    """Products of columns, e being one."""
+    return Products(e @ e, -Z.T @ e, Z.T @ Z, Z.T @ J, Q.T @ Z, Q.T @ J)
+
+
+def projected(of: Products, S: Float[Array, "m m"]) -> Products:
+    """Products with what the ends may add projected out of Z and J, by S that makes an orthonormal
+    basis of Q."""
+    Z, J = (jnp.asarray(S.T @ v) for v in (of.QZ, of.QJ))
+    return Products(of.ee, of.Ze, of.ZZ - Z.T @ Z, of.ZJ - Z.T @ J)
 
 
 def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Float[Array, " r"]:
@@ -275,7 +286,7 @@ def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Floa
 
 
 def _weighed(of: Products) -> tuple[Float[Array, " q"], Float[Array, "q q"]]:
-    """R^-T Z e and R^-T Z J^T, with R^T R = Z Z^T; zero along what is no direction of Z."""
+    """R^-T Z^T e and R^-T Z^T J, with R^T R = Z^T Z; zero along what is no direction of Z."""
     sizes = jnp.sqrt(jnp.maximum(jnp.diagonal(of.ZZ), 0.0))
     # Of one size: units do not decide what is rounding.
     over = jnp.where(sizes > 0, 1.0 / jnp.where(sizes > 0, sizes, 1.0), 0.0)
@@ -286,15 +297,6 @@ def _weighed(of: Products) -> tuple[Float[Array, " q"], Float[Array, "q q"]]:
     return along @ of.Ze, along @ of.ZJ
 
 
-# Products of errors, their derivatives by the unknowns, and instruments, over all lines.
-#
-# With $H = W C (zI - A_d)^{-1}$ the derivative of the whitened response is
-# $H (dA_d X + dB\,U) + W (dC X + dD\,U)$: one product for each line and unknown in place of a
-# solution, of which all unknowns share the first factor.
-#
-# Source: Pintelon and Schoukens (2012), chapter 9.
-
-
 def products_of_lines(
     layout: Layout,
     data: Data,
@@ -302,162 +304,119 @@ def products_of_lines(
     v: Float[Array, " q"],
     unknowns: Callable[[Array], Unknowns],
 ) -> Products:
-    """Over all records. Directly Z = J; by instrument the derivatives of the response to the inputs
-    by instrument.
+    """Products over all records. Directly Z = J; by instrument the derivatives of the response to
+    the inputs by instrument.
 
     Args:
         noise: with the whitening of each record, and whether instruments are used.
+        v: unknowns that all flights share.
     """
-    total = []
+    total, with_instruments = [], data.flights[0].by_instrument is not None
     for members in alike(layout, data):
-        parts = parts_of_group(layout, noise, members)
-        vehicles, slopes = differentiated(
-            lambda v, members=members: machines_of(layout, data, unknowns(v), members), v
-        )
 
-        def ready(matrices: Any, parts: Any = parts) -> Any:
-            return matrices, [resolved(matrices[0], record, W) for record, W in parts]
+        def model(v: Array, members: Any = members, **by: bool) -> tuple[Matrices, Driving]:
+            return discretised(layout, data, unknowns(v), members, **by)
 
-        def of_some(common: Any, some: Any, parts: Any = parts) -> Products:
-            matrices, ats = common
-            made = [
-                _of_record(at, matrices, record, noise.by_instrument, *some)
-                for at, (record, _) in zip(ats, parts, strict=True)
-            ]
-            return jax.tree.map(lambda *v: sum(v), *made)
+        (m, driving), slopes = differentiated(model, v)
+        by = None
+        if with_instruments:
+            by = differentiated(functools.partial(model, by_instrument=True), v)
+        y = measured(layout, data, members)
+        for record, W in parts_of_group(layout, noise, members):
+            at = resolved(m, record, W)
+            e = errors_of_record(at, m, driving, y)
+            total.append(_of_record(at, e, ((m, driving), slopes), by, noise.by_instrument))
+    return jax.tree.map(lambda *p: sum(p), *total)
 
-        direct = (vehicles.driving, slopes.driving)
-        by = None if vehicles.by is None else (vehicles.by, slopes.by)
-        each = (direct, by, measured(layout, data, members))
-        common = (vehicles.matrices, slopes.matrices)
-        made = by_flight(data, members, ready, of_some, common, each)
-        total.append(jax.tree.map(lambda v: jnp.sum(v, axis=0), made))
-    return jax.tree.map(lambda *v: sum(v), *total)
+
+type _Differentiated = tuple[tuple[Matrices, Driving], tuple[Matrices, Driving]]
+"""a model with what drives it, and the derivatives of both by the unknowns, a last axis; None in
+place of those that are zero"""
 
 
 def _of_record(
     at: Resolved,
-    matrices: tuple[Matrices, Matrices],
-    record: Record,
+    e: Errors,
+    direct: _Differentiated,
+    by: _Differentiated | None,
     by_instrument: Array,
-    direct: tuple[Driving, Driving],
-    by: tuple[Driving, Driving] | None,
-    y: Float[Array, "f N p"],
 ) -> Products:
-    """Rows of one record of a few flights, with a leading axis.
+    """Products over one record of all flights of a group."""
 
-    Args:
-        direct: what drives the vehicles, and its derivatives by the unknowns.
-        by: the same by instrument.
-    """
-    m, dm = matrices
-    e = errors_of_some(at, m, record, direct[0], y)
-
-    def blocks(v: Array) -> Array:
-        lines = at_lines(record, v.reshape(*v.shape[:2], -1))
-        return by_block(lines.reshape(*lines.shape[:2], *v.shape[2:]), len(at.z), axis=1)
-
-    own = (e.rows, e.X, *jax.tree.map(blocks, (direct, by)))
-    # What passes a vehicle by, without its states, hangs on no unknown of most.
-    passes = any(v is not None for v in (dm.C, dm.D, direct[1].held))
+    def at_lines(of: _Differentiated) -> Any:
+        # Flights behind blocks (b, f, k, ...).
+        signals = (of[0][1], of[1][1])
+        return jax.tree.map(lambda v: jnp.moveaxis(at.lines(v), -1, 1), signals)
 
     # Block by block: the derivatives at all lines would leave every cache.
-    def gram(of: Any) -> Float[Array, "f r c"]:
-        (z, W, H, ends), own = of
-        Q = basis_of(H, ends)
-        H, W = real(H), real(W) if passes else None
+    def of_block(of: Any) -> Products:
+        (W, R, H, effects), own = of
+        Q = basis_of(H, effects)
 
-        def of_one(one: tuple[Array, Array, Any, Any]) -> Array:
-            e, X, direct, by = one
-            J = _slopes(H, W, matrices, X, direct)
+        def of_flight(one: Any) -> Products:
+            e, X, direct_lines, by_lines = one
 
-            # One product of tall matrices in place of several: each is read once.
-            def products(Z: Array, *right: Array) -> Array:
-                left = jnp.concatenate([Z, e[:, None], Q], axis=1)
-                return left.T @ jnp.concatenate([*right, e[:, None]], axis=1)
+            def directly() -> Products:
+                J = _slopes(H, W, X, direct, direct_lines)
+                return products(J, J, e, Q)
 
-            def directly() -> Array:
-                G = products(J, J)
-                return jnp.concatenate([G[:, :-1], G], axis=1)
-
-            def with_instruments() -> Array:
+            def with_instruments() -> Products:
+                J = _slopes(H, W, X, direct, direct_lines)
                 # The states are those of the inputs alone: such a record has no ends.
-                X = states(at, z, by_real(by[0].U, m.B.T)[None])[0]
-                Z = _slopes(H, W, matrices, X, by)
-                return products(Z, J, Z)
+                of_inputs = times(R, by_lines[0].U @ by[0][0].B.T)
+                return products(_slopes(H, W, of_inputs, by, by_lines), J, e, Q)
 
             if by is None:
                 return directly()
             # One program for both: the direct estimate is where the search begins.
             return jax.lax.cond(by_instrument > 0.5, with_instruments, directly)
 
-        return jax.lax.map(of_one, own)
+        return jax.lax.map(of_flight, own)
 
-    G = jnp.sum(jax.lax.map(gram, ((at.z, at.W, at.H, at.ends), own)), axis=0)
-    return jax.vmap(lambda one: projected(one, at.S))(G)
+    rows, X = (jnp.moveaxis(v, -1, 1) for v in (e.rows, e.X))
+    own = (rows, X, at_lines(direct), None if by is None else at_lines(by))
+    made = jax.lax.map(of_block, ((at.W, at.R, at.H, at.effects), own))
+    by_flight = jax.vmap(projected, (0, None))(_summed(made), at.S)
+    return _summed(by_flight)
 
 
-def projected(G: Float[Array, "r c"], S: Float[Array, "m m"]) -> Products:
-    """Products with what the ends may add projected out of them: only they change (Kaufman).
-
-    Args:
-        G: of the columns [Z, e, Q], with Q what the ends may add, and [J, Z, e]; Z and J are minus
-            the derivatives.
-        S: makes an orthonormal basis of Q.
-    """
-    q = G.shape[1] // 2
-    along = S.T @ G[q + 1 :]
-    # Of a complex normal error each part has half of the variance.
-    P = 2.0 * (G[: q + 1] - along[:, q:].T @ along)
-    return Products(P[q, -1], -P[:q, -1], P[:q, q:-1], P[:q, :q])
+def _summed(of: Products) -> Products:
+    return jax.tree.map(lambda p: jnp.sum(p, axis=0), of)
 
 
 def _slopes(
-    H: Float[Array, "k p2 n2"],
-    W: Float[Array, "k p2 p2"] | None,
-    matrices: tuple[Matrices, Matrices],
-    X: Complex[Array, "k n"],
-    driven: tuple[Driving, Driving],
+    H: Float[Array, "k 2p 2n"],
+    W: Float[Array, "k 2p 2p"],
+    X: Float[Array, "k 2 n"],
+    of: _Differentiated,
+    signals: tuple[Driving, Driving],
 ) -> Float[Array, "s q"]:
-    """The derivatives of the whitened response, real parts and imaginary ones.
+    """Derivatives of the whitened response at the lines of a block, where the states are X:
+    H (dAd X + dB U + B dU) + W (dC X + dD held + D dheld).
 
     Args:
-        X: the states.
-        driven: what drives them, and its derivatives (k, c, q), None for those that do not move.
+        signals: what drives the model at the lines, and its derivatives.
     """
-    (m, dm), (lines, slopes) = matrices, driven
-    driving = _moved(X, lines.U, (dm.Ad, dm.B), (m.B, slopes.U))
-    passing = _moved(X, lines.held, (dm.C, dm.D), (m.D, slopes.held))
-    pairs = ((H, driving), (W, passing))
-    made = sum(M @ v for M, v in pairs if M is not None and v is not None)
-    return made.reshape(-1, made.shape[-1])  # pyright: ignore
+    value, slopes = (of[0][0], signals[0]), (of[1][0], signals[1])
 
+    def response(moving: tuple[Matrices, Driving]) -> Float[Array, " s"]:
+        m, signals = eqx.combine(moving, value)
+        # Not X @ Ad.T, whose derivatives XLA lays out so that the next product turns them over.
+        driving, passing = (
+            jnp.einsum("kcj,ij->kci", X, A) + jnp.einsum("kcj,ij->kci", v, B)
+            for A, v, B in ((m.Ad, signals.U, m.B), (m.C, signals.held, m.D))
+        )
+        return (times(H, driving) + times(W, passing)).reshape(-1)
 
-def _moved(
-    X: Complex[Array, "K n"],
-    u: Complex[Array, "K r"],
-    slopes: tuple[Any, Any],
-    of_signals: tuple[Array, Any],
-) -> Any:
-    """dF X + dG u + G du (K, 2a, q), real parts and imaginary ones; None where all are zero.
+    # Of what moves with the unknowns alone: all else has no derivative to go through.
+    moving = jax.tree.map(
+        lambda d, v: None if d is None else v, slopes, value, is_leaf=lambda d: d is None
+    )
 
-    Args:
-        slopes: dF (a, n, q) and dG (a, r, q), None where zero.
-        of_signals: G (a, r) and du (K, r, q), None where zero.
-    """
-    total, K = None, X.shape[0]
-    pairs = [(v, d) for v, d in zip((X, u), slopes, strict=True) if d is not None]
-    if pairs:
-        # One product of large real matrices: real and imaginary parts are rows of the first.
-        v = stacked(jnp.concatenate([v for v, _ in pairs], axis=1)).reshape(2 * K, -1)
-        d = jnp.concatenate([d for _, d in pairs], axis=1)
-        a, c, q = d.shape
-        total = (v @ jnp.swapaxes(d, 0, 1).reshape(c, a * q)).reshape(K, 2 * a, q)
-    G, du = of_signals
-    if du is not None:
-        part = jnp.einsum("ar,ksrq->ksaq", G, stacked(du)).reshape(K, 2 * G.shape[0], -1)
-        total = part if total is None else total + part
-    return total
+    def along(direction: tuple[Matrices, Driving]) -> Float[Array, " s"]:
+        return jax.jvp(response, (moving,), (direction,))[1]
+
+    return jax.vmap(along, in_axes=-1, out_axes=-1)(slopes)
 
 
 def differentiated[T](make: Callable[[Array], T], v: Float[Array, " q"]) -> tuple[T, T]:

@@ -12,10 +12,8 @@ from jaxtyping import Array, Complex, Float
 
 from heli_jax.identification.estimation.frequency_lines import (
     Matrices,
-    alike,
-    first_machine,
+    discretised,
     lines_of,
-    machines_of,
     records_of,
 )
 from heli_jax.identification.unknowns.layout import Data, Layout, unpack
@@ -211,9 +209,8 @@ _UNSEEN = 1e-20
 
 @eqx.filter_jit
 def machine_of(layout: Layout, data: Data, z: Float[Array, " q"]) -> Matrices:
-    """The spectrum of the first flight: records of one length share it."""
-    members = alike(layout, data)[0]
-    return first_machine(machines_of(layout, data, unpack(layout, data, z), members).matrices)
+    """The discretised model of the first flight."""
+    return discretised(layout, data, unpack(layout, data, z), [0])[0]
 
 
 def whitening_by(

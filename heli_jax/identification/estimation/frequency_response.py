@@ -40,8 +40,7 @@ from heli_jax.identification.estimation.frequency_lines import (
     Driving,
     Matrices,
     alike,
-    by_flight,
-    machines_of,
+    discretised,
     orthonormal,
     shared_of,
     with_shared,
@@ -88,35 +87,17 @@ from heli_jax.identification.unknowns.layout import (
 # Pereyra (1973) and Kaufman (1975) for the projection.
 
 
-class Resolved(NamedTuple):
-    """A model at K lines of a record, without a derivative."""
-
-    R: Complex[Array, "K n n"]
-    """(zI - Ad)^-1"""
-    H: Complex[Array, "K p n"]
-    """C (zI - Ad)^-1"""
-
-    def ends(self, samples: int) -> Float[Array, "p n N"]:
-        """The additions of a record's ends to the outputs, for each state."""
-        z, turns = _lines(samples)
-        return _in_time(jnp.moveaxis(self.H * z[:, None, None], 0, -1), turns)
-
-
-def resolved(m: Matrices, samples: int) -> Resolved:
-    """A model at the lines of a record."""
-    z, _ = _lines(samples)
-    Ad, C = (jax.lax.stop_gradient(v).astype(z.dtype) for v in (m.Ad, m.C))
-    R = jnp.linalg.inv(z[:, None, None] * jnp.eye(len(Ad), dtype=z.dtype)[None] - Ad[None])
-    return Resolved(R, C[None] @ R)
-
-
 def bounded_outputs(
-    m: Matrices, driving: Driving, at: Resolved, ends: Float[Array, " n"] | None
+    m: Matrices,
+    driving: Driving,
+    R: Complex[Array, "K n n"],
+    ends: Float[Array, " n"] | None = None,
 ) -> Float[Array, "p N"]:
     """The outputs over a record by the bounded solution.
 
     Args:
-        ends: of the states, factors of `Resolved.ends`; zero unless given.
+        R: of `inverses`.
+        ends: of the states, factors of `effects_of_ends`; zero unless given.
     """
     z, turns = _lines(len(driving.U))
     U = _at_lines(driving.U, turns) @ m.B.T.astype(z.dtype)
@@ -124,10 +105,25 @@ def bounded_outputs(
         U = U + z[:, None] * ends.astype(z.dtype)[None]
     # Products in place of the derivative of an inverse: dY = H (dAd X + dU) + dC X. What is
     # subtracted here is zero but for its derivative.
-    X = jax.lax.stop_gradient(jnp.einsum("kij,kj->ki", at.R, U))
+    X = jax.lax.stop_gradient(jnp.einsum("kij,kj->ki", R, U))
+    C = jax.lax.stop_gradient(m.C).astype(z.dtype)
     dA, dC = ((v - jax.lax.stop_gradient(v)).astype(z.dtype) for v in (m.Ad, m.C))
-    lines = jnp.einsum("kpn,kn->pk", at.H, U + X @ dA.T) + dC @ X.T
+    lines = jnp.einsum("kpn,kn->pk", C[None] @ R, U + X @ dA.T) + dC @ X.T
     return _in_time(lines, turns) + m.D @ driving.held.T
+
+
+def inverses(m: Matrices, samples: int) -> Complex[Array, "K n n"]:
+    """(zI - Ad)^-1 at the lines of a record, without a derivative."""
+    z, _ = _lines(samples)
+    Ad = jax.lax.stop_gradient(m.Ad).astype(z.dtype)
+    return jnp.linalg.inv(z[:, None, None] * jnp.eye(len(Ad), dtype=z.dtype)[None] - Ad[None])
+
+
+def effects_of_ends(m: Matrices, R: Complex[Array, "K n n"], samples: int) -> Array:
+    """The additions (p, n, N) of a record's ends to the outputs, for each state."""
+    z, turns = _lines(samples)
+    H = jax.lax.stop_gradient(m.C)[None].astype(z.dtype) @ R
+    return _in_time(jnp.moveaxis(H * z[:, None, None], 0, -1), turns)
 
 
 def _lines(N: int) -> tuple[np.ndarray, np.ndarray]:
@@ -199,28 +195,22 @@ def _by_flight(
     w = weights.windows
     N = next(iter(data.flights[group[0]].outputs.values())).shape[0]
     of_windows = dataclasses.replace(layout, outputs=(w.outputs,) * len(data.flights))
-    vehicles = machines_of(of_windows, data, u, group)
+    m, driving = discretised(of_windows, data, u, group)
 
     def windows(y: Array) -> Complex[Array, "p *c W k"]:
         E = window_transforms(y.reshape(-1, N), w.starts[group[0]], w.length, w.numbers, w.dt)
         return jnp.asarray(E).reshape(*y.shape[:-1], *E.shape[1:])
 
-    def ready(m: Matrices) -> tuple[Matrices, Resolved, Array]:
-        at = resolved(m, N)
-        return m, at, windows(at.ends(N))
+    R = inverses(m, N)
+    effects = windows(effects_of_ends(m, R, N))
 
-    def of_some(of: tuple[Matrices, Resolved, Array], some: Any) -> Any:
-        m, at, effects = of
+    def of_one(one: tuple[Driving, _Measured, Array | None]) -> Any:
+        driving, measured, ends = one
+        left = measured.y - bounded_outputs(m, driving, R, ends)
+        return body(windows(left), effects, measured)
 
-        def of_one(driving: Driving, measured: _Measured, ends: Any) -> Any:
-            left = measured.y - bounded_outputs(m, driving, at, ends)
-            return body(windows(left), effects, measured)
-
-        return jax.vmap(of_one)(*some)
-
-    each = (vehicles.driving, _measured(data, w, group), ends)
     # One at a time: what is made of a flight's windows for each unknown fills the caches.
-    return by_flight(data, group, ready, of_some, vehicles.matrices, each, together=1)
+    return jax.lax.map(of_one, (driving, _measured(data, w, group), ends))
 
 
 def _cross(measured: _Measured, E: Complex[Array, "p c W k"]) -> Complex[Array, "k p m c"]:

@@ -3,13 +3,11 @@
 Linear models get the exact discrete filter. Others get the extended one: the model is linearised
 anew in every step and the linearised one is followed exactly (Ozaki's local linearisation), so
 that on a linear model both are the same; models without fast modes go by explicit steps
-(`moments`). The process noise is the exact discrete one, the measurement noise white and
+(`_moments_after`). The process noise is the exact discrete one, the measurement noise white and
 independent between outputs; outputs of one sample are taken one after another, so nothing is
 inverted. A measurement that is NaN is skipped.
 """
 
-import functools
-import operator
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
@@ -194,8 +192,6 @@ def _step(equations: _Equations, estimate: Estimate, part: Segment) -> Estimate:
     return x + step.shift[:n], product(product(Phi, P), Phi.T) + step.Q[:n, :n]
 
 
-SMALL = 8
-"""States up to which the filter of a linear model is written out in rows"""
 _ONLY_SIMULATE = (
     "solver", "controller", "adjoint", "max_steps", "key", "block", "feedback", "events",
 )  # fmt: skip
@@ -240,9 +236,17 @@ def innovations(
     Ozaki (1985).
     """
     drive, (x, P), y, R = begun(model, params, inputs, measured, sd, options.changed(keywords))
-    small = model.linear and x.shape[0] <= SMALL
-    e, s = _by_rows(_linear(drive), x, P, y, R) if small else _run(filter_of(drive), x, P, y, R)
-    return by_name(measured, e, s)
+    filter_ = filter_of(drive)
+
+    def step(carry: Estimate, sample: tuple[Array, Any]) -> tuple[Any, Any]:
+        y, now = sample
+        estimate, innovation = corrected(filter_, carry, R, y, now)
+        x, P = filter_.move(*estimate, now)
+        # Phi P Phi' is symmetric but for rounding; the corrections, symmetric themselves, would
+        # never take the difference away again.
+        return (x, 0.5 * (P + P.T)), innovation
+
+    return by_name(measured, *jax.lax.scan(step, (x, P), (y, filter_.samples))[1])
 
 
 def begun(
@@ -286,111 +290,32 @@ def first_covariance(model: Model, params: Any, dtype: DTypeLike) -> Float[Array
     return correlation_of(model, params, dtype) * sds[:, None] * sds[None, :]
 
 
-class _Linear(NamedTuple):
-    """x[k+1] = Ad x[k] + drive[k] + noise, y[k] = C x[k] + feed[k] + noise."""
-
-    Ad: Float[Array, "n n"]
-    Q: Float[Array, "n n"]
-    C: Float[Array, "p n"]
-    drive: Float[Array, "N n"]
-    feed: Float[Array, "N p"]
-
-
-def _linear(drive: Drive) -> _Linear:
+def filter_of(drive: Drive) -> Filter:
+    """The exact filter of a linear model, else the extended one."""
     model, params, options = drive.model, drive.params, drive.options
+    if not model.linear:
+        return _local(drive)
     _, _, C, D = jacobians(model, params)
+    C, D = C[drive.rows], D[drive.rows]
     Ad, B, U, acting = held_columns(
         model, params, drive.inputs, options.dt, options.delay, drive.linear
     )
     Q = process_noise(model, params, options.dt)
-    # For all samples at once: one matrix product.
-    return _Linear(Ad, Q, C[drive.rows], U @ B.T, acting @ D[drive.rows].T)
 
-
-def _by_rows(system: _Linear, x0: Array, P0: Array, y: Array, R: Array) -> tuple[Array, Array]:
-    """The filter on rows and scalars: two to three times as fast as on small matrices.
-
-    Written out in scalars alone it is faster once more, and takes twice as long to compile.
-    """
-    n, p = x0.shape[0], y.shape[1]
-    # Behind barriers every number is computed once: XLA would compute each for every use.
-    once = jax.lax.optimization_barrier
-    Ad, Q, C, R = once((system.Ad, system.Q, system.C, R))
-
-    # Rows of P as a list, and the entries of A and C as scalars: products of whole matrices this
-    # small would cost more in calls than in arithmetic.
-    def step(carry: tuple[Array, Any], sample: tuple[Any, Array]) -> tuple[Any, Any]:
-        x, P = carry
-        y, w = sample
-        a = [[Ad[i, j] for j in range(n)] for i in range(n)]
-        c = [[C[k, j] for j in range(n)] for k in range(p)]
-        errors, variances = [], []
-        for k in range(p):
-            # Outputs of one sample are taken one after another, which white noise that is
-            # independent between them allows: s is a number, and no matrix is inverted.
-            h = _sum(P[i] * c[k][i] for i in range(n))
-            s = _sum(h[i] * c[k][i] for i in range(n)) + R[k]
-            seen = jnp.isfinite(y[k])
-            # NaN times a gain of zero is NaN: it must not reach the state.
-            e = jnp.where(seen, y[k], 0.0) - _sum(x[i] * c[k][i] for i in range(n))
-            g = jnp.where(seen, 1.0 / s, 0.0)
-            h, s, e, g = once((h, s, e, g))
-            x, scaled = x + h * (g * e), g * h
-            P = [P[i] - h[i] * scaled for i in range(n)]
-            x, P = once((x, P))
-            errors.append(jnp.where(seen, e, jnp.nan))
-            variances.append(jnp.where(seen, s, jnp.nan))
-        x = _sum(Ad[:, i] * x[i] for i in range(n)) + w
-        M = once([_sum(P[k] * a[i][k] for k in range(n)) for i in range(n)])
-        P = jnp.stack([_sum(Ad[:, k] * M[i][k] for k in range(n)) + Q[i] for i in range(n)])
-        # Symmetric by force: a correction takes nothing of what rounding leaves between P and its
-        # transpose, which an unstable mode would then blow up by its growth over the whole record.
-        return (x, list(0.5 * (P + P.T))), (errors, variances)
-
-    samples = (list((y - system.feed).T), system.drive)
-    _, (e, s) = jax.lax.scan(step, (x0, list(P0)), samples)
-    return jnp.stack(e, axis=1), jnp.stack(s, axis=1)
-
-
-def _sum(terms: Iterable[Any]) -> Any:
-    return functools.reduce(operator.add, terms)
-
-
-def filter_of(drive: Drive) -> Filter:
-    """The exact filter of a linear model, else the extended one."""
-    if not drive.model.linear:
-        return _local(drive)
-    system = _linear(drive)
-
-    # Rows written out one by one are a program whose length grows with the square of the states.
     def move(x: Array, P: Array, now: tuple[Array, Array]) -> Estimate:
         # A sum of products: the derivative of the matrix product Ad @ x costs ten times as much.
-        x = jnp.sum(system.Ad * x[None, :], axis=1) + now[0]
-        return x, product(product(system.Ad, P), system.Ad.T) + system.Q
+        x = jnp.sum(Ad * x[None, :], axis=1) + now[0]
+        return x, product(product(Ad, P), Ad.T) + Q
 
-    # C stays, so that no step differentiates the outputs.
-    samples = (system.drive, system.feed)
-    return Filter(samples, lambda x, now: (system.C, now[1]), move)
-
-
-def _run(filter_: Filter, x: Array, P: Array, y: Array, R: Array) -> tuple[Array, Array]:
-    """Errors and variances (N, p)."""
-
-    def step(carry: Estimate, sample: tuple[Array, Any]) -> tuple[Any, Any]:
-        y, now = sample
-        estimate, innovation = corrected(filter_, carry, R, y, now)
-        x, P = filter_.move(*estimate, now)
-        # Phi P Phi' is symmetric but for rounding; the corrections, symmetric themselves, would
-        # never take the difference away again.
-        return (x, 0.5 * (P + P.T)), innovation
-
-    return jax.lax.scan(step, (x, P), (y, filter_.samples))[1]
+    # The inputs' part of all samples at once: one matrix product. C stays, so that no step
+    # differentiates the outputs.
+    return Filter((U @ B.T, acting @ D.T), lambda x, now: (C, now[1]), move)
 
 
 def corrected(
     filter_: Filter, estimate: Estimate, R: Array, y: Array, now: Any
 ) -> tuple[Estimate, tuple[Array, Array]]:
-    """An estimate after one sample's outputs (p,), one after another as in `_by_rows`; errors and
+    """Return an estimate after one sample's outputs (p,), taken one after another; errors and
     variances (p,) of their innovations."""
 
     def correct(carry: Estimate, measured: tuple[Array, ...]) -> tuple[Any, Any]:

@@ -98,6 +98,9 @@ _ROUNDING = 1e-12
 """part of the sum of squares below which a change is rounding"""
 _GROWTH = 3.0
 """times the change of the residuals by a step that did as predicted may the next one make"""
+_LEAST_DAMPED = 1e7
+"""at most one over the damping: along a direction that the data leave open rounding over no damping
+at all is a step of any length; beside the square of `COLUMN` this damping is 1e-12"""
 ARRIVED = 1e-4
 """of joint standard deviations, squared: no interval shows a hundredth of one, and steps that
 shrink by a fifth each take ten more to come to a thousandth"""
@@ -149,6 +152,7 @@ class _TrustRegion(optx.ClassicalTrustRegion):
         as_predicted = change < self.high_cutoff * gain
         grown = jnp.where(as_predicted, _GROWTH * _norm2(moved), 0.0)
         radius = jnp.where(accept, jnp.maximum(state.radius, grown), part * _norm2(moved))
+        size = jnp.minimum(size, _LEAST_DAMPED)
         return size, accept, result, _Region(size, radius)
 
 

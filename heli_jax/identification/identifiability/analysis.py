@@ -5,14 +5,13 @@ scale for those that may be zero. Initial states and biases are projected out fi
 """
 
 import math
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Collection, Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
-from heli_jax import naming
 from heli_jax.flights.flight import labels
 from heli_jax.identification.estimation.evaluation import NULL, Evaluation
 from heli_jax.identification.identifiability.directions import (
@@ -20,7 +19,6 @@ from heli_jax.identification.identifiability.directions import (
     TAKES_PART,
     Spread,
     WithoutWeakPriors,
-    combinations,
     directions,
     projected,
     row_reduced,
@@ -30,18 +28,14 @@ from heli_jax.identification.identifiability.directions import (
     without_effect,
 )
 from heli_jax.identification.identifiability.equivalents import Valley
-from heli_jax.identification.identifiability.sentences import sentences
 from heli_jax.identification.identifiability.verdict import (
     FACTOR,
-    ROUGHLY,
     Z95,
     Group,
     Pair,
     SecondSolution,
     Unknown,
     Verdict,
-    Weakest,
-    connected,
 )
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.unknowns import transforms
@@ -68,7 +62,7 @@ def unknowns_of(problem: Problem, layout: Layout, e: Evaluation) -> tuple[Unknow
             # through a tanh, which comes near to its end and never to it.
             room = MAX_TIME_SHIFT - abs(value)
             u = Unknown(name, value, False, 1.0, 0.0, is_parameter=False, reference=dt)
-            u = u._replace(at_bound=room < _AT_END * MAX_TIME_SHIFT, room=room / dt)
+            u = u._replace(at_bound=room < _AT_END * MAX_TIME_SHIFT)
         elif name in problem.free:
             u = _parameter(problem, name, value)
         else:
@@ -139,12 +133,12 @@ def relative_rows(
 
 # The verdict.
 
-ILL_CONDITIONED = 1e4
-"""condition number above which the verdict warns: the data determine all, some of it hardly"""
-STRONG = 0.99
+_ROUGHLY = 0.5
+"""sd in relative coordinates, as intervals are reported, above which a parameter is determined only
+roughly: its 95 % interval reaches further than a factor of 2.7 to either side"""
+_STRONG = 0.99
 """correlation beyond which the verdict names a pair; rank alone does not show it (a stand's damping
 and the flybar's have correlation 1.00000 and full rank)"""
-_WITHOUT_ALIASES = "bound it where that mode is slower, or log faster"
 
 
 class Around(NamedTuple):
@@ -156,8 +150,6 @@ class Around(NamedTuple):
     """other values that fit as well"""
     valley: Valley | None = None
     """tells which combinations are the same far from the point; without it there are none"""
-    null: tuple[np.ndarray, ...] = ()
-    """directions (q,) in relative coordinates that are open at another point as likely"""
     one_sided: tuple[str, ...] = ()
     """the parameters that the likelihood does not bound within the factor of ten"""
     limits: Mapping[str, tuple[float, float]] = MappingProxyType({})
@@ -210,22 +202,7 @@ def verdict_of(
         around = around._replace(
             reported=reported, widening=lambda along: widening(along * to_relative)
         )
-    # On the stand Ixx, If and a are known up to a factor: moments of inertia and lift scale alike.
-    # A second run with a known inertia added sets the scale.
-    known = naming.names(problem.model.Params)
-    remedies = {n: "add a run with a known inertia" for n in problem.free if f"{n}_added" in known}
-    # Initial states of a chance optimum may tell what no input does: at rest they would not.
-    kinds = {n.kind for n in named} if around.valley else set()
-    # Windows need their initial states.
-    kinds -= {"initial_state"} if problem.window is not None else set()
-    return analyse(
-        sensitivity,
-        unknowns,
-        without_weak=without_weak,
-        around=around,
-        remedies=remedies | dict.fromkeys(around.aliased, _WITHOUT_ALIASES),
-        switches=kinds,
-    )
+    return analyse(sensitivity, unknowns, without_weak=without_weak, around=around)
 
 
 def analyse(
@@ -234,8 +211,6 @@ def analyse(
     *,
     without_weak: WithoutWeakPriors | None = None,
     around: Around = Around(),
-    remedies: Mapping[str, str] = MappingProxyType({}),
-    switches: Iterable[str] = (),
 ) -> Verdict:
     """Return the verdict from a whitened sensitivity in relative coordinates.
 
@@ -243,11 +218,10 @@ def analyse(
         sensitivity: (any, q) with the nuisances free but for their weak priors. Priors of the
             unknowns are no rows of it; they come with the unknowns.
         without_weak: the same without the weak priors, which count as data where it is not given.
-        remedies: by name of an unknown, a further way out that the model offers.
-        switches: the kinds of nuisances that may be switched off.
     """
     bare = sensitivity if without_weak is None else without_weak.sensitivity
     scale, own = np.array([u.scale for u in unknowns]), np.array([u.prior for u in unknowns])
+    names = [u.name for u in unknowns]
     # The rank is that without the weak priors: they give every nuisance a finite interval, and so
     # would lend one to each parameter that a bias or an initial state can take the place of.
     # A prior is a measurement of the parameter itself: a row with one over its sd.
@@ -258,8 +232,10 @@ def analyse(
         covariance = directions(np.vstack([sensitivity, np.diag(own)]), scale, 0.0).covariance
     null = with_too_wide(total.null, total.covariance, unknowns)
     null = with_further(null, _further(total.covariance, covariance, unknowns, around))
+    reported = covariance
     if around.reported is not None:
-        null = with_too_wide(null, around.reported, unknowns)
+        reported = around.reported
+        null = with_too_wide(null, reported, unknowns)
     # Two lists: what nothing determines is an error of the experiment, what rests on a prior is a
     # number that the prior has put there, and its combinations have no prior in them.
     resting = []
@@ -267,62 +243,46 @@ def analyse(
         resting = with_too_wide(data.null, data.covariance, unknowns)
     dead = without_effect(sensitivity, unknowns)
     of_rows = (sensitivity, without_weak)
-    groups = _groups(null, _spread(covariance, around), unknowns, of_rows, around, dead)
-    resting_groups = _groups(resting, _spread(data.covariance, around), unknowns, of_rows, around)
-    undetermined = tuple(
-        u.name
-        for i, u in enumerate(unknowns)
-        if any(abs(v[i]) > TAKES_NO_PART for v in null)
-        or any(u.name in other.changed for other in around.second)
-    )
-    # A variance of nothing may be rounding of either sign.
-    variance = np.diag(covariance if around.reported is None else around.reported)
-    known = [
-        (u, float(sd))
-        for u, sd in zip(unknowns, np.sqrt(np.maximum(variance, 0.0)), strict=True)
-        if u.name not in (*undetermined, *dead)
+    groups = _groups(null, covariance, unknowns, of_rows, around, dead)
+    resting_groups = _groups(resting, data.covariance, unknowns, of_rows, around)
+    moved = np.abs(null).max(axis=0) if null else np.zeros(len(unknowns))
+    changed = {n for other in around.second for n in other.changed}
+    undetermined = [
+        n for n, part in zip(names, moved, strict=True) if part > TAKES_NO_PART or n in changed
     ]
-    singular, names = total.singular, [u.name for u in unknowns]
-    condition = float(singular[0] / singular[-1]) if singular[-1] > 0 else math.inf
+    # A variance of nothing may be rounding of either sign.
+    sds = np.sqrt(np.maximum(np.diag(reported), 0.0)).tolist()
     # One that takes part in no determined direction has no correlation.
     sizes = np.sqrt(np.diag(covariance))
     sizes = np.where(sizes > 0, sizes, 1.0)
-    correlation = covariance / np.outer(sizes, sizes)
+    correlation = np.clip(covariance / np.outer(sizes, sizes), -1.0, 1.0)
     np.fill_diagonal(correlation, 1.0)
-    correlation = np.clip(correlation, -1.0, 1.0)
-    hardly = condition > ILL_CONDITIONED and not (null or resting or around.second)
-    shares = _shares(covariance, total.covariance, bare, own)
-    explained, by_own, by_weak = (dict(zip(names, s.tolist(), strict=True)) for s in shares)
     # Where a nuisance is exchangeable with a parameter the data say nothing of it, whatever
     # interval the weak priors make.
-    explained |= dict.fromkeys((n for g in groups if g.exchanged for n in g.names), 1.0)
-    verdict = Verdict(
+    share = dict(zip(names, _prior_share(covariance, bare).tolist(), strict=True))
+    share |= dict.fromkeys((n for g in groups if g.exchanged for n in g.names), 1.0)
+    return Verdict(
         unknowns=unknowns,
         identifiable=not (null or around.second),
         rank=total.rank,
         rank_without_priors=data.rank,
-        condition=condition,
-        singular_values=singular,
-        null_directions=tuple(dict(zip(names, map(float, v), strict=True)) for v in null),
-        combinations=tuple(c for group in (*groups, *resting_groups) for c in group.combinations),
+        singular_values=total.singular,
+        null_directions=tuple(dict(zip(names, v.tolist(), strict=True)) for v in null),
         pairs=_pairs(correlation, names, undetermined),
         without_effect=dead,
-        undetermined=undetermined,
+        undetermined=tuple(undetermined),
         covariance=covariance,
         correlation=correlation,
-        prior_share=explained,
-        own_share=by_own,
-        weak_share=by_weak,
+        prior_share=share,
         groups=groups,
         resting_groups=resting_groups,
-        factors=_factors(known, around.limits),
-        weakest=_weakest(covariance, unknowns) if hardly else None,
-        remedies=remedies,
-        switches=frozenset(switches),
-        through_zero=tuple(u.name for u, sd in known if _holds_zero(u, sd, around.limits)),
+        roughly=tuple(
+            u.name
+            for u, sd in zip(unknowns, sds, strict=True)
+            if u.name not in (*undetermined, *dead) and _is_rough(u, sd, around.limits)
+        ),
         second=around.second,
     )
-    return replace(verdict, sentences=sentences(verdict))
 
 
 def _further(
@@ -343,22 +303,12 @@ def _further(
     open_ = np.array([u.name in around.one_sided for u in unknowns])
     sds = np.sqrt(np.where(open_, np.diag(covariance), 1.0))
     one_sided = [np.where(open_, covariance[:, i] / sds, 0.0) for i in np.flatnonzero(open_)]
-    return [*weakly, *aliased, *around.null, *one_sided]
-
-
-def _spread(covariance: np.ndarray, around: Around) -> Spread:
-    """Return how far weighted sums of relative coordinates may be off."""
-
-    def spread(along: np.ndarray) -> tuple[float, float]:
-        wider, reach = around.widening(along)
-        return wider * math.sqrt(max(0.0, float(along @ covariance @ along))), reach
-
-    return spread
+    return [*weakly, *aliased, *one_sided]
 
 
 def _groups(
     null: list[np.ndarray],
-    spread: Spread,
+    covariance: np.ndarray,
     unknowns: tuple[Unknown, ...],
     of_rows: tuple[np.ndarray, WithoutWeakPriors | None],
     around: Around,
@@ -370,85 +320,54 @@ def _groups(
     null = [v for v in null if np.abs(v[alive]).max(initial=0.0) > TAKES_PART]
     if not null:
         return ()
+
+    def spread(along: np.ndarray) -> tuple[float, float]:
+        wider, reach = around.widening(along)
+        return wider * math.sqrt(max(0.0, float(along @ covariance @ along))), reach
+
     # Any basis of the null space serves; the reduced one has zeros wherever it can, and so shows
     # which parameters are not tied together.
-    rows = [unit_vector(v) for v in row_reduced(np.array(null), unknowns)[0]]
-    parts = [set(np.flatnonzero((np.abs(v) > TAKES_PART) & alive).tolist()) for v in rows]
+    rows = np.array([unit_vector(v) for v in row_reduced(np.array(null), unknowns)[0]])
+    parts = (np.abs(rows) > TAKES_PART) & alive
+    rows, parts = rows[parts.any(axis=1)], parts[parts.any(axis=1)]
+    count, labels = connected_components((parts @ parts.T).astype(int))
     sensitivity, without_weak = of_rows
     groups = []
-    for members in connected(parts):
-        mine = [v for v, part in zip(rows, parts, strict=True) if part & members]
+    for k in range(count):
+        mine, members = list(rows[labels == k]), parts[labels == k].any(axis=0)
         tied, exchanged = (), []
         if around.valley is not None:
             tied = around.valley.tied(mine, spread, unknowns)
         if without_weak is not None:
             exchanged = [n for v in mine for n in without_weak.exchanged(v, sensitivity)]
-        names = tuple(unknowns[i].name for i in sorted(members))
+        names = tuple(unknowns[i].name for i in np.flatnonzero(members))
         groups.append(Group(names, len(mine), tied, tuple(dict.fromkeys(exchanged))))
     return tuple(groups)
 
 
-def _pairs(
-    correlation: np.ndarray, names: list[str], undetermined: tuple[str, ...]
-) -> tuple[Pair, ...]:
+def _pairs(correlation: np.ndarray, names: list[str], undetermined: list[str]) -> tuple[Pair, ...]:
     """Return the pairs beyond the limit; what is not determined has no correlation."""
-    pairs = [
-        Pair(names[j], names[i], float(correlation[i, j]))
-        for i in range(len(names))
-        for j in range(i)
-        if abs(correlation[i, j]) > STRONG and not {names[i], names[j]} & {*undetermined}
-    ]
+    strong = np.argwhere(np.tril(np.abs(correlation) > _STRONG, -1)).tolist()
+    pairs = [Pair(names[j], names[i], float(correlation[i, j])) for i, j in strong]
+    pairs = [p for p in pairs if not {p.first, p.second} & {*undetermined}]
     return tuple(sorted(pairs, key=lambda p: -abs(p.correlation)))
 
 
-def _shares(
-    covariance: np.ndarray, without_weak: np.ndarray, bare: np.ndarray, own: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (q,) each the shares of the variance by all priors, of the precision by the unknown's
-    own, and of that by the weak ones."""
-    variance = np.diag(covariance)
-    safe = np.where(variance > 0, variance, 1.0)
-    bare_variance = np.diag(without_weak)
+def _prior_share(covariance: np.ndarray, bare: np.ndarray) -> np.ndarray:
+    """Return the share (q,) of the variance by all priors."""
     # The estimates' variance P = P (B'B + R) P is that of the data, whose rows are B, and that of
     # all priors R. An unknown without a prior rests on another's where only the two together show.
+    variance = np.diag(covariance)
     of_data = np.sum((bare @ covariance) ** 2, axis=0)
-    explained = np.where(variance > 0, 1.0 - of_data / safe, 0.0)
-    # Precisions add, so a prior's share is its precision times the variance that is left.
-    ratio = variance / np.where(bare_variance > 0, bare_variance, 1.0)
-    weak = np.where(bare_variance > 0, 1.0 - ratio, 0.0)
-    explained, by_own, by_weak = np.clip([explained, variance * own**2, weak], 0.0, 1.0)
-    return explained, by_own, by_weak
+    share = 1.0 - of_data / np.where(variance > 0, variance, 1.0)
+    return np.clip(np.where(variance > 0, share, 0.0), 0.0, 1.0)
 
 
-def _factors(
-    known: list[tuple[Unknown, float]], limits: Mapping[str, tuple[float, float]]
-) -> dict[str, float]:
-    """Return by unknown that is determined in a wide interval the factor to its ends; infinite of
-    one whose interval holds zero, or reaches the end of its search."""
-    factors = {}
-    for u, sd in known:
-        # A coordinate that is no logarithm has no factor.
-        factor = math.exp(Z95 * sd) if u.logarithmic else 1.0
-        if u.name in limits and u.logarithmic:
-            ratios = [end / u.value for end in limits[u.name]]
-            factor = max(max(r, 1.0 / r) if r > 0 else math.inf for r in ratios)
-        if Z95 * sd >= u.room and not u.at_bound:
-            factor = math.inf
-        if factor > math.exp(Z95 * ROUGHLY):
-            factors[u.name] = factor
-    return factors
-
-
-def _holds_zero(u: Unknown, sd: float, limits: Mapping[str, tuple[float, float]]) -> bool:
-    """True if the 95 % interval of an unknown of either sign holds zero: no factor describes it."""
-    low, high = limits.get(u.name, (0.0, 0.0))
-    return u.symmetric and (low <= 0.0 <= high if u.name in limits else Z95 * sd >= u.distance)
-
-
-def _weakest(covariance: np.ndarray, unknowns: tuple[Unknown, ...]) -> Weakest:
-    """Return the least determined direction, and what is determined far better."""
-    direction = unit_vector(np.linalg.eigh(covariance)[1][:, -1])
-    parts = {
-        u.name: float(v) for u, v in zip(unknowns, direction, strict=True) if abs(v) > TAKES_PART
-    }
-    return Weakest(parts, combinations([direction], _spread(covariance, Around()), unknowns))
+def _is_rough(u: Unknown, sd: float, limits: Mapping[str, tuple[float, float]]) -> bool:
+    """True if a 95 % interval, by the likelihood where `limits` has it, is wide or holds zero."""
+    low, high = limits.get(u.name, (math.nan, math.nan))
+    if u.symmetric and (low <= 0.0 <= high if u.name in limits else Z95 * sd >= u.distance):
+        return True
+    if u.name in limits and u.logarithmic:
+        sd = max(abs(math.log(end / u.value)) for end in (low, high)) / Z95
+    return u.logarithmic and sd > _ROUGHLY

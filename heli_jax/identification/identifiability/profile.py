@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.special
 
-from heli_jax.identification.estimation.evaluation import Evaluation, evaluate, pseudoinverse
+from heli_jax.identification.estimation.evaluation import Evaluation, pseudoinverse
 from heli_jax.identification.estimation.levenberg_marquardt import measured_count
-from heli_jax.identification.identifiability.analysis import Around, unknowns_of, verdict_of
+from heli_jax.identification.identifiability.analysis import Around, unknowns_of
 from heli_jax.identification.identifiability.equivalents import (
     Rows,
     descend,
@@ -27,7 +27,7 @@ from heli_jax.identification.identifiability.equivalents import (
 from heli_jax.identification.identifiability.verdict import FACTOR, Z95, Unknown, Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
-from heli_jax.identification.unknowns.layout import Solution, flight_places, value_of
+from heli_jax.identification.unknowns.layout import Solution, value_of
 
 _REACHES = (3.0, 9.0)
 """standard deviations to either side of a profile that is asked for; the second only where the
@@ -41,16 +41,12 @@ _AS_EXPECTED = 1.15
 slopes is then as wide as that of the likelihood within about as much"""
 _WIDE, _WIDE_IN_A_VALLEY = 0.2, 0.1
 """sd in relative coordinates, as intervals are reported, from which on the likelihood is asked: of
-any parameter, and of one that lies along a valley with another"""
+any parameter, and of one that lies along a valley with another, which bends"""
 _VALLEY = 0.9
-"""correlation beyond which two parameters lie along a valley, which bends"""
+"""correlation beyond which two parameters lie along a valley"""
 _INFLATED = 1.5
 """factor by which autocorrelated residuals may make intervals wider: beyond, a disturbance does,
 and the likelihood of white residuals means little"""
-_BY_CHANCE = 1e-3
-"""probability that initial states which are those of rest gain as much of the likelihood"""
-_REST = 1e-6
-"""initial states below this, in sds of their weak priors, are those of rest already"""
 
 
 class Profile(NamedTuple):
@@ -163,11 +159,17 @@ def beyond_slopes(
         reaches: (q,) sds of white residuals that a 95 % interval of each unknown reaches.
     """
     lacking = verdict.not_identifiable
-    wide = _wide(problem, at, e, verdict, reaches)
+    sds = np.sqrt(np.maximum(np.diag(verdict.covariance), 0.0))
+    related = np.abs(np.where(np.eye(len(sds)), 0.0, verdict.correlation)).max(1, initial=0.0)
+    least = Z95 * np.where(related > _VALLEY, _WIDE_IN_A_VALLEY, _WIDE)
+    wide = [
+        (i, u)
+        for i, u in enumerate(unknowns_of(problem, at.layout, e))
+        if not (u.name in lacking or u.at_bound or reaches[i] >= _INFLATED * Z95)
+        and _is_wide(problem, u, float(sds[i] * reaches[i]), float(least[i]))
+    ]
     if not wide or not (np.isfinite(e.r).all() and np.isfinite(e.J).all()):
         return around
-    null = _open_at_rest(problem, at, e, lacking, reaches)
-    opened = {n for v in null for n, part in zip(verdict.names, v, strict=True) if abs(part) > 0.1}
     # What is open already goes along with anything, and tells nothing of where the others go.
     J = np.array(e.J, np.float64)
     J[:, [i for i, n in enumerate(verdict.names) if n in lacking]] = 0.0
@@ -176,8 +178,6 @@ def beyond_slopes(
     together = math.sqrt(scipy.special.chdtri(len(wide), 0.05)) / Z95
     limits, one_sided = {}, []
     for i, u in wide:
-        if u.name in opened:
-            continue
         line = _line(at, Rows(np.asarray(e.r), J), i)
         reach = together * float(reaches[i])
         ends = [_end(problem, line, e, u, side, reach) for side in (-1, 1)]
@@ -187,29 +187,18 @@ def beyond_slopes(
         elif any(abs(t) != reach * line.sd for t in bounded):
             low, high = sorted(line.value(t) for t in bounded)
             limits[u.name] = (low, high)
-    return around._replace(limits=limits, one_sided=tuple(one_sided), null=tuple(null))
+    return around._replace(limits=limits, one_sided=tuple(one_sided))
 
 
-def _wide(
-    problem: Problem, at: Solution, e: Evaluation, verdict: Verdict, reaches: np.ndarray
-) -> list[tuple[int, Unknown]]:
-    """Return the parameters that the likelihood is asked of, by their place among the unknowns."""
-    sds = np.sqrt(np.maximum(np.diag(verdict.covariance), 0.0))
-    related = np.abs(np.where(np.eye(len(sds)), 0.0, verdict.correlation)).max(1, initial=0.0)
-    least = np.where(related > _VALLEY, _WIDE_IN_A_VALLEY, _WIDE)
-    wide = []
-    for i, u in enumerate(unknowns_of(problem, at.layout, e)):
-        if u.name not in problem.free or u.name in verdict.not_identifiable or u.at_bound:
-            continue
-        low, high = transforms.limits(problem.free[u.name])
-        reach = float(sds[i] * reaches[i])
-        # What acts through a parameter that may be zero may act not at all: slopes beside zero
-        # bound what the likelihood there does not.
-        may_vanish = u.symmetric and low < 0.0 < high and reach >= u.distance
-        far = (u.logarithmic or u.symmetric) and (reach > Z95 * least[i] or may_vanish)
-        if far and reaches[i] < _INFLATED * Z95:
-            wide.append((i, u))
-    return wide
+def _is_wide(problem: Problem, u: Unknown, reach: float, least: float) -> bool:
+    """True if the likelihood is asked of an unknown whose interval reaches so far."""
+    if u.name not in problem.free or not (u.logarithmic or u.symmetric):
+        return False
+    # What acts through a parameter that may be zero may act not at all: slopes beside zero bound
+    # what the likelihood there does not.
+    low, high = transforms.limits(problem.free[u.name])
+    may_vanish = u.symmetric and low < 0.0 < high and reach >= u.distance
+    return may_vanish or reach > least
 
 
 def _end(
@@ -221,85 +210,33 @@ def _end(
     [(t, root)] = line.roots(side, [min(expected, furthest)])
     if 1.0 / _AS_EXPECTED < root / reach < _AS_EXPECTED:
         return side * t
-    inside, outside = (0.0, 0.0), (furthest, math.inf)
-
-    def outwards() -> Iterator[float]:
-        for factor in _OUTWARDS:
-            yield min(factor * expected, furthest)
-            if outside[1] < math.inf or inside[0] >= furthest:
-                break
-        # Once more where a straight line has the end.
-        yield between()
-        # A likelihood that levels off is no bound, wherever it passes the limit: an optimum of
-        # chance is one among many places where the noise may have put it.
-        if outside[0] < furthest:
-            yield furthest
-
-    def between() -> float:
-        share = (reach - inside[1]) / (outside[1] - inside[1])
-        return inside[0] + share * (outside[0] - inside[0])
-
-    for t, root in line.roots(side, outwards()):
-        if root < reach and t >= furthest:
-            # A bound that was stated bounds it, a factor of ten does not.
-            bounded = transforms.at_bound(problem.free[u.name], line.value(side * furthest))
-            return side * furthest if bounded else None
-        if root < reach:
-            inside = (t, root)
-        elif t < outside[0]:
-            outside = (t, root)
-    return side * between()
+    # A likelihood that levels off is no bound, wherever it passes the limit: an optimum of chance
+    # is one among many places where the noise may have put it. So the furthest point is asked too.
+    near = [factor * expected for factor in _OUTWARDS if factor * expected < furthest]
+    found = [(0.0, 0.0), *line.roots(side, [*near, furthest])]
+    if found[-1][1] < reach:
+        # A bound that was stated bounds it, a factor of ten does not.
+        bounded = transforms.at_bound(problem.free[u.name], line.value(side * furthest))
+        return side * furthest if bounded else None
+    k = next(k for k, (_, root) in enumerate(found) if root >= reach)
+    (inside, before), (outside, after) = found[k - 1], found[k]
+    return side * (inside + (outside - inside) * (reach - before) / (after - before))
 
 
 def _furthest(problem: Problem, line: _Line, e: Evaluation, u: Unknown, side: int) -> float:
     """Return the distance in the coordinate to a factor of ten, or to a bound."""
-    free, value = problem.free[u.name], u.value
-    size = abs(value) / u.distance if u.distance else abs(value)
     up = (float(e.slopes[line.i]) > 0) == (side > 0)
-    outwards = up == (value > 0)
-    target = value * FACTOR if outwards else value / FACTOR
-    if u.symmetric and not (outwards and abs(value) > 0.3 * size):
-        # Away from zero a factor, as for all; towards it as far on its other side.
-        target = value + math.log(FACTOR) * (size if up else -size)
-    low, high = transforms.limits(free)
-    width = high - low if math.isfinite(high - low) else abs(value)
+    outwards = up == (u.value > 0)
+    target = u.value * FACTOR if outwards else u.value / FACTOR
+    if u.symmetric:
+        # Towards zero as far on its other side; away from it a factor too, where that is further.
+        step = math.log(FACTOR) * u.reference
+        step = max(step, (FACTOR - 1.0) * abs(u.value)) if outwards else step
+        target = u.value + (step if up else -step)
+    low, high = transforms.limits(problem.free[u.name])
+    width = high - low if math.isfinite(high - low) else abs(u.value)
     target = min(max(target, low + 1e-6 * width), high - 1e-6 * width)
     at, i = line.at, line.i
     limits = (at.data.sign[i], at.data.low[i], at.data.high[i])
     z = float(transforms.to_coordinate(at.layout.kinds[i], target, *limits))
     return abs(z - float(at.z[i]))
-
-
-def _open_at_rest(
-    problem: Problem, at: Solution, e: Evaluation, lacking: frozenset[str], reaches: np.ndarray
-) -> list[np.ndarray]:
-    """Return directions that nothing but initial states of chance determine: open with the initial
-    states at rest, where the data cannot tell them from that.
-
-    A transient is as large as the initial states that the fit has found, and so is what it tells
-    of the parameters. Where the data do not tell these states from rest, it may as well be none.
-    """
-    layout = at.layout
-    if layout.noise_model == "spectrum" or any(count > 1 for count, _ in layout.windows):
-        return []
-    held = np.zeros(layout.size, bool)
-    for places in flight_places(layout):
-        held[places.states] = True
-    z = np.asarray(at.z, np.float64)
-    if not (np.abs(z[held]) > _REST).any():
-        return []
-    rest, squares = descend(lambda z: rows_at(at, z), np.where(held, 0.0, z), ~held)
-    deviance = deviance_of(at, squares_of(e.r), squares)
-    # Autocorrelated residuals let chance gain more.
-    wider = max(1.0, float(np.median(reaches[held])) / Z95)
-    if deviance > wider**2 * scipy.special.chdtri(int(held.sum()), _BY_CHANCE):
-        return []
-    e = evaluate(layout, at.data, at.noise, jnp.asarray(rest, at.z.dtype))
-    if not np.isfinite(e.J).all():
-        return []
-    there = verdict_of(problem, layout, e)
-    return [
-        np.array([v[n] for n in there.names])
-        for v in there.null_directions
-        if not lacking & {n for n, part in v.items() if abs(part) > 0.1}
-    ]

@@ -1,22 +1,23 @@
-"""The result of the identifiability analysis: plain data, of which `sentences` makes words."""
+"""Verdict of the identifiability analysis: its data, and the sentences made of them."""
 
 import math
-from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from heli_jax.identification.unknowns.layout import FlightUnknown
+from heli_jax.messages import listed, sentence
 
 # Rank alone is not enough: noise of any size leaves full rank, and an interval of three decades.
 FACTOR = 10.0
 """A 95 % interval that reaches further than this factor to either side determines nothing."""
-ROUGHLY = 0.5
-"""sd in relative coordinates, as intervals are reported, above which a parameter is determined only
-roughly: its 95 % interval reaches further than a factor of 2.7 to either side"""
 # The 97.5 % point of the standard normal distribution.
 Z95 = 1.959963984540054
+ILL_CONDITIONED = 1e4
+"""condition number above which the verdict names the weakest direction, if all is determined"""
+_BY_PRIOR = 0.9
+"""share of the priors above which a parameter with a prior is what that says"""
 
 
 class Unknown(NamedTuple):
@@ -41,9 +42,6 @@ class Unknown(NamedTuple):
     """whether it moves a mode that the samples do not tell from its aliases"""
     at_bound: bool = False
     """whether it ended at its bound, so that the data want it beyond"""
-    room: float = math.inf
-    """from the value to the nearer end of a search that no configuration widens, that of a time
-    shift, in its relative coordinate"""
 
     @property
     def distance(self) -> float:
@@ -115,13 +113,6 @@ class Group(NamedTuple):
     """nuisances that they are exchanged with, where weak priors alone hold them"""
 
 
-class Weakest(NamedTuple):
-    """The least determined direction where all is determined, but hardly."""
-
-    parts: dict[str, float]
-    combinations: tuple[Combination, ...]
-
-
 @dataclass(frozen=True, eq=False)
 class Verdict:
     """The findings on what the data (with the priors) determine."""
@@ -132,13 +123,10 @@ class Verdict:
     # Both without the weak priors of nuisances, which would give full rank to anything.
     rank: int
     rank_without_priors: int
-    condition: float
     singular_values: np.ndarray
     """(q,) of the whitened, scaled sensitivity, largest first"""
     null_directions: tuple[dict[str, float], ...]
     """unit vectors in relative coordinates along which nothing changes"""
-    combinations: tuple[Combination, ...]
-    """what the data alone determine of parameters that they do not determine one by one"""
     pairs: tuple[Pair, ...]
     without_effect: tuple[str, ...]
     undetermined: tuple[str, ...]
@@ -151,33 +139,34 @@ class Verdict:
     """share (P R P)_ii / P_ii of the posterior variance P that the priors with the information R
     explain: its own, those of others, and the weak ones of the nuisances; 1 where the data say
     nothing"""
-    own_share: dict[str, float]
-    """share of the posterior precision by the unknown's own prior"""
-    weak_share: dict[str, float]
-    """the same by the weak priors of nuisances"""
     groups: tuple[Group, ...]
     """what is not determined"""
     resting_groups: tuple[Group, ...]
     """what priors determine, and the data alone do not"""
-    factors: dict[str, float]
-    """of what is determined, but with a wide interval, the factor to its ends; infinite where that
-    reaches the end of its search"""
-    weakest: Weakest | None
-    """None where there is more to say than that"""
-    remedies: Mapping[str, str]
-    """by name, a further way out, as 'add a run with a known inertia'"""
-    switches: frozenset[str]
-    """the kinds of nuisances that may be switched off"""
-    through_zero: tuple[str, ...] = ()
-    """parameters that are determined, with an interval that holds zero: their sign is open"""
+    roughly: tuple[str, ...] = ()
+    """parameters that are determined, with a wide interval, or one that holds zero"""
     second: tuple[SecondSolution, ...] = ()
     """other values that the data do not tell from these"""
-    sentences: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+    """further sentences"""
+    nothing_because: str = ""
+    """a sentence that tells why nothing is determined, whatever the numbers are"""
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the unknowns (q,)."""
         return tuple(u.name for u in self.unknowns)
+
+    @property
+    def condition(self) -> float:
+        """Condition number of the whitened, scaled sensitivity."""
+        largest, smallest = map(float, self.singular_values[[0, -1]])
+        return largest / smallest if smallest > 0 else math.inf
+
+    @property
+    def combinations(self) -> tuple[Combination, ...]:
+        """Combinations that the data alone determine, of parameters not determined one by one."""
+        return tuple(c for g in (*self.groups, *self.resting_groups) for c in g.combinations)
 
     @property
     def not_identifiable(self) -> frozenset[str]:
@@ -195,33 +184,131 @@ class Verdict:
         groups = (*self.groups, *self.resting_groups)
         return tuple(dict.fromkeys(n.label for group in groups for n in group.exchanged))
 
-    def nothing(self, sentence: str) -> "Verdict":
-        """Return the verdict with no parameter determined, for a reason."""
+    def nothing(self, because: str) -> "Verdict":
+        """Return the verdict with no parameter determined, for a reason in a sentence."""
         return replace(
             self,
             identifiable=False,
-            combinations=(),
-            pairs=(),
             undetermined=tuple(n for n in self.names if n not in self.without_effect),
-            sentences=(sentence,),
+            pairs=(),
+            groups=(),
             resting_groups=(),
-            factors={},
-            through_zero=(),
+            roughly=(),
+            remarks=(),
+            nothing_because=because,
         )
 
     @property
     def text(self) -> str:
         """The verdict in words."""
-        return " ".join(self.sentences)
+        return " ".join((*_sentences(self), *self.remarks))
 
 
-def connected[T](sets: Iterable[Set[T]]) -> list[set[T]]:
-    """Return the unions of those sets that share a member, directly or through others."""
-    groups: list[set[T]] = []
-    for one in sets:
-        # One may join several groups that had nothing in common until now.
-        touched = [group for group in groups if group & one]
-        rest = [group for group in groups if not group & one]
-        joined = set(one).union(*touched)
-        groups = [*rest, joined] if joined else groups
-    return groups
+def _sentences(v: Verdict) -> list[str]:
+    """Return sentences on what the data determine, what they do not, and what can be done."""
+    if v.nothing_because:
+        return [v.nothing_because]
+    # At its bound the slope of what is searched through a tanh vanishes: that is no lack of effect.
+    bound = [u.name for u in v.unknowns if u.at_bound]
+    lines = [
+        sentence("verdict.without-effect", name=n, way_out=_way_out([n]))
+        for n in v.without_effect
+        if n not in bound
+    ]
+    lines += [
+        sentence("verdict.at-bound", name=u.name, value=u.value) for u in v.unknowns if u.at_bound
+    ]
+    for other in v.second:
+        here = {u.name: u.value for u in v.unknowns}
+        one, two = (
+            [f"{n} {values[n]:.4g}" for n in other.changed] for values in (here, other.values)
+        )
+        lines.append(sentence("verdict.also-fits", names=other.changed, here=one, there=two))
+    lines += [_not_determined(group, v) for group in v.groups]
+    # Each parameter is spoken of once: what comes later leaves out what an earlier one has named.
+    told = {*v.without_effect, *bound, *(n for group in v.groups for n in group.names)}
+    told |= {n for other in v.second for n in other.changed}
+    if partners := [n for n in v.undetermined if n not in told]:
+        lines.append(sentence("verdict.partners", names=partners))
+    told |= {*partners, *v.resting}
+    lines += [_resting(group, v) for group in v.resting_groups]
+    # To say that the data determine what the prior alone holds would be the worst mistake here: its
+    # interval is as narrow as any.
+    by_prior = [u.name for u in v.unknowns if u.prior and v.prior_share[u.name] > _BY_PRIOR]
+    by_prior = [n for n in by_prior if n not in told]
+    well = [n for n in v.names if n not in (*told, *by_prior, *v.roughly)]
+    wide = [n for n in v.roughly if n not in (*told, *by_prior)]
+    if well or wide:
+        lines.append(sentence("verdict.determined", well=well, wide=wide, both=bool(well and wide)))
+    if by_prior:
+        lines.append(sentence("verdict.by-prior", names=by_prior))
+    if v.identifiable and v.condition > ILL_CONDITIONED and not v.resting_groups:
+        weakest = np.linalg.eigh(v.covariance)[1][:, -1]
+        parts = [
+            f"{n} {part:+.2f}" for n, part in zip(v.names, weakest, strict=True) if abs(part) > 0.1
+        ]
+        lines.append(sentence("verdict.hardly-separated", parts=parts, condition=v.condition))
+    if pairs := [p for p in v.pairs if not {p.first, p.second} <= told]:
+        words = [f"{p.first} with {p.second} ({p.correlation:+.5f})" for p in pairs]
+        names = dict.fromkeys(n for p in pairs for n in (p.first, p.second))
+        lines.append(sentence("verdict.correlated", pairs=words, way_out=_way_out([*names])))
+    return lines
+
+
+def _not_determined(group: Group, v: Verdict) -> str:
+    """Return the sentence on a group that is not determined."""
+    names = group.names
+    code = "verdict.not-determined"
+    if group.combinations:
+        code = "verdict.only-combinations"
+    elif group.count < len(names):
+        # Slopes at one point tell how they trade off there; no number holds along the whole valley.
+        code = "verdict.only-together"
+    aliased = [u.name for u in v.unknowns if u.aliased and u.name in names]
+    return sentence(
+        code,
+        names=names,
+        only=[c.name for c in group.combinations],
+        exchanged=_exchanged(group),
+        aliased=sentence("verdict.aliased", names=aliased),
+        way_out=_way_out(names, group.count, group.exchanged),
+    )
+
+
+def _resting(group: Group, v: Verdict) -> str:
+    """Return the sentence on a group that priors determine."""
+    # Only a parameter with a prior can hold the others up; the rest of the group leans on it.
+    owners = [u.name for u in v.unknowns if u.prior > 0 and u.name in group.names]
+    return sentence(
+        "verdict.resting",
+        names=group.names,
+        only=[c.name for c in group.combinations],
+        owners=owners,
+        others=not owners,
+        exchanged=_exchanged(group),
+    )
+
+
+def _exchanged(group: Group) -> str:
+    nuisances = dict.fromkeys(n.words for n in group.exchanged)
+    return listed([*group.names, *nuisances]) if nuisances else ""
+
+
+def _way_out(
+    names: tuple[str, ...] | list[str], count: int = 1, exchanged: tuple[FlightUnknown, ...] = ()
+) -> str:
+    """Return remedies for parameters that the data do not separate, `count` of which have to be
+    known."""
+    # A gain or a shift has no value in the configuration: it goes with its switch, as biases do.
+    # A record in windows has no switch for initial states.
+    kinds = [n.kind for n in exchanged if n.kind != "initial_state"]
+    kinds += ["input_gain" for n in names if n.startswith("gain ")]
+    kinds += [n for n in names if n == "time_shift"]
+    parameters = [n for n in names if n != "time_shift" and not n.startswith("gain ")]
+    off = [f"fit.nuisance.{kind}" for kind in dict.fromkeys(kinds)]
+    # At most all of them: a direction may also run through gains and the time shift.
+    number = min(count, len(parameters))
+    few = number if number < len(parameters) else 0
+    return sentence(
+        "verdict.way-out", off=off, which=parameters, few=few, both=bool(off and parameters)
+    )

@@ -1,13 +1,9 @@
-"""Estimates with standard deviations and intervals: by Cramér-Rao's bound, or wider."""
+"""Estimates with standard deviations and intervals, by name and in their units."""
 
-from collections.abc import Collection, Mapping
-from dataclasses import replace
-from types import MappingProxyType
-from typing import NamedTuple
+from collections.abc import Mapping
 
 import jax.numpy as jnp
 import numpy as np
-import scipy.special
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
@@ -22,21 +18,11 @@ from heli_jax.identification.estimation.evaluation import (
 )
 from heli_jax.identification.estimation.filter_error import innovation_sums
 from heli_jax.identification.estimation.simulated_flights import measured_count
-from heli_jax.identification.identifiability.analysis import Around, unknowns_of, verdict_of
-from heli_jax.identification.identifiability.equivalents import Valley
-from heli_jax.identification.identifiability.profile import beyond_slopes
-from heli_jax.identification.identifiability.through_inputs import (
-    by_disturbance,
-    remarks,
-    through_inputs,
-)
-from heli_jax.identification.identifiability.verdict import Z95, SecondSolution, Unknown, Verdict
+from heli_jax.identification.identifiability.analysis import unknowns_of
+from heli_jax.identification.identifiability.verdict import Unknown
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.result import Estimate
-from heli_jax.identification.uncertainty.autocorrelated_residuals import (
-    residual_curvature,
-    sandwich,
-)
+from heli_jax.identification.uncertainty.standard_errors import StandardErrors
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import (
     FlightUnknown,
@@ -45,129 +31,6 @@ from heli_jax.identification.unknowns.layout import (
     flight_unknowns,
     unpack,
 )
-
-
-class StandardErrors(NamedTuple):
-    """Standard deviations and verdict at an optimum."""
-
-    verdict: Verdict
-    wider: Float[np.ndarray, " q"]
-    """by how much autocorrelated residuals widen the standard deviations of the unknowns"""
-    quantiles: Float[np.ndarray, " q"]
-    """standard deviations that a 95 % interval reaches to either side"""
-    coloured: bool
-    """whether the intervals allow for residuals that are not white"""
-    limits: Mapping[str, tuple[float, float]] = MappingProxyType({})
-    """by parameter the ends of its 95 % interval by the likelihood, in its unit, where the slopes
-    have others"""
-    by: Evaluation | None = None
-    """what the standard deviations go by where it is not the optimum's own Jacobian"""
-
-
-def standard_errors(
-    problem: Problem,
-    at: Solution,
-    e: Evaluation,
-    before: Verdict,
-    *,
-    white: bool,
-    aliased: Collection[str] = (),
-    second: tuple[SecondSolution, ...] = (),
-    optimum: bool = True,
-) -> StandardErrors:
-    """Return standard errors by the slopes, and by the likelihood where the slopes leave wide
-    intervals.
-
-    With process noise they are Cramér-Rao's bound of the innovations; where these are not white, or
-    the spectrum of a disturbance tells more of a parameter than the inputs do, that of the
-    responses to the inputs alone.
-
-    Args:
-        before: the verdict at the first guess, which stands where the optimum has no Jacobian.
-        white: whether the residuals are white and independent between outputs; of a method with
-            process noise whether the innovations are.
-        aliased: the parameters that move a mode which the samples do not tell from its aliases.
-        optimum: whether the point is one, about which the likelihood may be asked.
-    """
-    around = Around(frozenset(aliased), second, Valley(problem, at, e))
-
-    def slopes(e: Evaluation, around: Around) -> StandardErrors:
-        return _by_slopes(problem, at, e, before, around, white=white)
-
-    errors = slopes(e, around)
-    if not optimum:
-        return errors
-    reaches = errors.wider * errors.quantiles
-    inputs = through_inputs(at, e)
-    if inputs is None:
-        beyond = beyond_slopes(problem, at, e, errors.verdict, reaches, around)
-        return errors if beyond is around else slopes(e, beyond)._replace(limits=beyond.limits)
-    # Neither names combinations, which take time to look for.
-    by_all, by_inputs = (
-        verdict_of(problem, at.layout, told, around._replace(valley=None)) for told in (e, inputs)
-    )
-    told = by_disturbance(by_all, by_inputs)
-    # Of several outputs a pushed one moves the others, which is a response to a measured motion. A
-    # disturbance of one output has its spectrum alone, which only adds to what the inputs tell.
-    spectrum_alone = all(len(outputs) == 1 for outputs in at.layout.outputs)
-    counts = white and not (spectrum_alone and (told.resting or told.mostly))
-    asked, names = errors.verdict, told.resting
-    if not counts:
-        lacking = dict.fromkeys((*asked.undetermined, *by_inputs.undetermined))
-        asked = replace(asked, undetermined=tuple(lacking))
-    beyond = beyond_slopes(problem, at, e, asked, reaches, around)
-    if not counts:
-        # The likelihood has the colour in it: its ends hold where parameters rest on responses.
-        limits = {n: ends for n, ends in beyond.limits.items() if n not in told.wider}
-        beyond = beyond._replace(limits=limits)
-        if names or len(by_inputs.null_directions) > len(by_all.null_directions):
-            # Along directions that no input shows the colour has placed the optimum.
-            beyond = beyond._replace(valley=None)
-            names = names or by_inputs.undetermined
-    if beyond is not around:
-        errors = slopes(e if counts else inputs, beyond)
-    said = (*errors.verdict.sentences, *remarks(told, names, counts=counts, white=white))
-    verdict = replace(errors.verdict, sentences=said)
-    return errors._replace(verdict=verdict, limits=beyond.limits, by=None if counts else inputs)
-
-
-def _by_slopes(
-    problem: Problem,
-    at: Solution,
-    e: Evaluation,
-    before: Verdict,
-    around: Around,
-    *,
-    white: bool,
-) -> StandardErrors:
-    """Return Cramér-Rao's bound, or where the residuals are not white and their autocorrelation can
-    be estimated, the sandwich; the arguments are those of `standard_errors`."""
-    layout, objective = at.layout, at.layout.objective
-    usable = bool(np.all(np.isfinite(e.J)) and np.all(np.isfinite(e.r)))
-    freedom = max(objective.numbers(layout, at.data, at.noise) - layout.determined, 1)
-    quantile = float(scipy.special.stdtrit(freedom, 0.975))
-    quantiles = np.full(layout.size, quantile)
-    if white or not (usable and objective.noise_model == "white"):
-        verdict = verdict_of(problem, layout, e, around) if usable else before
-        # Weighed by the noise's own spectrum, the bound allows for it as it stands.
-        allowed = usable and not white and objective.noise_model == "spectrum"
-        return StandardErrors(verdict, np.ones(layout.size), quantiles, allowed)
-    errors = sandwich(layout, at.data, e, residual_curvature(layout, at.data, at.noise, at.z))
-    quantiles = np.maximum(errors.quantile(), quantile)
-    # The verdict, which takes 1.96 standard deviations, has to see the reported intervals.
-    k = len(layout.of_interest)
-    factor = quantiles[:k] / Z95
-    reported = errors.covariance()[:k, :k] * np.outer(factor, factor)
-
-    def widening(along: np.ndarray) -> tuple[float, float]:
-        of_all = np.pad(along, (0, layout.size - k))[None]
-        return float(errors.inflation(of_all)[0]), float(errors.quantile(of_all)[0])
-
-    around = around._replace(reported=reported, widening=widening)
-    return StandardErrors(
-        verdict_of(problem, layout, e, around), errors.inflation(), quantiles, True
-    )
-
 
 _STEP = 1e-3
 """of a coordinate, for a difference"""

@@ -79,8 +79,6 @@ class Record(NamedTuple):
     """Compared signals of a flight: SI, NaN where nothing is measured."""
 
     label: str
-    dt: float
-    """[s]"""
     measured: Mapping[str, np.ndarray]
     simulated: Mapping[str, np.ndarray]
 
@@ -125,8 +123,6 @@ class Adequacy(NamedTuple):
     """outputs of which nothing is explained, though what is left may be noise"""
     still: tuple[str, ...] = ()
     """outputs that never move, of which nothing is judged"""
-    unstable: bool = False
-    """whether the model is, over the length of the record"""
 
     @property
     def denied(self) -> bool:
@@ -164,11 +160,8 @@ class Evidence(NamedTuple):
 
 
 def misses(expected: Mapping[str, float]) -> bool:
-    """True if a simulation misses an output by more than its disturbance lets expect.
-
-    Args:
-        expected: by output the power of its error over that which is expected.
-    """
+    """True if a simulation misses an output by more than its disturbance lets expect, from the
+    power of its errors over that which is expected."""
     return max(expected.values()) > EXPECTED
 
 
@@ -189,7 +182,10 @@ def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
     disturbed = evidence.error_ratio is not None
     # Linearising takes a compiled program of its own, so it is asked only where the answer counts.
     unstable = disturbed and evidence.ahead is None and is_unstable(problem, params)
-    still = tuple(n for n in evidence.agreement if _still(n, evidence.records))
+    # What never moves has an error and no VAF.
+    still = tuple(
+        n for n, m in evidence.agreement.items() if np.isnan(m.vaf) and np.isfinite(m.rmse)
+    )
     outputs = tuple(
         _of_output(name, m, evidence, unstable)
         for name, m in evidence.agreement.items()
@@ -202,8 +198,7 @@ def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
         outputs = tuple(output._replace(adequate=False) for output in outputs)
         return Adequacy(outputs, by_chance=True, still=still)
     unmoved = tuple(o.output for o in noise if o.adequate)
-    unstable = unstable or (bad and is_unstable(problem, params))
-    return Adequacy(outputs, False, evidence.ahead, unmoved, still, unstable)
+    return Adequacy(outputs, False, evidence.ahead, unmoved, still)
 
 
 _BY_CHANCE = 1e-3
@@ -226,16 +221,6 @@ def _of_noise(output: OutputAdequacy, evidence: Evidence) -> bool:
 def _of_all_flights(name: str, records: tuple[Record, ...]) -> np.ndarray:
     """The measured output (any,), flight after flight."""
     return np.concatenate([r.measured[name] for r in records if name in r.measured])
-
-
-def _still(name: str, records: tuple[Record, ...]) -> bool:
-    """True if an output never moves, so that nothing is to be explained."""
-    # By its range: the mean of equal numbers, and so their variance, is off by rounding. As
-    # `metrics` has it, so that what has no VAF is not judged by one.
-    return all(
-        np.nanmax(y) - np.nanmin(y) <= 1e-9 * np.nanmax(np.abs(y))
-        for y in (r.measured[name] for r in records if name in r.measured)
-    )
 
 
 def _of_output(name: str, m: Metrics, evidence: Evidence, unstable: bool) -> OutputAdequacy:

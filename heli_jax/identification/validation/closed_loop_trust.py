@@ -87,11 +87,32 @@ def moved_by_feedback(at: Solution, J: Float[np.ndarray, "n q"]) -> dict[str, Mo
     """By unknown of interest; empty where the method knows no frequencies, or every input that
     moves is taken by instrument.
     """
-    layout, data, noise, _ = at
-    if layout.objective.fits_responses:
-        return _of_responses(at)
+    layout, q = at.layout, len(at.layout.of_interest)
     if layout.noise_model != "spectrum":
         return {}
+    responses = layout.objective.fits_responses
+    room = _room_of_responses(at) if responses else _room_of_records(at)
+    if not room:
+        return {}
+    # Up to where the loop that holds an unstable mode has to reach nothing tells test from
+    # correction.
+    poles, inside = held_poles(at), [np.zeros_like(v) for v in room]
+    for record, v in zip(() if responses else records_of(layout), inside, strict=False):
+        dt = float(at.data.flights[record.flight].dt)
+        omega = 2.0 * np.pi * np.arange(1, record.lines + 1) / (record.samples * dt)
+        v[omega <= _REACHES * poles[record.flight]] = 1.0
+    whole = (
+        information(at, [np.ones_like(v) for v in room]) if responses else J[:q, :q].T @ J[:q, :q]
+    )
+    may_be, held = (shares(information(at, w), whole) for w in (room, inside))
+    each = zip(layout.of_interest, may_be, held, strict=True)
+    return {n: Moved(float(m), float(h)) for n, m, h in each}
+
+
+def _room_of_records(at: Solution) -> list[Float[np.ndarray, " K"]]:
+    """By record and line the part of the inputs that feedback may have brought in; empty if all
+    inputs are taken by instrument."""
+    layout, data, noise, _ = at
     joint, inputs = [], list(naming.asdict(data.flights[0].inputs))
     for record in records_of(layout):
         flight, part = data.flights[record.flight], slice(record.first, record.last)
@@ -102,24 +123,26 @@ def moved_by_feedback(at: Solution, J: Float[np.ndarray, "n q"]) -> dict[str, Mo
     by = inputs_by_instrument(data) if data.flights[0].by_instrument is not None else ()
     direct = np.array([n not in by for n, moves in zip(inputs, moving, strict=True) if moves])
     if not direct.any():
-        return {}
+        return []
     kept = np.r_[moving, np.ones(joint[0].shape[1] - moving.size, bool)]
     W = [np.asarray(w) for w in noise.whitening]
     errors = jax.device_get(errors_of_lines(*at).errors)
     spectra = (W, smoothed([v[:, kept] for v in joint], _PART), smoothed(errors, _PART))
-    room = once_a_length(functools.partial(_room, direct=direct), *spectra)
-    q = len(layout.of_interest)
-    whole = J[:q, :q].T @ J[:q, :q]
-    # Up to where the loop that holds an unstable mode has to reach nothing tells test from
-    # correction.
-    poles, inside = held_poles(at), []
-    for record in records_of(layout):
-        dt = float(data.flights[record.flight].dt)
-        omega = 2.0 * np.pi * np.arange(1, record.lines + 1) / (record.samples * dt)
-        inside.append((omega <= _REACHES * poles[record.flight]).astype(float))
-    may_be, held = (shares(information(at, w), whole) for w in (room, inside))
-    each = zip(layout.of_interest, may_be, held, strict=True)
-    return {n: Moved(float(m), float(h)) for n, m, h in each}
+    return list(once_a_length(functools.partial(_room, direct=direct), *spectra))
+
+
+def _room_of_responses(at: Solution) -> list[Float[np.ndarray, " k"]]:
+    """The same of fitted responses, by line of their windows."""
+    layout, data, noise, z = at
+    w, density = noise.whitening.windows, np.asarray(noise.whitening.density)
+    direct = np.array([n not in w.instruments for n in w.inputs])
+    if not direct.any():
+        return []
+    # A method of the estimator: its module stands above this one in the order of imports.
+    E = np.asarray(layout.objective.errors_in_windows(layout, data, noise, z))
+    joint = np.concatenate([np.asarray(w.U), np.asarray(w.Y)], axis=2)
+    S, See = (np.einsum("wka,wkb->kab", v, np.conj(v)) / len(v) for v in (joint, E))
+    return [_room(np.linalg.inv(np.linalg.cholesky(density)), S, See, direct)]
 
 
 def shares(
@@ -132,35 +155,6 @@ def shares(
     of_part = np.diagonal(covariance @ (part / np.outer(sd, sd)) @ covariance)
     with np.errstate(all="ignore"):
         return np.clip(np.nan_to_num(of_part / np.diagonal(covariance)), 0.0, 1.0)
-
-
-def _of_responses(at: Solution) -> dict[str, Moved]:
-    """The same of fitted responses: how much of the inputs feedback may have brought in."""
-    layout, data, noise, z = at
-    w, density = noise.whitening.windows, np.asarray(noise.whitening.density)
-    direct = np.array([n not in w.instruments for n in w.inputs])
-    if not direct.any():
-        return {}
-    # A method of the estimator: its module stands above this one in the order of imports.
-    E = np.asarray(layout.objective.errors_in_windows(layout, data, noise, z))
-    joint = np.concatenate([np.asarray(w.U), np.asarray(w.Y)], axis=2)
-    S = np.einsum("wka,wkb->kab", joint, np.conj(joint)) / len(joint)
-    See = np.einsum("wka,wkb->kab", E, np.conj(E)) / len(E)
-    room = _room(np.linalg.inv(np.linalg.cholesky(density)), S, See, direct)
-    by_line = information_by_line(at)
-    may_be = shares(np.einsum("k,kab->ab", room, by_line), by_line.sum(axis=0))
-    return {n: Moved(float(m)) for n, m in zip(layout.of_interest, may_be, strict=True)}
-
-
-def information_by_line(at: Solution) -> Float[np.ndarray, "k q q"]:
-    """Information on the unknowns of interest at each line of the windows of fitted responses."""
-    layout, data, noise, z = at
-    k, r = np.asarray(noise.whitening.whitening).shape[:2]
-    q = len(layout.of_interest)
-    # Real parts, then imaginary ones.
-    J = np.asarray(residual_and_jacobian(layout, data, noise, z).J)
-    J = J[: 2 * k * r, :q].reshape(2, k, r, q)
-    return np.einsum("ckra,ckrb->kab", J, J)
 
 
 def held_poles(at: Solution) -> list[float]:
@@ -245,11 +239,18 @@ def _room(
 def information(
     at: Solution, weights: Sequence[Float[np.ndarray, " K"]]
 ) -> Float[np.ndarray, "q q"]:
-    """Information on the unknowns of interest, each frequency by its weight."""
+    """Information on the unknowns of interest, each frequency by its weight; weights by record, or
+    those of the windows of fitted responses."""
     layout, data, noise, z = at
     q = len(layout.of_interest)
     if not any(np.any(w) for w in weights):
         return np.zeros((q, q))
+    if layout.objective.fits_responses:
+        k, r = np.asarray(noise.whitening.whitening).shape[:2]
+        # Real parts, then imaginary ones.
+        J = np.asarray(residual_and_jacobian(layout, data, noise, z).J)
+        J = J[: 2 * k * r, :q].reshape(2, k, r, q)
+        return np.einsum("k,ckra,ckrb->ab", weights[0], J, J)
     weighed: Noise = noise._replace(
         whitening=tuple(
             np.asarray(W) * np.sqrt(w)[:, None, None]
@@ -282,7 +283,6 @@ def weak_by_instrument(problem: Problem, at: Solution) -> tuple[str, ...]:
     if layout.noise_model != "spectrum" or not instruments_of(problem):
         return ()
     if layout.objective.fits_responses:
-        # By the lines of the windows of the responses.
         flights = problem.training
         by = instrumented_inputs(problem, flights)
         if by is None:
@@ -290,9 +290,8 @@ def weak_by_instrument(problem: Problem, at: Solution) -> tuple[str, ...]:
         signals = [(f.inputs, b) for f, b in zip(flights, by, strict=True)]
         F = _followed(signals, [(0, f.n_samples) for f in flights])[1][0]
         hz = np.arange(1, len(F) + 1) / (flights[0].n_samples * flights[0].dt)
-        by_line = information_by_line(at)
-        part = by_line[np.interp(noise.whitening.windows.hz, hz, F) < STRONG].sum(axis=0)
-        whole = by_line.sum(axis=0)
+        F = [np.interp(noise.whitening.windows.hz, hz, F)]
+        direct, followed = at, [np.ones_like(f) for f in F]
     elif data.flights[0].by_instrument is None:
         return ()
     else:
@@ -303,8 +302,8 @@ def weak_by_instrument(problem: Problem, at: Solution) -> tuple[str, ...]:
         ]
         followed, F = _followed(signals, [(r.first, r.last) for r in records])
         direct = at._replace(noise=noise._replace(by_instrument=np.zeros(())))
-        weak = [g * (f < STRONG) for g, f in zip(followed, F, strict=True)]
-        part, whole = information(direct, weak), information(direct, followed)
+    weak = [g * (f < STRONG) for g, f in zip(followed, F, strict=True)]
+    part, whole = information(direct, weak), information(direct, followed)
     each = zip(layout.of_interest, shares(part, whole), strict=True)
     return tuple(n for n, share in each if share > _MOST)
 

@@ -17,7 +17,7 @@ partial coherence.
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import jax
@@ -46,7 +46,7 @@ _LEAST_POWER = 1e-3
 _SEEN = 0.8
 """part of an output's samples that has to be measured: the holes are bridged by straight lines"""
 _ROUNDING = 1e-6
-"""part of an input's power below which nothing is left of it"""
+"""part of the inputs' power below which a combination of them is rounding"""
 
 
 class Followed(NamedTuple):
@@ -157,31 +157,37 @@ def _bridged(y: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
 
 
 def _pairs(X: Complex[np.ndarray, "K m"], moving: Sequence[str]) -> tuple[Pair, ...]:
-    """The coherence of each two inputs."""
-    pairs, inputs = [], X.shape[1]
-    for a, b in itertools.combinations(range(inputs), 2):
-        u, v, others = X[:, [a]], X[:, [b]], np.delete(X, [a, b], axis=1)
-        alone, beside, both = (
-            _in_bands(v[:, :, None], drives, inputs=inputs)
-            for drives in (u, others, np.hstack([others, u]))
-        )
-        power, own = (
-            np.sum(bands.whole, axis=(1, 2))
-            for bands in (alone, _in_bands(u[:, :, None], v, inputs=inputs))
-        )
-        by_alone, by_others, by_both = (v.followed[:, 0, 0] for v in (alone, beside, both))
-        left = power - by_others
-        # Where the others explain all of one, what is left is rounding: the pair by itself.
-        known = left > _ROUNDING * power
-        part = np.where(known, by_both - by_others, by_alone) / np.maximum(
-            np.where(known, left, power), 1e-300
-        )
-        coherence = np.clip(part, 0.0, 1.0)
+    """The coherence of each two inputs, from the inverse of their spectra in each band."""
+    powers, coherences, m = list[np.ndarray](), list[np.ndarray](), len(moving)
+    for band in _band_slices(*X.shape):
+        S = X[band].T @ np.conj(X[band])
+        powers.append(np.real(np.diag(S)))
+        size = np.sqrt(np.where(powers[-1] > 0, powers[-1], 1.0))
+        P = np.linalg.pinv(S / np.outer(size, size), rcond=_ROUNDING, hermitian=True)
+        own = np.real(np.diag(P))
+        part = np.abs(P) ** 2 / np.maximum(np.outer(own, own), 1e-300)
+        # Less what chance makes of so many lines.
+        n = band.stop - band.start - m + 2
+        coherences.append(np.clip((n * part - 1.0) / (n - 1), 0.0, 1.0))
+    if not powers:
+        return ()
+    parts = np.stack(powers) / np.maximum(np.sum(powers, axis=0), 1e-300)
+    pairs = []
+    for a, b in itertools.combinations(range(m), 2):
         # Where both have power: that is where each could be taken for the other.
-        weights = np.min([p / max(float(np.sum(p)), 1e-300) for p in (power, own)], axis=0)
-        mean = float(np.sum(coherence * weights) / max(float(np.sum(weights)), 1e-300))
+        weights = np.minimum(parts[:, a], parts[:, b])
+        values = np.stack(coherences)[:, a, b]
+        mean = float(weights @ values / max(float(np.sum(weights)), 1e-300))
         pairs.append(Pair((moving[a], moving[b]), mean))
     return tuple(sorted(pairs, key=lambda pair: -pair.coherence))
+
+
+def _band_slices(lines: int, m: int) -> Iterator[slice]:
+    """Bands of a number of lines, each wide enough for m excitations."""
+    first, size = 0, float(max(_FIRST, 4 * m))
+    while first + int(size) <= lines:
+        yield slice(first, first + int(size))
+        first, size = first + int(size), size * _GROWTH
 
 
 def least_rough(flights: Sequence[Flight]) -> tuple[str, float]:
@@ -204,9 +210,6 @@ def least_rough(flights: Sequence[Flight]) -> tuple[str, float]:
 def residual_against_excitation(problem: Problem, at: Solution) -> dict[str, Followed]:
     """Return by output the part of its residual that follows the excitation; outputs of too few
     lines are left out.
-
-    Args:
-        at: where a fit by frequency error ended.
     """
     errors = jax.device_get(errors_of_lines(*at).errors)
     by = instruments_of(problem) if at.data.flights[0].by_instrument is not None else ()
@@ -304,20 +307,15 @@ def _in_bands(
     signals: Complex[np.ndarray, "K p c"],
     X: Complex[np.ndarray, "K m"],
     size: Float[np.ndarray, "K s"] | None = None,
-    inputs: int = 0,
 ) -> _Bands:
     """Explain signals by an excitation in each band.
 
     Args:
         size: of each output, or (s = 1) of all; one unless given.
-        inputs: as many as bands have to tell apart; those of X unless given.
     """
     size = np.ones((len(X), 1)) if size is None else size
-    first, lines = 0, float(max(_FIRST, 4 * (inputs or X.shape[1])))
     found = list[tuple[_Bands, np.ndarray]]()
-    while first + int(lines) <= len(X):
-        n, band = int(lines), slice(first, first + int(lines))
-        first, lines = band.stop, lines * _GROWTH
+    for band in _band_slices(*X.shape):
         over = 1.0 / size[band].T
         # All outputs side by side: each has excitations of its own size.
         Q, R = np.linalg.qr(X[None, band] * over[:, :, None])
@@ -330,7 +328,8 @@ def _in_bands(
         parts = np.sum(np.abs(np.conj(np.swapaxes(Q, 1, 2)) @ v) ** 2, axis=1)
         scale = np.broadcast_to(np.mean(size[band] ** 2, axis=0), m.shape)
         density = np.mean(np.abs(X[band]) ** 2, axis=0)
-        found.append((_Bands(np.array([n]), m, whole, parts, scale, np.array(False)), density))
+        n = np.array([band.stop - band.start])
+        found.append((_Bands(n, m, whole, parts, scale, np.array(False)), density))
     if not found:
         p, c = signals.shape[1:]
         b1, bp, bpc = np.zeros((0, 1)), np.zeros((0, p)), np.zeros((0, p, c))

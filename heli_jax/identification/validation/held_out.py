@@ -15,13 +15,12 @@ from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate, simulated_outputs
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines, parts_of
-from heli_jax.identification.estimation.levenberg_marquardt import optimise, residual_and_jacobian
+from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.estimation.noise_covariance import first_noise, first_noise_sizes
 from heli_jax.identification.estimation.output_error import in_time
 from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
-    Data,
     Layout,
     Noise,
     Solution,
@@ -29,9 +28,6 @@ from heli_jax.identification.unknowns.layout import (
     layout_of,
 )
 from heli_jax.identification.validation.excitation import LEVEL, errors_against_excitation
-
-_STEPS = 60
-"""of Levenberg-Marquardt at most"""
 
 
 class Validation(NamedTuple):
@@ -41,15 +37,13 @@ class Validation(NamedTuple):
     free_run: tuple[dict[str, np.ndarray], ...] | None
     """with windows: by flight and output the simulation (N,) in one piece from the initial state of
     the first window, with the bias; None without windows"""
-    converged: bool
-    """whether initial states and biases were found"""
 
 
 def validate(
     problem: Problem, layout: Layout, z: Array, noise: Noise, held: tuple[Flight, ...]
 ) -> Validation:
     """Predict the flights held out with the estimates; only their initial states (of every window)
-    and biases are adjusted, by least squares.
+    and biases are adjusted, by least squares of the simulation.
 
     Args:
         z: (q,) the optimum of the fitted flights in `layout`.
@@ -59,20 +53,14 @@ def validate(
     # What no line of a spectrum knows, the initial states and biases, shows in time alone.
     if other.objective.noise_model == "spectrum":
         other = replace(other, objective=objective_of("output-error"))
-    data = data_of(problem, held, other)
+    data, first = data_of(problem, held, other), layout.first_nuisance
     # From any point a linear model's are found in one step, so zero, the middle of their weak
     # priors, will do.
-    begin = jnp.zeros(other.size - layout.first_nuisance, z.dtype)
+    begin = jnp.zeros(other.size - first, z.dtype)
     if not problem.model.linear:
-        begin = start_vector(other, data, problem)[layout.first_nuisance :]
-    full = jnp.concatenate([z[: layout.first_nuisance], begin])
+        begin = start_vector(other, data, problem)[first:]
     their_noise = _noise_of(problem, layout, noise, held)
-    converged = True
-    if layout.noise_model == "spectrum":
-        full = in_time(other, data, their_noise, full)
-    elif other.size > layout.first_nuisance:
-        adjust = _linear if problem.model.linear else _damped
-        full, converged = adjust(other, data, their_noise, full)
+    full = in_time(other, data, their_noise, jnp.concatenate([z[:first], begin]))
     e = evaluate(other, data, their_noise, full)
     # With windows the agreement is that of many short runs. How far the model is good for by itself
     # only a run in one piece shows.
@@ -80,7 +68,7 @@ def validate(
     if any(count > 1 for count, _ in other.windows):
         one_piece, whole = _in_one_piece(other, full)
         free_run = simulated_outputs(one_piece, data, whole)
-    return Validation(e, free_run, converged)
+    return Validation(e, free_run)
 
 
 def _noise_of(problem: Problem, layout: Layout, noise: Noise, held: tuple[Flight, ...]) -> Noise:
@@ -97,28 +85,6 @@ def _noise_of(problem: Problem, layout: Layout, noise: Noise, held: tuple[Flight
     return guess._replace(
         sd=tuple({n: known.get(n, s) for n, s in flight.items()} for flight in guess.sd)
     )
-
-
-def _linear(layout: Layout, data: Data, noise: Noise, z: Array) -> tuple[Array, bool]:
-    """A model that is linear in its states: one least-squares solution."""
-    e = evaluate(layout, data, noise, z)
-    # Whatever the rest of z, predictions are linear in the initial states, biases and offsets.
-    columns, r = np.asarray(e.J)[:, layout.first_nuisance :], np.asarray(e.r)
-    if not (np.isfinite(columns).all() and np.isfinite(r).all()):
-        return z, False
-    step, *_ = np.linalg.lstsq(columns, -r, rcond=1e-10)
-    return z.at[layout.first_nuisance :].add(jnp.asarray(step, z.dtype)), True
-
-
-def _damped(layout: Layout, data: Data, noise: Noise, z: Array) -> tuple[Array, bool]:
-    """The fit's own Levenberg-Marquardt, with all that the flights share held."""
-    # Plain Gauss-Newton steps from the model's own initial state diverge where the estimates are
-    # off: an inertia 10 % wrong gave a yaw VAF of -3.0 for 0.999.
-    held = np.arange(layout.size) < layout.first_nuisance
-    optimum = optimise(layout, data, noise, z, _STEPS, held=held)
-    if not (np.isfinite(optimum.cost) and bool(jnp.all(jnp.isfinite(optimum.z)))):
-        return z, False
-    return optimum.z, bool(optimum.converged)
 
 
 def _in_one_piece(layout: Layout, z: Array) -> tuple[Layout, Array]:
@@ -190,35 +156,22 @@ class HeldOutFrequency(NamedTuple):
     """the flights that cannot be compared with the fitted ones"""
 
 
-class _Fitted(NamedTuple):
-    """The estimates of a fit, and what it knows of them."""
-
-    information: Float[np.ndarray, "q q"]
-    names: tuple[str, ...]
-    values: Float[np.ndarray, " q"]
-    slopes: Float[np.ndarray, " q"]
-
-
 def validate_in_frequency(
     problem: Problem, at: Solution, e: Evaluation, held: Sequence[Flight], *, feedback: bool
 ) -> HeldOutFrequency | None:
     """Judge the flights held out of a fit in frequency; None of a fit in time.
 
     Args:
-        at: where the fit ended.
         feedback: True if inputs follow the outputs and no instrument is used.
     """
-    q = len(at.layout.of_interest)
-    J = np.asarray(e.J, float)[:, :q]
-    if not held or at.layout.noise_model != "spectrum" or not np.isfinite(J).all():
+    if not held or at.layout.noise_model != "spectrum" or not np.isfinite(e.J).all():
         return None
-    fitted = _Fitted(J.T @ J, at.layout.of_interest, np.asarray(e.named), np.asarray(e.slopes))
     judged, others = [], []
     for label, flight in zip(labels(tuple(held)), held, strict=True):
         part, one = _comparable(problem, at, flight, feedback=feedback), None
         if part is not None:
             with np.errstate(all="ignore"):
-                one = _judged(problem, at, fitted, label, part)
+                one = _judged(problem, at, e, label, part)
         if one is None:
             others.append(label)
         else:
@@ -242,7 +195,7 @@ def _comparable(problem: Problem, at: Solution, flight: Flight, *, feedback: boo
 
 
 def _judged(
-    problem: Problem, at: Solution, fit: _Fitted, label: str, flight: Flight
+    problem: Problem, at: Solution, fitted: Evaluation, label: str, flight: Flight
 ) -> HeldOutFlight | None:
     """One flight; None if its errors have no spectrum."""
     # At the lines of the whole flight, also after a fit of responses.
@@ -270,11 +223,11 @@ def _judged(
     worse = [n for n, f in followed.items() if f.p_value < level and not f.explained >= 0.0]
     known = [n for n, f in followed.items() if f.by_chance < _SURE or n in worse]
     explained = {n: min(followed[n].explained, 1.0) for n in known}
-    return HeldOutFlight(label, *_own_estimates(r, J, fit), explained, tuple(worse))
+    return HeldOutFlight(label, *_own_estimates(r, J, at, fitted), explained, tuple(worse))
 
 
 def _own_estimates(
-    r: Float[np.ndarray, " r"], J: Float[np.ndarray, "r q"], fit: _Fitted
+    r: Float[np.ndarray, " r"], J: Float[np.ndarray, "r q"], at: Solution, fitted: Evaluation
 ) -> tuple[float | None, Furthest | None]:
     """The chance that the flight's own estimates lie as far from the fit's, and the furthest; None
     where the two have no direction in common.
@@ -282,15 +235,17 @@ def _own_estimates(
     Args:
         r: the flight's errors, in units of its own noise.
     """
-    own, known = J.T @ J, fit.information
+    names, values = at.layout.of_interest, np.asarray(fitted.named)
+    of_fit, slopes = np.asarray(fitted.J, float)[:, : len(names)], np.asarray(fitted.slopes)
+    own, known = J.T @ J, of_fit.T @ of_fit
     if not (np.isfinite(own).all() and np.isfinite(r).all()):
         return None, None
     sizes = np.sqrt(np.diag(own + known))
     sizes = np.where(sizes > 0, sizes, 1.0)
     b, (own, known) = J.T @ r / sizes, (v / np.outer(sizes, sizes) for v in (own, known))
-    values, vectors = np.linalg.eigh(own + known)
-    kept = values > _NO_EFFECT * values[-1]
-    root = vectors[:, kept] / np.sqrt(values[kept])
+    sums, vectors = np.linalg.eigh(own + known)
+    kept = sums > _NO_EFFECT * sums[-1]
+    root = vectors[:, kept] / np.sqrt(sums[kept])
     shares, turned = np.linalg.eigh(root.T @ own @ root)
     # A direction that only one of the two determines cannot be compared.
     both = (shares > _NO_EFFECT) & (shares < 1.0 - _NO_EFFECT)
@@ -299,9 +254,9 @@ def _own_estimates(
     directions, shares = root @ turned[:, both], shares[both]
     along = directions.T @ b
     p = scipy.special.chdtrc(int(both.sum()), np.sum(along**2 * (1.0 / shares - 1.0)))
-    moved = -(directions @ (along / shares)) / sizes * fit.slopes
+    moved = -(directions @ (along / shares)) / sizes * slopes
     sd = np.sqrt(np.sum(directions**2 / (shares * (1.0 - shares)), axis=1)) / sizes
-    sds = np.abs(moved) / np.maximum(sd * np.abs(fit.slopes), 1e-300)
+    sds = np.abs(moved) / np.maximum(sd * np.abs(slopes), 1e-300)
     k = int(np.argmax(sds))
-    own_value = float(fit.values[k] + moved[k])
-    return float(p), Furthest(fit.names[k], own_value, float(fit.values[k]), float(sds[k]))
+    own_value = float(values[k] + moved[k])
+    return float(p), Furthest(names[k], own_value, float(values[k]), float(sds[k]))

@@ -19,7 +19,6 @@ from heli_jax.analysis.linear import linearize
 from heli_jax.analysis.operating_point import OperatingPoint, operating_point
 from heli_jax.dynamics.onboard.filters import states_behind
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.identifiability.equivalents import SAME, Valley
 from heli_jax.identification.problem import Problem
 from heli_jax.numerics.jumps import split
 from heli_jax.numerics.white_noise import white_part
@@ -134,8 +133,6 @@ class Rate(NamedTuple):
     mode: _Mode
     least: float
     """samples in a period of the mode, below which nothing of it is seen"""
-    staircase: bool = False
-    """true for an input of steps of equal length"""
 
     @property
     def samples(self) -> float:
@@ -157,9 +154,7 @@ def rates_against_modes(
         rate = input_rate(flight, name, u)
         felt = [mode for mode in modes if mode.input == name]
         if rate is not None and felt:
-            # All stairs of one length are a clock's, and so is a test signal with a clock.
-            stairs = flight.hold[name] == "zero-order"
-            rates.append(Rate((name,), rate, felt[-1], RATE.hopeless, stairs))
+            rates.append(Rate((name,), rate, felt[-1], RATE.hopeless))
     of = {y: output_rate(flight, y) for y in flight.outputs}
     fastest = max(of.values())
     # A decay has no alias, but between two samples all of it may be over.
@@ -278,9 +273,9 @@ def power_between_samples(flight: Flight, name: str) -> tuple[float, float] | No
 # past the Nyquist frequency is one of many that fit as well, each with a narrow interval.
 
 
-_NEAR, _AT_NYQUIST = 0.8, 0.9
-"""parts of the Nyquist frequency from which on the samples hardly show a mode: from the first its
-alias is tried, from the second nobody has to ask"""
+_NEAR = 0.8
+"""part of the Nyquist frequency from which on the samples hardly show a mode, and an alias beyond
+it fits as well"""
 _MOVED = 1e-6
 """relative change of a mode, for a relative change of a parameter, that is none"""
 _TURNED = 0.2
@@ -291,8 +286,6 @@ _SWINGS = 10.0
 between the samples, and any other frequency past them fits as well"""
 _STEP = 1e-4
 """relative step of the parameters for these changes"""
-
-# params is Any: a record of a model's Params, whose class may be a user's own.
 
 
 class FastMode(NamedTuple):
@@ -307,8 +300,6 @@ class FastMode(NamedTuple):
     """where the model was linearised; empty for a linear one"""
     undetermined: tuple[str, ...]
     """the free parameters that can take it to an alias, where it shows in an output"""
-    turning: tuple[tuple[str, float], ...] = ()
-    """those that can, whether it shows or not, each with the factor that takes it there"""
 
 
 def measurement_noise(
@@ -333,86 +324,41 @@ def fast_modes(
         values: of the free parameters, SI; gains and shifts among them move no mode.
         noise: sd by flight and output, SI; without it nothing is said to be undetermined.
     """
-    free = {n: v for n, v in values.items() if n in problem.free}
-    flights = zip(problem.training, noise or [None] * len(problem.training), strict=True)
-    modes = [_of_flight(problem, flight, free, of) for flight, of in flights]
-    return [mode for mode in modes if mode is not None]
-
-
-def _of_flight(
-    problem: Problem, flight: Flight, free: Mapping[str, float], noise: Mapping[str, Any] | None
-) -> FastMode | None:
-    here = {**free, **flight.known}
-    modes = _modes_of(problem, problem.params_with(here), flight)
-    if modes is None:
-        return None
-    nyquist = np.pi / flight.dt
-    # The imaginary part alone: a fast decay without oscillation has no alias.
-    past = [k for k, v in enumerate(modes.eigenvalues) if v.imag >= _NEAR * nyquist]
-    if not past:
-        return None
-    slopes = _relative_slopes(problem, here, [n for n in free if n not in flight.known], modes)
-    # A filter or a servo whose constants are given is simulated as it is, and has no alias.
-    past = [k for k in past if any(abs(s[k]) > _MOVED for s in slopes.values())]
-    if not past:
-        return None
-    first = max(past, key=lambda k: float(modes.eigenvalues[k].imag))
-    fastest = float(modes.eigenvalues[first].imag)
-    lost = []
-    for k in past:
-        swing, decay = modes.eigenvalues[k].imag, -modes.eigenvalues[k].real
+    fast = []
+    for i, flight in enumerate(problem.training):
+        here = {**{n: v for n, v in values.items() if n in problem.free}, **flight.known}
+        modes, nyquist = _modes_of(problem, problem.params_with(here), flight), np.pi / flight.dt
+        # The imaginary part alone: a fast decay without oscillation has no alias.
+        if modes is None or not np.any(modes.eigenvalues.imag >= _NEAR * nyquist):
+            continue
+        slopes = _relative_slopes(problem, here, [n for n in here if n not in flight.known], modes)
+        # A filter or a servo whose constants are given is simulated as it is, and has no alias.
+        past = modes.eigenvalues.imag >= _NEAR * nyquist
+        past &= np.any([np.abs(s) > _MOVED for s in slopes.values()], axis=0)
+        if not past.any():
+            continue
+        swing, decay = modes.eigenvalues.imag, -modes.eigenvalues.real
         # What is gone within a sample swings in none, under any alias, unless it swings many times
         # before it is gone: then its frequency was told by nothing.
-        swings = decay * flight.dt < 1.0 or swing > decay * _SWINGS
-        shows = noise is not None and modes.strongest(k, problem, flight, noise)[0] >= RATE.shows
-        lost += [k] if swing >= _AT_NYQUIST * nyquist and swings and shows else []
-    # A prior excludes the alias; the modes of a delay are an approximation's.
-    turn = {
-        n: np.imag(s)
-        for n, s in slopes.items()
-        if problem.free[n].prior is None and n not in problem.model.delay_parameters
-    }
-    undetermined = tuple(n for n, s in turn.items() if any(abs(s[lost]) > _TURNED))
-    # By powers: that is how a frequency goes with a stiffness or a time constant.
-    other = max(2.0 * nyquist - fastest, 0.0) / fastest
-    turning = {n: s[first] for n, s in turn.items() if other > 0 and abs(s[first]) > _TURNED}
-    return FastMode(
-        flight.name or "the flight",
-        fastest,
-        nyquist,
-        modes.at.words,
-        undetermined,
-        tuple((n, float(other ** (1.0 / s))) for n, s in turning.items()),
-    )
-
-
-_AS_GOOD = 0.02
-"""of the sum of squares by which an alias may be worse and still fit as well: where a model lacks
-something, chi-squared's few squares tell nothing"""
-
-
-def as_good_as_aliases(modes: Sequence[FastMode], valley: Valley) -> list[FastMode]:
-    """Return the modes, each with the parameters that take it to an alias which fits as well."""
-    # A filter's rows hold the level of its variances too, and no squares to take a part of.
-    if valley.at.layout.noise_model != "white":
-        return list(modes)
-    values = dict(zip(valley.at.layout.of_interest, valley.e.named, strict=True))
-    worse = max(SAME, _AS_GOOD * float(np.sum(np.square(np.asarray(valley.e.r, np.float64)))))
-    aliased = []
-    for mode in modes:
-        more = []
-        for name, factor in () if mode.undetermined else mode.turning:
-            point = valley.visit({name: float(values[name]) * factor}, {}, priors=True)
-            more += [name] if point is not None and point.excess <= worse else []
-        aliased.append(mode._replace(undetermined=(*mode.undetermined, *more)))
-    return aliased
+        lost = past & ((decay * flight.dt < 1.0) | (swing > decay * _SWINGS))
+        lost &= [
+            noise is not None and modes.strongest(k, problem, flight, noise[i])[0] >= RATE.shows
+            for k in range(lost.size)
+        ]
+        # A prior excludes the alias; the modes of a delay are an approximation's.
+        undetermined = tuple(
+            n
+            for n, s in slopes.items()
+            if problem.free[n].prior is None and n not in problem.model.delay_parameters
+            if np.any(np.abs(np.imag(s[lost])) > _TURNED)
+        )
+        name, fastest = flight.name or "the flight", float(np.max(swing[past]))
+        fast.append(FastMode(name, fastest, nyquist, modes.at.words, undetermined))
+    return fast
 
 
 def _relative_slopes(
-    problem: Problem,
-    here: Mapping[str, float],
-    names: Sequence[str],
-    modes: Modes,
+    problem: Problem, here: Mapping[str, float], names: Sequence[str], modes: Modes
 ) -> dict[str, np.ndarray]:
     """Return by parameter the relative changes (n,), complex, of the eigenvalues for a relative
     change of it: first-order perturbation of simple eigenvalues."""

@@ -169,9 +169,8 @@ def whiteness(
 
     Args:
         residual: (N,), any unit.
-        together: how many signals are judged side by side: the p value is multiplied by it
-            (Bonferroni), so that one in a hundred white records fails, not one in a hundred
-            signals.
+        together: how many signals are judged side by side: p is that of the least of as many, so
+            that one in a hundred white records fails, not one in a hundred signals.
         fitted: (N, k) what of the signal the unknowns could follow, see `seen_autocorrelation`.
     """
     fitted = None if fitted is None else fitted[kept(residual)]
@@ -183,12 +182,26 @@ def whiteness(
     q = (n + 2) / max(n, 1) * np.cumsum(r**2 * pairs)
     # Few lags see a short memory that many lags would drown; both must agree with white noise.
     short = min(lags, 20)
-    p_all = scipy.special.chdtrc(lags, q[-1])
-    p_short = scipy.special.chdtrc(short, q[short - 1])
-    # Bonferroni again, for two tests of each signal.
-    p = min(1.0, 2.0 * together * min(p_all, p_short))
+    p_all, p_short = (_chance(q[k - 1], k, n) for k in (lags, short))
+    # Two tests of each signal (Sidak, 1967).
+    p = -np.expm1(2 * together * np.log1p(-min(p_all, p_short, 1.0 - 1e-12)))
     outside = float(np.mean(np.abs(r) * whole > band99(pairs, whole)))
     return Whiteness(bool(p > 0.01), float(p), lags, outside, float(r[0] * whole[0]))
+
+
+_SPREAD = 2.2
+"""times lags over samples, part by which the variance of Ljung and Box's statistic is above twice
+the lags (4000 records of white noise each of 200 to 4000 samples)"""
+
+
+def _chance(statistic: float, lags: int, samples: int) -> float:
+    """Probability that white noise exceeds Ljung and Box's statistic.
+
+    Its mean is the number of lags; its variance is above that of chi-squared where these are a
+    large part of the samples. A scaled chi-squared has both.
+    """
+    wide = 1.0 + _SPREAD * lags / max(samples, 1)
+    return float(scipy.special.chdtrc(lags / wide, statistic / wide))
 
 
 def band99(pairs: np.ndarray, whole: np.ndarray) -> np.ndarray:

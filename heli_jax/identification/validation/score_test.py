@@ -240,13 +240,13 @@ class _Trial(NamedTuple):
         own = np.moveaxis(own, 3, 1)
         of_known, answers = self._products(known), self._products(residuals)
 
-        left = whole - of_known @ _turned(of_known[:, :b])
+        left = whole - of_known @ of_known[:, :b].mT
         taken = left[:, b:] @ _inverse(left[:, :b], whole[:, :b])
         answers = answers[:, b:] - taken @ answers[:, :b]
         answers, of_known, left, taken = (
             v.reshape(f, d, 2, -1) for v in (answers, of_known[:, b:], left[:, b:], taken)
         )
-        over = _inverse(own - of_known @ _turned(of_known) - taken @ _turned(left), own)
+        over = _inverse(own - of_known @ of_known.mT - taken @ left.mT, own)
         return np.sum(answers * (over @ answers), axis=2)
 
     def _products(self, others: Complex[np.ndarray, "n K"]) -> Float[np.ndarray, "f c2 n"]:
@@ -352,10 +352,6 @@ def step_to_least(records: Sequence[Lines]) -> Float[np.ndarray, " q"]:
     return _steps(J, np.zeros((len(J), 2)), e)[1]
 
 
-def _turned(M: np.ndarray) -> np.ndarray:
-    return np.swapaxes(M, -1, -2)
-
-
 def _inverse(left: np.ndarray, whole: np.ndarray) -> np.ndarray:
     """Inverse of what is left (..., n, n) of the columns' products, without directions in which
     next to nothing is left; whole: products of the columns themselves."""
@@ -364,7 +360,7 @@ def _inverse(left: np.ndarray, whole: np.ndarray) -> np.ndarray:
     kept = values > _SAME**2
     over = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)
     V = V / sizes[..., :, None]
-    return V @ (over[..., :, None] * _turned(V))
+    return V @ (over[..., :, None] * V.mT)
 
 
 def _by_chance(gain: float, others: Float[np.ndarray, " r"]) -> float:

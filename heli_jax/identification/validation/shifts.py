@@ -2,8 +2,8 @@
 
 - `shifts`: the likelihood of a fitted model with a signal at another time, where its unknowns
   follow to first order (a score test, Rao, 1948). An input or an output is moved by whole samples,
-  an input also within a sample by the slope of the residual; the other hold of the inputs moves
-  them by half a sample. Every candidate has the same statistic and the same limit. An input that
+  an input also within a sample by the slope of the residual; the other hold of an input moves it
+  by half a sample. Every candidate has the same statistic and the same limit. An input that
   follows the response knows the errors of later samples, but takes them back: used too early it
   predicts them with the wrong sign, so that the test holds in a closed loop too.
 - `leads`: no vehicle responds before its input. If the past of an output and of all inputs leaves
@@ -21,7 +21,6 @@ import scipy.special
 from jaxtyping import Float
 
 from heli_jax import naming
-from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import is_low_passed
@@ -33,7 +32,6 @@ from heli_jax.identification.estimation.evaluation import (
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Solution
-from heli_jax.numerics.jumps import split
 
 # Signals with which a model explains the record better at another time.
 
@@ -82,13 +80,16 @@ def shift_in_time(
         return None
     inputs = naming.names(problem.model.Inputs)
     moving = [n for n in inputs if any(np.ptp(f.inputs[n]) > 0 for f in problem.training)]
+    # A held input is a linear one that is late by half a sample, but for terms of second order in
+    # the sample time; a command that changes at every sample is taken for a linear one.
+    guessed = [n for n in moving if all(_linear_by_guess(f, n) for f in problem.training)]
     signals = [*(("input", n) for n in moving), *(("output", n) for n in outputs)]
-    found = {one: _best_place(at, e, *one) for one in signals}
+    found = {one: _best_place(at, e, *one) for one in [*signals, *(("hold", n) for n in guessed)]}
     found = {one: best for one, best in found.items() if best[1] > SHIFT.clear}
     if not found:
         return None
     kind, surest = max(found, key=lambda one: found[one][1])
-    together = {one for one in found if one[0] == kind == "input"} | {(kind, surest)}
+    together = {one for one in found if one[0] == kind != "output"} | {(kind, surest)}
     places = {one[1]: found[one][0] for one in found if one in together}
     dt, there = float(at.data.flights[0].dt), at.data
     for name, place in places.items():
@@ -96,47 +97,23 @@ def shift_in_time(
     first = max(places.values(), key=abs)
     names = tuple(n for n, place in places.items() if place * first > 0)
     gain, moved = found[kind, surest][1], _change(at, e, *_rows(at, there))
-    return Shift("response" if first > 0 else kind, names, abs(first) * dt, gain, moved)
+    late = "response" if kind == "input" and first > 0 else kind
+    return Shift(late, names, abs(first) * dt, gain, moved)
 
 
-def other_hold(problem: Problem, at: Solution, e: Evaluation) -> Shift | None:
-    """Return the inputs that the record shows to be held, and that were taken as linear: a command
-    that changes at every sample looks so. None if that is not clear, or if an input acts on an
-    output at once: the mean of two samples is another value then.
-    """
-    moving = [
-        {
-            n
-            for n, u in f.inputs.items()
-            if f.hold[n] != "zero-order" and n in f.hold_reason and np.ptp(u) > 0
-            if not is_low_passed(f, n)
-        }
-        for f in problem.training
-    ]
-    # At the start values and zero inputs: a term that vanishes there is taken for none.
-    if not any(moving) or np.any(jacobians(problem.model, problem.start_params()).D):
-        return None
-    # Other inputs to the same program: compiling another one costs far more than an evaluation.
-    r, J = _rows(at, _held(at, moving))
-    if not (np.all(np.isfinite(e.J)) and np.all(np.isfinite(r)) and np.all(np.isfinite(J))):
-        return None
-    names = tuple(dict.fromkeys(n for one in moving for n in sorted(one)))
-    dt = float(at.data.flights[0].dt)
-    # Frequencies are independent of each other.
-    block = 1 if at.layout.noise_model == "spectrum" else _block(dt)
-    gain = _gain(block, _beside(e.J, e.r), _beside(J, r))
-    if not gain > SHIFT.clear:
-        return None
-    return Shift("hold", names, 0.5 * dt, gain, _change(at, e, r, J))
+def _linear_by_guess(flight: Flight, name: str) -> bool:
+    """True if an input is taken as linear, which nobody stated and no low-pass made so."""
+    linear = flight.hold[name] == "linear" and name in flight.hold_reason
+    return linear and not is_low_passed(flight, name)
 
 
 def _best_place(at: Solution, e: Evaluation, kind: str, name: str) -> tuple[float, float]:
     """Return by how many samples a signal has to come later to fit best (below zero: earlier), and
     what twice the log-likelihood gains there."""
     dt = float(at.data.flights[0].dt)
-    left, gains = {0: _beside(e.J, e.r)}, {0: 0.0}
+    left, gains = {0.0: _beside(e.J, e.r)}, {0.0: 0.0}
 
-    def gained(k: int) -> float:
+    def gained(k: float) -> float:
         """Return the gain where the unknowns follow, and rows are as white as these."""
         if k not in gains:
             rows, J = _rows(at, _moved(at.data, kind, name, k * dt))
@@ -146,6 +123,8 @@ def _best_place(at: Solution, e: Evaluation, kind: str, name: str) -> tuple[floa
                 gains[k] = _gain(_block(dt), left[0], left[k])
         return gains[k]
 
+    if kind == "hold":
+        return 0.5, gained(0.5)
     farthest = max(1, round(SHIFT.farthest / dt))
     # Innovations forget within a few samples: between now and the right time none need be likelier.
     begun = [2**k for k in range(farthest.bit_length())] if e.innovations else [1]
@@ -222,7 +201,7 @@ def _moved(data: Data, kind: str, name: str, seconds: float) -> Data:
     flights = []
     for flight in data.flights:
         inputs, outputs = naming.asdict(flight.inputs), dict(flight.outputs)
-        of = inputs if kind == "input" else outputs
+        of = outputs if kind == "output" else inputs
         if name in of:
             # By NumPy: each step of it would be a program of JAX's to load.
             v = np.asarray(of[name])
@@ -233,21 +212,6 @@ def _moved(data: Data, kind: str, name: str, seconds: float) -> Data:
             of[name] = jax.device_put(line.astype(v.dtype))
         flights.append(flight._replace(inputs=type(flight.inputs)(**inputs), outputs=outputs))
     return data._replace(flights=tuple(flights))
-
-
-def _held(at: Solution, moving: Sequence[set[str]]) -> Data:
-    """Return linear inputs that do what held ones do, but for terms of second order in the sample
-    time: a held input is a linear one that is late by half a sample. A mixed one is held where it
-    jumps already."""
-    flights = []
-    for i, (flight, names) in enumerate(zip(at.data.flights, moving, strict=True)):
-        inputs = naming.asdict(flight.inputs)
-        for n in inputs.keys() & names:
-            u = np.asarray(inputs[n])
-            stairs, slow = split(u) if at.layout.hold(i)[n] == "mixed" else (0.0 * u, u)
-            inputs[n] = stairs + 0.5 * (slow + np.concatenate([slow[:1], slow[:-1]]))
-        flights.append(flight._replace(inputs=at.layout.model.Inputs(**inputs)))
-    return at.data._replace(flights=jax.device_put(tuple(flights)))
 
 
 # Inputs whose future an output shows.

@@ -12,11 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from heli_jax import naming, units
+from heli_jax import units
 from heli_jax.dynamics.model import Model, axes_of
 from heli_jax.flights.flight import Flight, Signal
-from heli_jax.identification.estimation.evaluation import evaluate, pseudoinverse
-from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.metrics import autocorrelation, cross_correlation
 from heli_jax.vehicle import of_helicopter
 
@@ -228,22 +226,10 @@ _FLOWN = 0.3
 """by which an angle's changes may differ from those of its integrated rate where it was flown"""
 
 
-class Oversized(NamedTuple):
-    """An angle or a rate that is larger than its unit lets expect."""
-
-    name: str
-    signal: Signal
-    size: float
-    """[SI]"""
-    limit: float
-    """[SI]"""
-    flown: bool
-    """whether an angle is what its rate adds up to: it was flown, or both are in degrees"""
-    certain: bool
-
-
-def oversized(model: Model, flight: Flight) -> Iterator[Oversized]:
-    """Angles and rates of a log that are too large to be in the unit that they are read in."""
+def oversized(model: Model, flight: Flight) -> Iterator[tuple[str, float, float, bool, bool]]:
+    """Yield the angles and rates of a log that are too large for the unit that they are read in:
+    name, size and limit [SI], whether an angle is what its rate adds up to (it was flown, or both
+    are in degrees), and whether another unit is certain."""
     headings = {a.angle for a in axes_of(model) if a.rate == "r"} | {"psi", "yaw"}
     for name, signal in (flight.source.outputs if flight.source else {}).items():
         values = flight.outputs.get(name)
@@ -264,7 +250,7 @@ def oversized(model: Model, flight: Flight) -> Iterator[Oversized]:
         if size > limit:
             flown = _flown(model, flight, str(name), size) and not said
             certain = said or (size > impossible and not flown)
-            yield Oversized(str(name), signal, size, limit, flown, certain)
+            yield str(name), size, limit, flown, certain
 
 
 def _of_fuselage(model: Model, name: str) -> bool:
@@ -293,9 +279,6 @@ def _flown(model: Model, flight: Flight, name: str, size: float) -> bool:
 
 NEAR = 3.0
 """factor by which start values may be off beside the unit"""
-_STEP, _SCALED = 1.001, 0.2
-"""factor on a signal, and the relative change of a parameter over its own, from which on the unit
-of the signal decides what the parameter is"""
 _FULL = 1.2
 """of a stick's or a surface's full travel: 1, or a radian"""
 
@@ -332,28 +315,6 @@ def inputs_in_other_units(
                 factor = units.factor(other, stated)
                 if all(factor / NEAR < size < factor * NEAR for size in sizes.values()):
                     yield OtherUnit(label, name, stated, other, factor, sizes)
-
-
-def scaled_by(at: Solution, name: str) -> tuple[str, ...]:
-    """The parameters that another unit of a signal would change by a good part of its factor."""
-    layout, data = at.layout, at.data
-    flights = []
-    for flight in data.flights:
-        outputs = {n: y * _STEP if n == name else y for n, y in flight.outputs.items()}
-        inputs = {n: u * _STEP if n == name else u for n, u in naming.asdict(flight.inputs).items()}
-        flights.append(
-            flight._replace(outputs=outputs, inputs=naming.replace(flight.inputs, **inputs))
-        )
-    e = evaluate(*at)
-    other = evaluate(layout, data._replace(flights=tuple(flights)), at.noise, at.z)
-    step = pseudoinverse(np.asarray(e.J)) @ (np.asarray(e.r) - np.asarray(other.r))
-    values, slopes = np.asarray(e.named), np.asarray(e.slopes)
-    change = step[: slopes.size] * slopes / (_STEP - 1.0)
-    return tuple(
-        n
-        for n, c, v in zip(layout.of_interest, change, values, strict=True)
-        if abs(c) > _SCALED * abs(v)
-    )
 
 
 def _units_by_size(signal: Signal, values: np.ndarray) -> tuple[str, str]:

@@ -8,8 +8,6 @@ from heli_jax.report.figures.bode import bode_unit, draw_response, match
 from heli_jax.report.figures.estimates import (
     bootstrap_pairs,
     posterior_pairs,
-    trace,
-    waterfall,
 )
 from heli_jax.report.figures.signals import (
     motion,
@@ -34,6 +32,4 @@ __all__ = [
     "rls_history",
     "sticks",
     "time_label",
-    "trace",
-    "waterfall",
 ]

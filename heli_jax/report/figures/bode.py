@@ -16,10 +16,9 @@ from heli_jax.analysis.spectra import COHERENT, octave_mean
 from heli_jax.dynamics.model import Model
 from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.identifiability.verdict import Z95
-from heli_jax.report import frequency, style
+from heli_jax.report import style
 from heli_jax.report.charts import Chart, Panel, Series, band, bars, limits_of, panel
 from heli_jax.report.fitted_responses import FittedPair
-from heli_jax.report.frequency import phase
 
 _TURN = 2.0 * np.pi
 """rad/s of 1 Hz"""
@@ -50,6 +49,25 @@ def _chart(title: str, note: str, limits: Sequence[float], panels: Sequence[Pane
 def _nearest(degrees: np.ndarray, along: np.ndarray) -> np.ndarray:
     """Phases on the branch within half a turn of others."""
     return degrees - 360.0 * np.round((degrees - along) / 360.0)
+
+
+def phase(H: np.ndarray) -> np.ndarray:
+    """Unwrapped phase (k,) [deg], begun between -270 and 90."""
+    unwrapped = np.degrees(np.unwrap(np.angle(H)))
+    first = unwrapped[0] if unwrapped.size else 0.0
+    # Less 1e-6, so that rounding does not send a response that begins at +90 down to -270.
+    return unwrapped - 360.0 * np.ceil((first - 90.0 - 1e-6) / 360.0)
+
+
+def baseline_response(baseline: Baseline, omega: np.ndarray) -> np.ndarray:
+    """Hd(e^{i omega dt}) (k,) of the recursive least squares, without the hold of its input."""
+    # On the unit circle, as it was identified: its continuous form is an approximation where no
+    # inverse of the hold exists.
+    turns = omega * baseline.dt
+    z, hold = np.exp(1j * turns), np.sinc(turns / (2.0 * np.pi)) * np.exp(-0.5j * turns)
+    # A pole on the unit circle gives inf there, which no curve draws.
+    with np.errstate(all="ignore"):
+        return np.polyval(baseline.num, z) / np.polyval(baseline.den, z) / hold
 
 
 def _curve(
@@ -137,7 +155,7 @@ def match(pair: FittedPair, unit: str, note: str, baseline: Baseline | None = No
     data = _bars(f, gain, angle, (own, own), style.BLACK, "data, 95 % intervals")
     beside = []
     if baseline is not None:
-        R = frequency.discrete(baseline, omega)
+        R = baseline_response(baseline, omega)
         turned = _nearest(np.degrees(np.angle(R)), near)
         beside = [
             c._replace(dashed=True) for c in _curve("RLS", omega, R, turned, style.ORANGE, 1.2)

@@ -6,62 +6,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from heli_jax.identification.result import Estimate, Fit, StartRow
+from heli_jax.identification.result import Estimate, Fit
 from heli_jax.identification.uncertainty.bootstrap import Bootstrap
 from heli_jax.identification.uncertainty.nuts import Posterior
 from heli_jax.report import style
-from heli_jax.report.charts import Chart, Series, panel
 from heli_jax.report.style import subtitle
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-
-_DRAWN = 1e100
-"""cost up to which a start is drawn at its own height"""
-
-
-def waterfall(starts: tuple[StartRow, ...]) -> Chart | None:
-    """The cost that each start reached, best first; None where there is one start or none."""
-    if len(starts) < 2:
-        return None
-    rows = sorted(starts, key=lambda s: s.cost if np.isfinite(s.cost) else np.inf)
-    cost, x = np.array([s.cost for s in rows]), np.arange(1.0, len(rows) + 1.0)
-    # A cost that is next to infinite leaves an axis no room.
-    finite, ok = cost < _DRAWN, np.array([s.converged for s in rows])
-    low, top = (cost[finite].min(), cost[finite].max()) if finite.any() else (1.0, 1.0)
-    logarithmic = bool(low > 0 and top > 30 * low)
-    # Where all starts agree to rounding, 2 % of the cost: an axis over rounding errors would show
-    # differences where there are none.
-    span = max(top - low, 0.02 * abs(top), 1e-300)
-    shown = np.where(finite, cost, 3.0 * top if logarithmic else top + 0.4 * span)
-    middle = 0.5 * (top + low)
-    series = [
-        Series("", x[finite], shown[finite], style.PALE, width=0.8),
-        Series("converged", x[ok], shown[ok], style.BLUE, "points", width=6.0),
-        Series("failed", x[~ok], shown[~ok], style.VERMILLION, "points", width=6.0),
-    ]
-    limits = (0.5 * low, 5.0 * top) if logarithmic else (middle - 0.9 * span, middle + 1.1 * span)
-    best, failed = sum(r.optimum == 1 for r in rows), np.count_nonzero(~ok)
-    title = f"{best} of {len(rows)} starts reached the best optimum"
-    return Chart(
-        f"{title}, {failed} failed" if failed else title,
-        "start, sorted by cost",
-        (0.4, len(rows) + 0.6),
-        (
-            panel(
-                "cost",
-                [s for s in series if s.x.size],
-                1.9,
-                limits=(float(limits[0]), float(limits[1])),
-                logarithmic=logarithmic,
-            ),
-        ),
-        ""
-        if finite.all()
-        else f"starts that ended without a cost below {_DRAWN:g} are drawn on top",
-    )
 
 
 MOST = 6
@@ -73,29 +25,6 @@ _DOTS = 1500
 """samples of which dots are drawn: of more they hide one another"""
 _MARKS = 200
 """divergent steps that are marked"""
-
-
-def trace(posterior: Posterior, fit: Fit) -> Chart:
-    """The chains by draw, one panel for each of the first parameters."""
-    panels, count = [], next(iter(posterior.draws.values())).shape[1]
-    draw = np.arange(float(count))
-    diverging = posterior.statistics.get("diverging")
-    marks = np.flatnonzero(np.any(diverging, axis=0)) if diverging is not None else ()
-    for name in list(posterior.draws)[:MOST]:
-        series = [
-            Series(f"chain {i + 1}", draw, np.asarray(chain), style.CYCLE[i % 8], width=0.5)
-            for i, chain in enumerate(posterior.draws[name])
-        ]
-        words, estimate = style.label(name, fit.estimates[name].unit), fit.estimates[name].value
-        panels.append(panel(words, series, 0.9, levels=(float(estimate),)))
-    # At most as many as can be told apart.
-    divergent = tuple(float(m) for m in marks[:_MARKS])
-    panels[-1] = panels[-1]._replace(marks=divergent)
-    note = f"dotted: the estimate{_left_out(len(posterior.draws))}"
-    note += "; upright lines: divergent steps" if divergent else ""
-    return Chart(
-        "Draws of the chains", "draw", (0.0, float(max(count - 1, 1))), tuple(panels), note
-    )
 
 
 def posterior_pairs(posterior: Posterior, fit: Fit) -> "Figure":
@@ -131,7 +60,7 @@ def _pairs(
     grid = drawing.subplots(n, n, squeeze=False, sharex="col")
     shown = slice(None, None, max(1, -(-next(iter(samples.values())).size // _DOTS)))
     for i, below in enumerate(names):
-        _histogram(grid[i, i], samples[below], fit.estimates[below], color)
+        grid[i, i].hist(samples[below], bins="auto", color=color)
         for j, left in enumerate(names[:i]):
             ax = grid[i, j]
             x, y = samples[left], samples[below]
@@ -183,20 +112,6 @@ def _interval_lines(draw: Callable[..., object], e: Estimate) -> None:
             draw(end, color=style.BLUE, lw=0.8, ls=":")
 
 
-def _histogram(ax: "Axes", values: np.ndarray, e: Estimate, color: str) -> None:
-    ax.hist(values, bins=min(40, max(8, round(values.size**0.5))), density=True, color=color)
-    x = np.linspace(*ax.get_xlim(), 200)
-    sd = e.sd
-    if sd is None or not sd > 0:
-        return
-    # By the coordinate in which the interval is symmetric, as the ellipses are.
-    at, slope = coordinate(x, e), 1.0
-    if logarithmic(e):
-        sd, slope = sd / abs(e.value), 1.0 / np.abs(x)
-    density = np.exp(-0.5 * (at / sd) ** 2) / (sd * np.sqrt(2.0 * np.pi)) * slope
-    ax.plot(x, np.where(np.isfinite(density), density, 0.0), color=style.BLUE, lw=1.2)
-
-
 def logarithmic(e: Estimate) -> bool:
     """True if an estimate's interval reaches by equal factors and not by equal amounts."""
     if e.lower95 is None or e.upper95 is None or not min(e.lower95, e.upper95) * e.value > 0:
@@ -207,59 +122,26 @@ def logarithmic(e: Estimate) -> bool:
     return bool(by_factors < abs(e.upper95 + e.lower95 - 2.0 * e.value) / abs(e.value))
 
 
-def coordinate(values: np.ndarray, e: Estimate) -> np.ndarray:
-    """Values less the estimate, in the coordinate in which the interval is symmetric: log |value|
-    or the value itself."""
-    if not logarithmic(e):
-        return values - e.value
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.log(values / e.value)
-
-
-def _factor(fit: Fit, x: str, y: str) -> Float[np.ndarray, "2 2"] | None:
-    """Cholesky factor of the covariance of two estimates in those coordinates; None where there is
-    none."""
-    names = fit.verdict.names
-    if x not in names or y not in names:
-        return None
-    sds = []
-    for e in (fit.estimates[x], fit.estimates[y]):
-        if e.sd is None or not (np.isfinite(e.sd) and e.sd > 0):
-            return None
-        sds.append(e.sd / abs(e.value) if logarithmic(e) else e.sd)
-    r = float(fit.verdict.correlation[names.index(x), names.index(y)])
-    if not abs(r) < 1.0:
-        return None
-    return np.array([[sds[0], 0.0], [r * sds[1], np.sqrt(1.0 - r**2) * sds[1]]])
-
-
 def gaussian_ellipse(fit: Fit, x: str, y: str) -> Float[np.ndarray, "2 n"] | None:
     """The curve within which 95 % of the fit's Gaussian approximation lie, of two parameters.
 
     It is an ellipse in the coordinates in which their intervals are symmetric. None where the data
     do not determine both.
     """
-    factor = _factor(fit, x, y)
-    if factor is None:
+    names, pair = fit.verdict.names, (fit.estimates[x], fit.estimates[y])
+    if not {x, y} <= set(names) or not all(e.sd and np.isfinite(e.sd) for e in pair):
+        return None
+    r = float(fit.verdict.correlation[names.index(x), names.index(y)])
+    if not abs(r) < 1.0:
         return None
     angle = np.linspace(0.0, 2.0 * np.pi, 181)
-    away = _RADIUS * factor @ np.array([np.cos(angle), np.sin(angle)])
+    # The Cholesky factor of a correlation matrix, times a circle.
+    unit = np.cos(angle), r * np.cos(angle) + np.sqrt(1.0 - r**2) * np.sin(angle)
     curve = []
-    for d, e in zip(away, (fit.estimates[x], fit.estimates[y]), strict=True):
-        curve.append(e.value * np.exp(d) if logarithmic(e) else e.value + d)
+    for away, e in zip(unit, pair, strict=True):
+        reach = _RADIUS * float(e.sd or 0.0) * away
+        curve.append(e.value * np.exp(reach / abs(e.value)) if logarithmic(e) else e.value + reach)
     return np.array(curve)
-
-
-def share_within(fit: Fit, samples: Mapping[str, np.ndarray], x: str, y: str) -> float | None:
-    """The share of the samples within the ellipse of two parameters; 0.95 where the Gaussian
-    approximation holds."""
-    factor = _factor(fit, x, y)
-    if factor is None:
-        return None
-    away = np.array([coordinate(np.ravel(samples[n]), fit.estimates[n]) for n in (x, y)])
-    white = np.linalg.solve(factor, away)
-    # A sample of the other sign has no logarithm, and lies outside.
-    return float(np.mean(np.sum(white**2, axis=0) < _RADIUS**2))
 
 
 def _left_out(count: int) -> str:

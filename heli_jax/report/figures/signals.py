@@ -33,7 +33,6 @@ from heli_jax.report.charts import (
     samples,
     time_limits,
 )
-from heli_jax.report.frequency import sample_time
 from heli_jax.report.style import label
 from heli_jax.simulation.trajectory import Trajectory
 
@@ -136,7 +135,7 @@ def residual_correlation(
         together: how many residuals are tested side by side (Bonferroni, as in `whiteness`).
         test: of the fit, whose numbers the figure says; made here unless given.
     """
-    residual, dt = signals.error(output), sample_time(signals)
+    residual, dt = signals.error(output), _sample_time(signals.times)
     whole, residual = residual, sequence(residual)
     seen = np.arange(whole.size)
     if residual.size < whole.size:
@@ -169,6 +168,11 @@ def residual_correlation(
         f"{lag1} at one sample; Ljung-Box p = {number(test.p_value, 2)}",
         of=signals.flight,
     )
+
+
+def _sample_time(t: np.ndarray) -> float:
+    """Time between samples [s]; 1 for a single sample, which has none."""
+    return float(t[1] - t[0]) if t.size > 1 else 1.0
 
 
 def _stems(words: str, x: np.ndarray, y: np.ndarray, limit: np.ndarray) -> Panel:
