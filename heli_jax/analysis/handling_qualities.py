@@ -232,7 +232,9 @@ def _derivatives(kind: Kind, response: _Response) -> dict[str, np.ndarray]:
     }
 
 
-def _ends(response: _Response, name: str, values: dict[str, float], by: dict[str, np.ndarray]):
+def _ends(
+    response: _Response, name: str, values: dict[str, float], by: dict[str, np.ndarray]
+) -> tuple[float, float]:
     """Frequencies [rad/s] next to a number's past which the curve's band (Fieller) leaves out the
     level; beyond the band infinitely far away, NaN where errors are not known.
 
