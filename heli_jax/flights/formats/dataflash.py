@@ -41,6 +41,8 @@ FIELDS: dict[str, tuple[str, float | None]] = {
 }  # fmt: skip
 _APART = 1.0
 """s before and after the board's time that a message may have some"""
+_FEWEST_ROWS = 10
+"""of a message, from which on a time that is out of order stands out"""
 # New firmware counts microseconds, old firmware milliseconds.
 # In old firmware's message GPS TimeMS is the time of the week, and T the board's.
 _CLOCKS = {"TimeUS": 1e-6, "TimeMS": 1e-3, "T": 1e-3}
