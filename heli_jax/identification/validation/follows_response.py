@@ -219,12 +219,11 @@ def feedback(
         N = len(views[0].innovations)
         blocks = lag_blocks(max(1, min(round(_LONGEST / views[0].dt), N // 10)))
         seconds = [(first * views[0].dt, last * views[0].dt) for first, last in blocks]
-        for name in dict.fromkeys(n for view in views for n in view.free):
-            those = [view for view in views if name in view.free]
+        for view in views:
             # Bonferroni: one test in a hundred records fails by chance, not one in a hundred lags.
-            count = len(those) * those[0].inputs * len(those[0].outputs) * len(blocks)
-            for view in those:
-                each = correlations_with_sums(view.free[name], view.innovations, blocks)
+            count = len(views) * view.inputs * len(view.outputs) * len(blocks)
+            for name, free in view.free.items():
+                each = correlations_with_sums(free, view.innovations, blocks)
                 for k, b in np.ndindex(each.p_value.shape):
                     one = Feedback(
                         flight.name or "flight 1",

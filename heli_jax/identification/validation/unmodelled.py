@@ -111,66 +111,29 @@ _STEP = 1e-4
 """of an unknown's coordinate, for differences"""
 
 
-def longest(at: Solution) -> list[int]:
-    """The flights that are looked at, of one sample time: filters are of samples.
-
-    Args:
-        at: where the fit ended.
+def of_one_clock(at: Solution, e: Evaluation, name: str) -> list[tuple[int, OwnSamples]]:
+    """The flights whose residual of an output can be asked, and where it was sampled in each: it
+    moves, and a simulation follows it. The longest flights, of one sample time and one clock of the
+    output, since filters are of samples.
     """
-    flights = at.data.flights
+    flights, asked = at.data.flights, list[tuple[int, OwnSamples]]()
     sizes = [next(iter(f.outputs.values())).shape[0] for f in flights]
     order = np.argsort(sizes, kind="stable")[::-1].tolist()
     dt = float(flights[order[0]].dt)
-    return sorted([i for i in order if np.isclose(float(flights[i].dt), dt)][:_FLIGHTS])
-
-
-def usable(at: Solution, e: Evaluation, i: int, name: str) -> bool:
-    """True if an output was measured, moves, and is followed by a simulation that stays with it.
-
-    Args:
-        at: where the fit ended.
-    """
-    if name not in at.layout.outputs[i]:
-        return False
-    own = own_of(at, i, name)
-    if own is None:
-        return False
-    y = np.asarray(at.data.flights[i].outputs[name])[own.rows]
-    left = np.asarray(e.raw[i][name])[own.rows]
-    if not (np.isfinite(left).all() and np.std(y) > 0):
-        return False
-    with np.errstate(over="ignore"):
-        size = float(np.std(left) / np.std(y))
-    return _ROUNDING < size < np.sqrt(1.0 - _DIVERGED)
-
-
-def own_of(at: Solution, i: int, name: str) -> OwnSamples | None:
-    """The places of the samples of a flight's output.
-
-    Args:
-        at: where the fit ended.
-    """
-    return own_samples(np.isfinite(np.asarray(at.data.flights[i].outputs[name])))
-
-
-def of_one_clock(at: Solution, e: Evaluation, name: str) -> list[tuple[int, OwnSamples]]:
-    """The flights whose residual of an output can be asked, and where it was sampled in each; of
-    one clock, since filters are of samples.
-
-    Args:
-        at: where the fit ended.
-    """
-    flights = [(i, own_of(at, i, name)) for i in longest(at) if usable(at, e, i, name)]
-    samples = [(i, own) for i, own in flights if own is not None]
-    return [(i, own) for i, own in samples if own.every == samples[0][1].every]
+    for i in sorted([i for i in order if np.isclose(float(flights[i].dt), dt)][:_FLIGHTS]):
+        y = np.asarray(flights[i].outputs.get(name, np.nan))
+        own = own_samples(np.isfinite(y)) if name in at.layout.outputs[i] else None
+        if own is None or not np.std(y[own.rows]) > 0:
+            continue
+        with np.errstate(over="ignore", invalid="ignore"):
+            size = np.std(np.asarray(e.raw[i][name])[own.rows]) / np.std(y[own.rows])
+        if _ROUNDING < size < np.sqrt(1.0 - _DIVERGED):
+            asked.append((i, own))
+    return [(i, own) for i, own in asked if own.every == asked[0][1].every]
 
 
 def sensitivities(at: Solution, e: Evaluation) -> dict[tuple[int, str], np.ndarray]:
-    """By flight and output (N, q) the derivative of the residual by all unknowns.
-
-    Args:
-        at: where the fit ended.
-    """
+    """By flight and output (N, q) the derivative of the residual by all unknowns."""
     layout, data, noise, z = at
     if layout.objective is OUTPUT_ERROR:
         rows, J = {}, np.asarray(e.J)
@@ -184,9 +147,9 @@ def sensitivities(at: Solution, e: Evaluation) -> dict[tuple[int, str], np.ndarr
     z = np.asarray(z)
     blocks = [places.every for places in flight_places(layout)]
     common = [np.array([k]) for k in range(layout.first_nuisance)]
-    longest = max((b.size for b in blocks), default=0)
+    most = max((b.size for b in blocks), default=0)
     # Each flight's own unknowns move at once: none is felt by another flight.
-    own = [np.array([b[k] for b in blocks if k < b.size]) for k in range(longest)]
+    own = [np.array([b[k] for b in blocks if k < b.size]) for k in range(most)]
     before = simulated_outputs(layout, data, jnp.asarray(z))
     slopes = {(i, n): np.zeros((before[i][n].size, z.size)) for i, n in signals(layout)}
     step = _STEP if z.dtype == np.float64 else np.sqrt(_STEP)
@@ -213,11 +176,7 @@ _DEAD = 0.02
 
 
 def moving_inputs(at: Solution) -> list[str]:
-    """The inputs that move in some flight.
-
-    Args:
-        at: where the fit ended.
-    """
+    """The inputs that move in some flight."""
     flights = [naming.asdict(f.inputs) for f in at.data.flights]
     return [n for n in flights[0] if any(np.ptp(np.asarray(u[n])) > 0 for u in flights)]
 
@@ -301,15 +260,11 @@ def unmodelled(
     simulation that left the record, of windows and of sensors compared with each other nothing is
     asked. Whoever asks has seen to it that inputs do not follow the response: through a loop
     disturbances are in the inputs, and any residual follows these.
-
-    Args:
-        at: where the fit ended.
     """
     layout, nothing = at.layout, ([], (1.0, {}))
     if is_kinematic(layout.model) or any(count > 1 for count, _ in layout.windows):
         return nothing
-    looked_at = longest(at)
-    names = sorted({n for i in looked_at for n in layout.outputs[i] if usable(at, e, i, n)})
+    names = sorted({n for outputs in layout.outputs for n in outputs if of_one_clock(at, e, n)})
     if not names:
         return nothing
     level = (IN_COLOUR if coloured else LEVEL) / len(names)
@@ -352,9 +307,7 @@ def _where_least(
             break
         there = at._replace(z=at.z + part * jnp.asarray(strong.step, at.z.dtype))
         e = evaluate(*there)
-        asked, again = [], []
-        if any(usable(there, e, i, name) for i in longest(at)):
-            asked, again = _lines(there, e, name, sensitivities(there, e), called)
+        asked, again = _lines(there, e, name, sensitivities(there, e), called)
         if not asked or not _deviance(again) < _deviance(records):
             part *= 0.25
             continue
