@@ -252,8 +252,9 @@ class Products(NamedTuple):
     """its negative: the derivatives of e are -J"""
     ZZ: Float[Array, "q q"]
     ZJ: Float[Array, "q q"]
-    QZ: Float[Array, "m q"] | None = None
-    QJ: Float[Array, "m q"] | None = None
+    QZ: Float[Array, "m q"]
+    """zero once what the ends may add is projected out"""
+    QJ: Float[Array, "m q"]
 
 
 def products(Z: Array, J: Array, e: Array, Q: Array) -> Products:
@@ -264,8 +265,9 @@ def products(Z: Array, J: Array, e: Array, Q: Array) -> Products:
 def projected(of: Products, S: Float[Array, "m m"]) -> Products:
     """Products with what the ends may add projected out of Z and J, by S that makes an orthonormal
     basis of Q."""
-    Z, J = (jnp.asarray(S.T @ v) for v in (of.QZ, of.QJ))
-    return Products(of.ee, of.Ze, of.ZZ - Z.T @ Z, of.ZJ - Z.T @ J)
+    Z, J = S.T @ of.QZ, S.T @ of.QJ
+    none = jnp.zeros_like(of.QZ)
+    return Products(of.ee, of.Ze, of.ZZ - Z.T @ Z, of.ZJ - Z.T @ J, none, none)
 
 
 def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Float[Array, " r"]:
@@ -360,7 +362,7 @@ def _of_record(
                 J = _slopes(H, W, X, direct, direct_lines)
                 return products(J, J, e, Q)
 
-            def with_instruments() -> Products:
+            def with_instruments(by: _Differentiated) -> Products:
                 J = _slopes(H, W, X, direct, direct_lines)
                 # The states are those of the inputs alone: such a record has no ends.
                 of_inputs = times(R, by_lines[0].U @ by[0][0].B.T)
@@ -369,7 +371,7 @@ def _of_record(
             if by is None:
                 return directly()
             # One program for both: the direct estimate is where the search begins.
-            return jax.lax.cond(by_instrument > 0.5, with_instruments, directly)
+            return jax.lax.cond(by_instrument > 0.5, lambda: with_instruments(by), directly)
 
         return jax.lax.map(of_flight, own)
 

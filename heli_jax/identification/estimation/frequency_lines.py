@@ -226,7 +226,7 @@ def discretised(
 
     own = [(data.flights[i], u.states[i], u.offsets[i]) for i in members]
     if len(members) == 1:
-        # Beside a batch of one, what only one flight has would be no part of the model alone.
+        # A model that depends on numbers of its flight alone would leave vmap with an axis.
         m, driving = of_one(own[0])
         return m, jax.tree.map(lambda v: v[None], driving)
     axes: Any = (None, 0)
@@ -379,11 +379,15 @@ def resolved(m: Matrices, record: Record, whitening: Complex[Array, "K p p"]) ->
 def _triangle(Ad: Float[Array, "n n"]) -> tuple[Complex[Array, "n n"], Complex[Array, "n n"]]:
     """T and V with Ad = V T V^H, V unitary; T is triangular on the CPU, where JAX has Schur's."""
     dtype = np.result_type(Ad.dtype, np.complex64)
-    return jax.lax.platform_dependent(
-        Ad,
-        cpu=lambda Ad: tuple(jax.scipy.linalg.schur(Ad, output="complex")),
-        default=lambda Ad: (Ad.astype(dtype), jnp.eye(len(Ad), dtype=dtype)),
-    )
+
+    def triangle(Ad: Array) -> tuple[Array, Array]:
+        T, V = jax.scipy.linalg.schur(Ad, output="complex")
+        return T, V
+
+    def whole(Ad: Array) -> tuple[Array, Array]:
+        return Ad.astype(dtype), jnp.eye(len(Ad), dtype=dtype)
+
+    return jax.lax.platform_dependent(Ad, cpu=triangle, default=whole)
 
 
 def _inverse(z: Complex[Array, " k"], T: Array, V: Array) -> Complex[Array, "k n n"]:

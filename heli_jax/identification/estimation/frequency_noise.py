@@ -208,7 +208,7 @@ _UNSEEN = 1e-20
 
 
 @eqx.filter_jit
-def machine_of(layout: Layout, data: Data, z: Float[Array, " q"]) -> Matrices:
+def first_model(layout: Layout, data: Data, z: Float[Array, " q"]) -> Matrices:
     """The discretised model of the first flight."""
     return discretised(layout, data, unpack(layout, data, z), [0])[0]
 

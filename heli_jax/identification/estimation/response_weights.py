@@ -37,8 +37,8 @@ from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.estimation.frequency_noise import (
+    first_model,
     gust_spectrum,
-    machine_of,
 )
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout
@@ -476,8 +476,8 @@ is zero, where integrations have no finite response"""
 def gusts_through(layout: Layout, data: Data, z: Float[Array, " q"], w: Windowed) -> Described:
     """The shape that the first flight's vehicle gives to the noise."""
     seen = dataclasses.replace(layout, outputs=(w.outputs,) * len(data.flights))
-    vehicle = machine_of(seen, data, z)
-    return described(np.asarray(vehicle.Ad, float), np.asarray(vehicle.C, float), w)
+    model = first_model(seen, data, z)
+    return described(np.asarray(model.Ad, float), np.asarray(model.C, float), w)
 
 
 def described(Ad: Float[np.ndarray, "n n"], C: Float[np.ndarray, "p n"], w: Windowed) -> Described:

@@ -40,7 +40,7 @@ from heli_jax.identification.estimation.frequency_instrument import (
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines, lines_of, records_of
 from heli_jax.identification.estimation.frequency_noise import (
     LEAST,
-    machine_of,
+    first_model,
     once_a_length,
     smoothed,
 )
@@ -164,7 +164,7 @@ def held_poles(at: Solution) -> list[float]:
     if layout.noise_model != "spectrum" or layout.objective.fits_responses:
         return [0.0]
     with np.errstate(divide="ignore"):  # what a sample forgets altogether
-        modes = np.log(np.linalg.eigvals(machine_of(layout, data, z).Ad).astype(complex))
+        modes = np.log(np.linalg.eigvals(first_model(layout, data, z).Ad).astype(complex))
     held = []
     for names, flight in zip(layout.outputs, data.flights, strict=True):
         y = [np.asarray(flight.outputs[n]) for n in names]
