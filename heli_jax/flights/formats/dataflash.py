@@ -41,6 +41,8 @@ FIELDS: dict[str, tuple[str, float | None]] = {
 }  # fmt: skip
 _APART = 1.0
 """s before and after the board's time that a message may have some"""
+_FEWEST_ROWS = 10
+"""of a message, from which on a time that is out of order stands out"""
 # New firmware counts microseconds, old firmware milliseconds.
 # In old firmware's message GPS TimeMS is the time of the week, and T the board's.
 _CLOCKS = {"TimeUS": 1e-6, "TimeMS": 1e-3, "T": 1e-3}
@@ -353,8 +355,8 @@ def _in_order(messages: _Messages, clock: str) -> _Messages:
         return messages
     # A row before which the times go back is the wrong one, or the one before it is: whichever
     # leaves the others in order.
-    wrong = [r if r + 1 == times.size or times[r + 1] >= times[r - 1] else r - 1 for r in back]
-    kept = np.delete(np.arange(times.size), wrong)
+    rows = [r if r + 1 == times.size or times[r + 1] >= times[r - 1] else r - 1 for r in back]
+    kept = np.delete(np.arange(times.size), rows)
     return messages.rows(kept) if np.all(np.diff(times[kept]) >= 0) else messages
 
 
