@@ -355,8 +355,8 @@ def _in_order(messages: _Messages, clock: str) -> _Messages:
         return messages
     # A row before which the times go back is the wrong one, or the one before it is: whichever
     # leaves the others in order.
-    wrong = [r if r + 1 == times.size or times[r + 1] >= times[r - 1] else r - 1 for r in back]
-    kept = np.delete(np.arange(times.size), wrong)
+    rows = [r if r + 1 == times.size or times[r + 1] >= times[r - 1] else r - 1 for r in back]
+    kept = np.delete(np.arange(times.size), rows)
     return messages.rows(kept) if np.all(np.diff(times[kept]) >= 0) else messages
 
 
