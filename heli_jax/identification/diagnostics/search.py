@@ -2,6 +2,8 @@
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from heli_jax import naming
 from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import labels, own_instruments, own_said
@@ -23,7 +25,7 @@ def at_bound(c: Context) -> Iterator[Finding]:
 
 
 def search_stopped(c: Context) -> Iterator[Finding]:
-    """A search that did not arrive."""
+    """A search that did not arrive, and what the data leave open where it may go on without end."""
     # Rounding has a remedy of its own.
     if c.optimum is None or c.arrived or c.rounding:
         return
@@ -31,6 +33,10 @@ def search_stopped(c: Context) -> Iterator[Finding]:
     windows = sum(count for count, _ in layout.windows) > len(layout.windows)
     code = "search.stopped-in-windows" if windows and layout.continuity is None else STOPPED
     yield found(code, "doubt", value=float(sum(s for s, _ in c.optimum.trace)))
+    open_ = c.before.not_identifiable & c.verdict.not_identifiable
+    names = [n for n in c.verdict.names if n in open_]
+    if names and np.all(np.isfinite(c.e.J)):
+        yield found("search.open-directions", "doubt", *names)
 
 
 def search_told(c: Context) -> Iterator[Finding]:
