@@ -207,7 +207,13 @@ def _check_intervals(config: FitConfig, path: Path) -> None:
                 f"{path}: fit.intervals.nuts: {package} is not installed, expected the extra "
                 "bayes: pip install 'heli_jax[bayes]'"
             )
-    in_frequency = objective_of(config.method).noise_model == "spectrum"
+    objective = objective_of(config.method)
+    if config.intervals.bootstrap and objective.fits_responses:
+        raise InputError(
+            f"{path}: fit.intervals.bootstrap: not available with method {config.method}, expected "
+            "another method or fit.intervals.profile"
+        )
+    in_frequency = objective.noise_model == "spectrum"
     if config.intervals.bootstrap and config.nuisance.time_shift and not in_frequency:
         raise InputError(
             f"{path}: fit.intervals.bootstrap: not available with fit.nuisance.time_shift, "

@@ -76,7 +76,7 @@ def test_no_part_says_more_than_the_whole(ranked):
 
 
 @pytest.mark.parametrize(
-    ("length", "named"), [(0.18, "200"), (100.0, "longest flight"), (0.1, "9 at least")]
+    ("length", "named"), [(0.18, "200"), (100.0, "longest flight"), (0.1, "9 for 3 free")]
 )
 def test_lengths_that_cannot_be_compared_are_refused(length, named):
     with pytest.raises(ValueError, match=named):

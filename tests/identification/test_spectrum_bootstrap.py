@@ -1,13 +1,10 @@
 """The bootstrap of fits in frequency: what is drawn, and how estimates scatter."""
 
-from dataclasses import replace
-
 import jax
 import numpy as np
 import pytest
 
-from heli_jax import fit, stages
-from heli_jax.analysis.spectra import ResponseOptions
+from heli_jax import stages
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines, in_time_of, lines_of
 from heli_jax.identification.uncertainty.bootstrap import _spectrum_records, bootstrap
 
@@ -60,14 +57,3 @@ def test_the_stage_counts_records_and_no_steps_of_their_searches(fitted_by_lines
     with stages.observed_by(heard), stages.stage("bootstrap", total=3):
         bootstrap(fitted_by_lines, 3, seed=2)
     assert ("bootstrap", 3) in heard.ended
-
-
-@pytest.mark.slow
-def test_responses_are_drawn_of_the_residual_at_all_lines(by_lines):
-    options = ResponseOptions(window=10.0)
-    responses = fit(replace(by_lines, method="frequency-response", frequency=options))
-    booted = bootstrap(responses, 6, seed=2)
-    assert booted.failures == 0
-    for name, one in responses.estimates.items():
-        scatter = np.sqrt(np.mean((booted.values[name] - one.value) ** 2))
-        assert 0.3 * one.sd < scatter < 2.2 * one.sd

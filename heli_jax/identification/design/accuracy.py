@@ -17,7 +17,7 @@ from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.finding import Finding, found
 from heli_jax.identification.estimation.evaluation import Evaluation, deviations
-from heli_jax.identification.identifiability.analysis import relative_rows, verdict_of
+from heli_jax.identification.identifiability.analysis import relative_rows
 from heli_jax.identification.identifiability.directions import projected
 from heli_jax.identification.identifiability.verdict import Unknown
 from heli_jax.identification.problem import Problem
@@ -64,8 +64,7 @@ def triangle(s: Sensitivity) -> Float[np.ndarray, "s s"]:
 
 def together(*triangles: np.ndarray) -> Float[np.ndarray, "s s"]:
     """Return the triangle of several parts of the data, whose shared unknowns are the same."""
-    rows = np.vstack(triangles)
-    return projected(rows, np.zeros((len(rows), 0)))
+    return np.linalg.qr(np.vstack(triangles), mode="r")
 
 
 def expected_sd(
@@ -81,12 +80,6 @@ def expected_sd(
     # What filter error estimates of the noise may leave no trace: it is then no unknown.
     felt = np.any(rows != 0.0, axis=0) | (np.arange(R.shape[1]) < q)
     return deviations(rows[:, felt])[:q]
-
-
-def not_determined(problem: Problem, layout: Layout, e: Evaluation) -> tuple[str, ...]:
-    """Return the parameters that the whole record does not determine, and so none of its parts."""
-    verdict = verdict_of(problem, layout, e)
-    return (*verdict.undetermined, *verdict.without_effect)
 
 
 GUESSED = "guessed: too small where the log was smoothed; state the output's sd"

@@ -17,16 +17,15 @@ from heli_jax.identification.design.accuracy import (
     FREE,
     Sensitivity,
     expected_sd,
-    not_determined,
     sensitivity_at,
     together,
     triangle,
 )
 from heli_jax.identification.design.windows import DETERMINES
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
+from heli_jax.identification.identifiability.analysis import verdict_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
-    Layout,
     Solution,
     flight_places,
     layout_of,
@@ -39,8 +38,6 @@ _LONGEST = 20.0
 """duration of a candidate at most [s]: of a longer record several in a row"""
 _BAND = (0.1, 5.0)
 """of the chirp [Hz]"""
-_SHORT = 20_000
-"""samples of a record up to which its own program serves for the candidates"""
 
 
 class Candidate(NamedTuple):
@@ -74,16 +71,11 @@ class Plan(NamedTuple):
 
 def plan_next_flight(problem: Problem, at: Solution, e: Evaluation) -> Plan | None:
     """Compare manoeuvres; None where nothing can be compared."""
-    # A filter of a nonlinear model would be compiled for every candidate by itself.
-    if not (at.layout.noise_model == "white" or at.layout.model.linear):
-        return None
-    # Rows that weigh all flights together do not say what one more would add, and those at
-    # frequencies are none of samples.
-    objective = at.layout.objective
-    if objective.noise_model == "spectrum":
-        return None
-    # Of a simulation that diverges there is nothing to compare with.
-    if not np.isfinite(e.J).all():
+    layout = at.layout
+    # A filter of a nonlinear model would be compiled for every candidate by itself. Rows at
+    # frequencies weigh all flights together, and do not say what one more would add.
+    comparable = layout.noise_model == "white" or layout.model.linear
+    if not comparable or layout.noise_model == "spectrum" or not np.isfinite(e.J).all():
         return None
     flight = max(problem.training, key=lambda f: f.n_samples)
     i = problem.training.index(flight)
@@ -94,9 +86,9 @@ def plan_next_flight(problem: Problem, at: Solution, e: Evaluation) -> Plan | No
     if not candidates:
         return None
     now, each = sensitivity_at(problem, at.layout, e), _flown(problem, at, i, candidates, m)
-    flights = objective.tags(at.layout, at.data, len(now.shared)).flight
+    flights = layout.objective.tags(layout, at.data, len(now.shared)).flight
     once_more = now.part(flights == i)
-    lacking = not_determined(problem, at.layout, e)
+    lacking = verdict_of(problem, layout, e).not_identifiable
     absent = np.array([u.name in lacking for u in now.unknowns])
     if lacking:
         # What only weak priors of biases and offsets hold up is not known: neither now nor then.
@@ -130,34 +122,24 @@ def _flown(
     """The rows of each candidate, a flight of m samples that begins as the i-th one does."""
     flight, numbers, model = problem.training[i], at.data.flights[i], problem.model
     dtype, whole, places = at.z.dtype, np.asarray(at.z), flight_places(at.layout)[i]
-
-    def of_length(n: int) -> Layout:
-        inputs, outputs = (dict.fromkeys(s, np.zeros(n)) for s in (flight.inputs, flight.outputs))
-        # Held between samples: steps are, and of a chirp it makes no difference to the comparison.
-        unlogged = {"instruments": {}, "hold": {}, "hold_reason": {}}
-        return layout_of(problem, (replace(flight, inputs=inputs, outputs=outputs, **unlogged),))
-
-    # The record's program is compiled already. Behind the end of a candidate nothing is measured
-    # there, and rows are zero. Another record is too long for that, or is not flown like this.
-    n, layout = flight.n_samples, at.layout
-    in_one_piece = model.linear and n <= _SHORT and layout.windows == ((1, n),)
-    if not (in_one_piece and layout == of_length(n)):
-        n, layout = m, replace(of_length(m), windows=((1, m),), continuity=None)
+    # Held between samples: steps are, and of a chirp it makes no difference to the comparison.
+    signals = (dict.fromkeys(s, np.zeros(m)) for s in (flight.inputs, flight.outputs))
+    names = ("inputs", "outputs", "instruments", "hold", "hold_reason")
+    alone = replace(flight, **dict(zip(names, (*signals, {}, {}, {}), strict=True)))
+    layout = replace(layout_of(problem, (alone,)), windows=((1, m),), continuity=None)
     # A linear model is at rest with neutral sticks alone, and would respond to others as to a step;
     # another begins in the state and with the sticks that the record begins with.
     moves = 0.0 if model.linear else 1.0
-    rest = {k: np.full(n, moves * float(u[0])) for k, u in flight.inputs.items()}
+    rest = {k: np.full(m, moves * float(u[0])) for k, u in flight.inputs.items()}
     shared, begin = whole[: at.layout.first_nuisance], moves * whole[places.states[0]]
     z = jnp.asarray(np.concatenate([shared, begin, np.zeros(places.constants.size)]))
-    measured = jnp.asarray(np.where(np.arange(n) < m, 0.0, np.nan), dtype)
     noise = at.noise._replace(sd=(at.noise.sd[i],))
     each = []
     for candidate in candidates:
-        moved = rest[candidate.input] + np.pad(candidate.values, (0, n - m))
-        inputs = {**rest, candidate.input: moved}
+        inputs = {**rest, candidate.input: rest[candidate.input] + candidate.values}
         part = numbers._replace(
             inputs=model.Inputs(**{k: jnp.asarray(v, dtype) for k, v in inputs.items()}),
-            outputs=dict.fromkeys(numbers.outputs, measured),
+            outputs=dict.fromkeys(numbers.outputs, jnp.zeros(m, dtype)),
         )
         data = at.data._replace(flights=(part,))
         s = sensitivity_at(problem, layout, evaluate(layout, data, noise, z))

@@ -25,7 +25,6 @@ from heli_jax.flights.signal_facts import DROP_SHARE
 from heli_jax.identification.design.accuracy import (
     FREE,
     expected_sd,
-    not_determined,
     sensitivity_at,
     together,
     triangle,
@@ -33,10 +32,10 @@ from heli_jax.identification.design.accuracy import (
 from heli_jax.identification.estimation.data import runs_away
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.simulated_flights import predict
+from heli_jax.identification.identifiability.analysis import verdict_of
 from heli_jax.identification.identifiability.verdict import Unknown
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
-    Data,
     Layout,
     Solution,
     flight_places,
@@ -130,10 +129,10 @@ def window_samples(problem: Problem, length: float | None = None) -> int:
     """
     flight = max(problem.training, key=lambda f: f.duration)
     least = max(_FEWEST, _PER_PARAMETER * len(problem.free))
-    fewest = -(-sum(f.n_samples for f in problem.training) // _MOST)
+    fewest = max(least, -(-sum(f.n_samples for f in problem.training) // _MOST))
     if length is None:
-        samples = round(np.clip(flight.duration / _PARTS, _SHORTEST, _LONGEST) / flight.dt)
-        samples = min(max(samples, least, fewest), flight.n_samples)
+        length = float(np.clip(flight.duration / _PARTS, _SHORTEST, _LONGEST))
+        samples = min(max(round(length / flight.dt), fewest), flight.n_samples)
     else:
         samples = round(length / flight.dt)
         if samples > flight.n_samples:
@@ -141,15 +140,10 @@ def window_samples(problem: Problem, length: float | None = None) -> int:
                 f"windows of {length:g} s: expected at most the length of the longest flight, "
                 f"{flight.n_samples * flight.dt:.4g} s"
             )
-        if least <= samples < fewest:
-            raise ValueError(
-                f"windows of {length:g} s: expected at most {_MOST} windows, so "
-                f"{fewest * flight.dt:.3g} s at least for this log"
-            )
-    if samples < least:
+    if samples < min(fewest, flight.n_samples) or samples < least:
         raise ValueError(
-            f"windows of {samples * flight.dt:.3g} s hold {samples} samples, expected {least} at "
-            f"least for {len(problem.free)} free parameters"
+            f"windows of {samples * flight.dt:.3g} s hold {samples} samples, expected {fewest} at "
+            f"least: {least} for {len(problem.free)} free parameters, and at most {_MOST} windows"
         )
     if problem.window is not None:
         cell = round(problem.window / flight.dt)
@@ -174,15 +168,15 @@ def rank_windows(
                 f"windows: the simulation of {', '.join(away)} diverges at the start values, "
                 "expected fit.shooting or fit.method: filter-error"
             )
-    lacking = not_determined(problem, layout, e)
+    lacking = verdict_of(problem, layout, e).not_identifiable
     if shooting:
         sizes = [m * max(1, round(samples / m)) for _, m in layout.windows]
     else:
         sizes = [-(-f.n_samples // max(1, round(f.n_samples / samples))) for f in flights]
-    if layout.noise_model == "white" and not shooting:
-        windows = tuple((-(-f.n_samples // m), m) for f, m in zip(flights, sizes, strict=True))
-        layout = dataclasses.replace(layout, windows=windows, initial_state=True)
-        e = evaluate(layout, at.data, at.noise, _on_record(layout, at))
+        if layout.noise_model == "white":
+            cut = tuple((-(-f.n_samples // m), m) for f, m in zip(flights, sizes, strict=True))
+            layout = dataclasses.replace(layout, windows=cut, initial_state=True)
+            e = evaluate(layout, at.data, at.noise, _on_record(layout, at))
     s = sensitivity_at(problem, layout, e)
     s = s._replace(own=s.own / _prior_weights(layout, flights, samples, shooting=shooting))
     unknown = np.array([u.name in lacking for u in s.unknowns])
@@ -211,7 +205,7 @@ def rank_windows(
         tuple(window for window, _ in windows),
         taken,
         all_sd,
-        lacking,
+        tuple(u.name for u in s.unknowns if u.name in lacking),
         tuple(f"{label}/{n}" for label, f, sd in sds for n in sd if n not in f.sd),
         {f"{label}/{n}": float(v) for label, _, sd in sds for n, v in sd.items()},
     )
@@ -225,17 +219,15 @@ def why_excluded(flight: Flight, first: int, last: int) -> str:
         longest = float(np.max(np.diff(np.r_[first - 1, here, last])))
         # A sensor slower than the flight's rate leaves samples out that are no gap.
         if longest > max(5.0 * float(np.median(np.diff(seen))), _GAP / flight.dt):
-            return f"{name}: a gap of {longest * flight.dt:.2g} s"
+            return f"{name} has a gap of {longest * flight.dt:.2g} s"
     for (name, _), whole in flight.facts.items():
         facts = whole.within(first * flight.dt, (last - 1) * flight.dt)
         if facts.stuck is not None:
-            length = sum(one.end - one.begin for one in facts.stretches)
-            return f"{name} stuck at one value for {length:.2g} s"
+            return f"{name} is stuck"
         if facts.dropped >= DROP_SHARE and facts.dropouts is not None:
-            words = f"jumps to {facts.dropouts.value:.4g} and back"
-            return f"{name} {words}, in {100 * facts.dropped:.2g} % of the samples"
-        if (share := sum(facts.shares)) >= _RAILS:
-            return f"{name} at an end of its range in {100 * share:.0f} % of the samples"
+            return f"{name} has dropouts"
+        if sum(facts.shares) >= _RAILS:
+            return f"{name} is clipped"
     return ""
 
 
@@ -243,18 +235,13 @@ def _on_record(layout: Layout, at: Solution) -> Float[Array, " q"]:
     """The unknowns, each window's initial state being that of the simulation of the record."""
     z, every = np.asarray(at.z), naming.names(layout.model.State)
     own, of_states = [z[: layout.first_nuisance]], [every.index(n) for n in layout.states]
-    runs = _states(at.layout, at.data, at.z)
+    runs = eqx.filter_jit(predict)(at.layout, at.data, unpack(at.layout, at.data, at.z))
     each = zip(at.data.flights, runs, layout.windows, flight_places(at.layout), strict=True)
-    for flight, states, (count, m), places in each:
+    for flight, run, (count, m), places in each:
         scales = np.array([float(flight.state_scale[n]) for n in layout.states])
-        begun = np.asarray(states)[of_states][:, m * np.arange(count)]
+        begun = np.asarray(run.states)[of_states][:, m * np.arange(count)]
         own += [(begun.T / scales).ravel(), z[places.constants]]
     return jnp.asarray(np.concatenate(own), at.z.dtype)
-
-
-@eqx.filter_jit
-def _states(layout: Layout, data: Data, z: Float[Array, " q"]) -> tuple[Array, ...]:
-    return tuple(run.states for run in predict(layout, data, unpack(layout, data, z)))
 
 
 def _prior_weights(
@@ -279,21 +266,20 @@ def _chosen(
     """The windows, the one that gains most first, until they say enough (Mehra, 1974), and the sds
     expected of all.
     """
-    left, R, steps = list(usable), np.zeros_like(usable[0][1]), []
+    left, R, taken = list(usable), np.zeros_like(usable[0][1]), []
+    before, log_dets = np.full(len(unknowns), np.inf), []
     while left:
         # The first of equal ones: the same record gives the same windows.
         gains = [_log_det(unknowns, together(R, T)) for _, T in left]
         window, T = left.pop(int(np.argmax(gains)))
         R = together(R, T)
-        steps.append((window, max(gains), np.where(unknown, np.inf, expected_sd(unknowns, R))))
-    taken, before = [], np.full(len(unknowns), np.inf)
-    for window, log_det, sd in steps:
-        efficiency = float(np.exp((log_det - steps[-1][1]) / len(unknowns)))
-        taken.append(Choice(window, efficiency, sd, _reason(unknowns, before, sd)))
+        sd = np.where(unknown, np.inf, expected_sd(unknowns, R))
+        taken.append(Choice(window, 0.0, sd, _reason(unknowns, before, sd)))
+        log_dets.append(max(gains))
         before = sd
-        if efficiency >= ENOUGH:
-            break
-    return tuple(taken), steps[-1][2]
+    efficiencies = np.exp((np.array(log_dets) - log_dets[-1]) / len(unknowns))
+    taken = [c._replace(efficiency=float(f)) for c, f in zip(taken, efficiencies, strict=True)]
+    return tuple(taken[: 1 + int(np.argmax(efficiencies >= ENOUGH))]), before
 
 
 def _log_det(unknowns: tuple[Unknown, ...], R: np.ndarray) -> float:
@@ -310,14 +296,16 @@ def _log_det(unknowns: tuple[Unknown, ...], R: np.ndarray) -> float:
 
 
 def _reason(unknowns: tuple[Unknown, ...], before: np.ndarray, after: np.ndarray) -> str:
-    """The parameter of which a window tells most."""
-    names, known = np.array([u.name for u in unknowns]), after < DETERMINES
+    """Return in words the parameters that a window determines, else the one that it tells most."""
+    if (new := (after < DETERMINES) & (before >= DETERMINES)).any():
+        return (
+            f"determines {', '.join(u.name for u, one in zip(unknowns, new, strict=True) if one)}"
+        )
+    known = after < DETERMINES
     if not known.any():
-        return "determines no parameter by itself"
-    if (new := known & (before >= DETERMINES)).any():
-        return f"determines {', '.join(names[new])}"
+        return ""
     i = int(np.argmax(np.where(known, before / after, 0.0)))
-    return f"{names[i]}: sd {100 * before[i]:.2g} % to {100 * after[i]:.2g} %"
+    return f"{unknowns[i].name}: sd {100 * before[i]:.2g} % to {100 * after[i]:.2g} %"
 
 
 def window_flights(problem: Problem, ranking: Ranking) -> dict[int, tuple[Flight, ...]]:

@@ -8,13 +8,12 @@ aliases of a fast mode (`validation.logging_rate`).
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
 
 from heli_jax import naming
 from heli_jax.analysis.linear import linearize
@@ -185,36 +184,25 @@ class Valley(NamedTuple):
         """
         params = self.problem.model.Params
         units = {u.name: naming.unit(params, u.name) for u in unknowns if u.is_parameter}
-        products = combinations(null, spread, unknowns)
-        added = combinations(null, spread, unknowns, units)
-        if not (products or added):
-            return ()
-        points: list[dict[str, float]] = []
-        # As many unknowns span the valley as it has directions; the others are asked only where
-        # these left a combination's own parameters nearly where they were.
-        for asked, more in enumerate(self._far_points(null, unknowns), start=1):
-            points += more
-            stays = [_stays(c, unknowns, points) for c in (*products, *added)]
-            if asked >= len(null) and None not in stays:
-                break
-        return tuple(c for c in products if _stays(c, unknowns, points)) or tuple(
-            c for c in added if _stays(c, unknowns, points)
-        )
+        found = [
+            *combinations(null, spread, unknowns),
+            *combinations(null, spread, unknowns, units),
+        ]
+        points = self._far_points(null, unknowns) if found else []
+        stays = [c for c in found if _stays(c, unknowns, points)]
+        return tuple(c for c in stays if c.kind == stays[0].kind)
 
     def _far_points(
         self, null: Sequence[np.ndarray], unknowns: tuple[Unknown, ...]
-    ) -> Iterator[list[dict[str, float]]]:
-        """Yield points along the valley for each unknown that is moved; those that together span
-        the valley come first."""
+    ) -> list[dict[str, float]]:
+        """Return the values at points along the valley, to which each unknown is moved in turn."""
         N = np.array(null) * np.array([u.per_log if u.logarithmic else 0.0 for u in unknowns])
         # Onto the null directions: how the logarithms of all go with that of one.
-        onto = np.linalg.pinv(N) @ N
-        pivoted: Any = scipy.linalg.qr(onto, mode="r", pivoting=True)
-        for i in pivoted[1].tolist():
-            u = unknowns[i]
+        onto, points = np.linalg.pinv(N) @ N, []
+        for i, u in enumerate(unknowns):
             if not onto[i, i] > 1e-2:
                 continue
-            points, along = [], onto[i] / onto[i, i]
+            along = onto[i] / onto[i, i]
             others = [
                 k for k in np.flatnonzero(abs(along) > 1e-6) if k != i and unknowns[k].logarithmic
             ]
@@ -226,15 +214,14 @@ class Valley(NamedTuple):
                     if point is not None and point.excess <= SAME:
                         points.append(point.values)
                         break
-            yield points
+        return points
 
 
 def _stays(
     c: Combination, unknowns: tuple[Unknown, ...], points: Sequence[Mapping[str, float]]
-) -> bool | None:
-    """Return whether a combination is the same at all points; None where its parameters have hardly
-    moved at any."""
-    values, told = {u.name: u.value for u in unknowns}, None
+) -> bool:
+    """True if a combination is the same at all points, and its parameters are not at one."""
+    values, has_moved = {u.name: u.value for u in unknowns}, False
     for point in points:
         if c.kind == "sum":
             parts = [w * (point[n] - values[n]) for n, w in c.exponents.items()]
@@ -248,8 +235,8 @@ def _stays(
         moved = sum(abs(part) for part in parts)
         if abs(sum(parts)) > max(2.0 * sd, _STAYS * moved):
             return False
-        told = True if moved > _MOVED * size else told
-    return told
+        has_moved |= moved > _MOVED * size
+    return has_moved
 
 
 # Two real modes that other parameters make.
@@ -269,7 +256,7 @@ _MAKES = 0.05
 """of the change of two modes that parameters make, the least beside the largest"""
 _REACH = math.log(300.0)
 """how far a parameter may be put"""
-_VISITS = 3
+_VISITS = 2
 """times that all unknowns follow after an exchange"""
 _DIFFERENCE = 1e-5
 """relative, of a parameter"""
@@ -294,20 +281,15 @@ def second_solutions(
     for held in _exchanged_modes(problem, here):
         # Held until the others have followed, or the modes would change back; then all of them
         # follow more than once, until they stay or are back.
-        before, point = here, valley.visit(held, {}, same=not optimum, priors=True)
+        point = valley.visit(held, {}, same=not optimum, priors=True)
         for _ in range(_VISITS):
-            if point is None:
-                break
-            before = {n: point.values[n] for n in here}
-            point = valley.visit({}, before, same=not optimum, priors=True)
-            if point is not None and all(_alike(v, point.values[n]) for n, v in here.items()):
-                break
+            if point is not None:
+                guess = {n: point.values[n] for n in here}
+                point = valley.visit({}, guess, same=not optimum, priors=True)
         # What the slopes expect to be within the interval is no other solution.
         if point is None or not (point.excess <= SAME and point.expected > _APART):
             continue
         there = {n: point.values[n] for n in here}
-        if not all(map(_alike, before.values(), there.values())):
-            continue
         changed = tuple(n for n, v in here.items() if not _alike(v, there[n]))
         known = (all(map(_alike, s.values.values(), there.values())) for s in solutions)
         if changed and not any(known):

@@ -165,7 +165,7 @@ class Verdict:
 
     @property
     def combinations(self) -> tuple[Combination, ...]:
-        """Combinations that the data alone determine, of parameters not determined one by one."""
+        """Combinations of parameters that the data determine, and not one by one."""
         return tuple(c for g in (*self.groups, *self.resting_groups) for c in g.combinations)
 
     @property

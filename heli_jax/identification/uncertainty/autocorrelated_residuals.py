@@ -17,11 +17,11 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 import scipy.special
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 
 from heli_jax.identification.estimation.evaluation import NULL, Evaluation, deviations
-from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise
+from heli_jax.identification.identifiability.equivalents import rows_at
+from heli_jax.identification.unknowns.layout import Data, Layout, Solution
 
 _LENGTH = 6.0
 """Parzen's window over tau^(4/5) n^(1/5), where tau is the sum of squared autocorrelations. The
@@ -161,39 +161,30 @@ def sandwich(
     return Sandwich(norms, white, bread, tuple(parts), J[at:].T @ J[at:])
 
 
-def residual_curvature(
-    layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
-) -> Float[np.ndarray, "q q"]:
+def residual_curvature(at: Solution) -> Float[np.ndarray, "q q"]:
     """Return what the residuals add to J'J in the Hessian of r'r/2, (q, q): the sum of r_k r_k''.
 
     By central differences of J'r along the unknowns of interest; zero where it is not finite. Those
     of a model that is not linear reach two standard deviations to either side, across the kinks
     that a limit, a stop or a dead band makes.
     """
-    least = float(np.finfo(np.asarray(z).dtype).eps) ** 0.25
-    at = residual_and_jacobian(layout, data, noise, z)
-    J = np.asarray(at.J, np.float64)
-    q, k = J.shape[1], len(layout.of_interest)
+    least = float(np.finfo(np.asarray(at.z).dtype).eps) ** 0.25
+    _, J = rows_at(at, at.z)
+    q, k = J.shape[1], len(at.layout.of_interest)
     curvature = np.zeros((q, q))
     steps = np.full(k, least)
-    if not layout.model.linear:
+    if not at.layout.model.linear:
         sds = deviations(J)[:k]
         steps = np.where(np.isfinite(sds), 2.0 * sds, _LARGEST_STEP)
         steps = np.clip(steps, least, _LARGEST_STEP)
     with np.errstate(all="ignore"):  # an unstable simulation a step away: zero, as said above
         # Initial states and biases enter linearly, or so nearly that they are left at J'J.
-        for i in range(k):
-            # So far away a simulation may diverge that does not close by.
-            for step in (float(steps[i]), least):
-                ends = []
-                for sign in (1.0, -1.0):
-                    near = residual_and_jacobian(
-                        layout, data, noise, z.at[i].add(jnp.asarray(sign * step, z.dtype))
-                    )
-                    ends.append(np.asarray(near.J, np.float64).T @ np.asarray(near.r, np.float64))
-                curvature[:, i] = (ends[0] - ends[1]) / (2.0 * step) - J.T @ J[:, i]
-                if np.isfinite(curvature[:, i]).all():
-                    break
+        for i, step in enumerate(steps.tolist()):
+            ends = []
+            for end in (step, -step):
+                near = rows_at(at, jnp.asarray(at.z).at[i].add(end))
+                ends.append(near.J.T @ near.r)
+            curvature[:, i] = (ends[0] - ends[1]) / (2.0 * step) - J.T @ J[:, i]
     # A Hessian is symmetric, its differences only nearly so.
     curvature[:k, :k] = 0.5 * (curvature[:k, :k] + curvature[:k, :k].T)
     curvature[:k, k:] = curvature[k:, :k].T

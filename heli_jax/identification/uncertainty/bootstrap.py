@@ -1,6 +1,5 @@
 """Bootstrap: records about the estimated vehicle's response are identified again, many times."""
 
-import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -11,15 +10,10 @@ from jaxtyping import Array, Bool, Float
 
 from heli_jax import naming, stages
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.frequency_error import OBJECTIVE as FREQUENCY_ERROR
-from heli_jax.identification.estimation.frequency_error import first_spectrum
 from heli_jax.identification.estimation.frequency_lines import (
-    FlightFacts,
     errors_of_lines,
     in_time_of,
-    parts_of,
     records_of,
-    without_parts,
 )
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
 from heli_jax.identification.estimation.many_runs import optimise_many
@@ -28,10 +22,8 @@ from heli_jax.identification.estimation.noise_covariance import relax_noise_cova
 from heli_jax.identification.problem import FEWEST_SEEN
 from heli_jax.identification.result import Fit
 from heli_jax.identification.uncertainty.autocorrelated_residuals import drawn
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, unpack, value_of
+from heli_jax.identification.unknowns.layout import Data, Layout, Solution, unpack, value_of
 
-_ROUNDS = 3
-"""of residual and spectrum in turn, for an estimate by responses, which has no spectrum of lines"""
 _STEPS = 200
 """of the optimiser at most, in frequency"""
 
@@ -153,20 +145,22 @@ def bootstrap(
     """Refit records simulated with the estimates: same inputs, same missing samples, new noise.
 
     Filter error draws the disturbance anew. Output error adds white noise, or where its residuals
-    are autocorrelated, noise with their covariance over time and between outputs. The methods in
-    frequency draw residuals line by line, and estimate the spectrum anew.
+    are autocorrelated, noise with their covariance over time and between outputs. Frequency error
+    draws residuals line by line, and estimates the spectrum anew.
 
     Args:
         say: called with a sentence where many records are not fitted by programs of machine code.
 
     Raises:
-        ValueError: no run; the time shift is free in a fit in time, or the data do not determine
-            every parameter; in frequency no part of a flight has all outputs.
+        ValueError: no run; the time shift is free in a fit in time, the data do not determine every
+            parameter, or responses are fitted, which have no residual at lines.
     """
     if runs < 1:
         raise ValueError(f"bootstrap: expected at least 1 run, got {runs}")
     at = fit.reached
     in_frequency = at.layout.noise_model == "spectrum"
+    if at.layout.objective.fits_responses:
+        raise ValueError(f"bootstrap: not available with method {fit.method}")
     if at.layout.shift and not in_frequency:
         raise ValueError("bootstrap: not available with a free time shift")
     if fit.not_identifiable:
@@ -257,7 +251,7 @@ def _spectrum_records(at: Solution, rng: np.random.Generator) -> Iterator[Data]:
     that another one had, with any phase, at the size that the spectrum gives it there (Franke and
     Härdle, 1992, On bootstrapping kernel spectral estimates). Nothing is simulated in time.
     """
-    layout, noise = _in_lines(at)
+    layout, noise = at.layout, at.noise
     errors = jax.device_get(errors_of_lines(layout, at.data, noise, at.z).errors)
     records = records_of(layout)
     # What the unknowns fit of the noise is missing in the residual.
@@ -287,27 +281,3 @@ def _spectrum_records(at: Solution, rng: np.random.Generator) -> Iterator[Data]:
                 for f, by_name in zip(at.data.flights, outputs, strict=True)
             )
         )
-
-
-def _in_lines(at: Solution) -> tuple[Layout, Noise]:
-    """Return layout and noise by which the residual stands at the lines of whole records."""
-    layout, data = at.layout, at.data
-    if layout.objective is FREQUENCY_ERROR:
-        return layout, at.noise
-    flights = [
-        Flight(
-            dt=float(f.dt),
-            inputs={n: np.asarray(v) for n, v in naming.asdict(f.inputs).items()},
-            outputs={n: np.asarray(y) for n, y in f.outputs.items()},
-            name=f"flight {i}",
-        )
-        for i, f in enumerate(data.flights, 1)
-    ]
-    if (why := without_parts(flights)) is not None:
-        raise ValueError(f"bootstrap: {why}")
-    facts = tuple(FlightFacts(parts_of(f), f.dt) for f in flights)
-    layout = dataclasses.replace(layout, objective=FREQUENCY_ERROR, flight_facts=facts)
-    noise, z = first_spectrum(at.noise, flights), at.z
-    for _ in range(_ROUNDS):
-        _, noise = FREQUENCY_ERROR.relax(layout, data, noise, z)
-    return layout, noise

@@ -119,9 +119,6 @@ def _findings(
         findings.append(found("intervals.residuals-coloured"))
     if booted is not None and booted.failures:
         findings.append(found("intervals.records-failed", value=booted.failures))
-    beside = [n for n in fit.nuisance if n == "time_shift" or n.startswith("gain ")]
-    if beside and booted is not None:
-        findings.append(found("intervals.estimated-too", "note", *beside))
     if posterior is not None and not posterior.trusted:
         numbers = {"rhat": posterior.rhat, "draws": posterior.effective}
         limits = {"most_rhat": RHAT, "least_draws": EFFECTIVE}
@@ -133,18 +130,7 @@ def _findings(
         others = {m: ends for m, ends in by.items() if m != "gaussian"}
         apart_by = {m: apart(by["gaussian"], ends) for m, ends in others.items()}
         if far := [m for m, d in apart_by.items() if d > limits.get(m, DIFFERENT)]:
-            code = _which(far, others)
+            bounded = np.isfinite(others.get("profile", (0.0, 0.0))).all()
+            code = "intervals.differ" if bounded else "intervals.unbounded"
             findings.append(found(code, "doubt", name, methods=far, limit=DIFFERENT))
     return findings
-
-
-def _which(far: Sequence[str], others: Mapping[str, _Ends]) -> str:
-    """Return the code that tells which interval to believe where some differ from the Gaussian."""
-    if not np.isfinite(others.get("profile", (0.0, 0.0))).all():
-        return "intervals.unbounded"
-    # All against the Gaussian one: the parabola is wrong, not one of their assumptions.
-    if len(far) == len(others):
-        return "intervals.not-quadratic"
-    if "profile" in far:
-        return "intervals.profile-differs"
-    return "intervals.bootstrap-differs" if "bootstrap" in far else "intervals.nuts-differs"

@@ -139,7 +139,7 @@ def _by_slopes(
         # Weighed by the noise's own spectrum, the bound allows for it as it stands.
         allowed = usable and not white and objective.noise_model == "spectrum"
         return StandardErrors(verdict, np.ones(layout.size), quantiles, allowed)
-    errors = sandwich(layout, at.data, e, residual_curvature(layout, at.data, at.noise, at.z))
+    errors = sandwich(layout, at.data, e, residual_curvature(at))
     quantiles = np.maximum(errors.quantile(), quantile)
     # The verdict, which takes 1.96 standard deviations, has to see the reported intervals.
     k = len(layout.of_interest)
