@@ -371,7 +371,8 @@ def _of_record(
             if by is None:
                 return directly()
             # One program for both: the direct estimate is where the search begins.
-            return jax.lax.cond(by_instrument > 0.5, lambda: with_instruments(by), directly)
+            instruments = lambda: with_instruments(by)  # noqa: E731  # pyright: ignore
+            return jax.lax.cond(by_instrument > 0.5, instruments, directly)
 
         return jax.lax.map(of_flight, own)
 
