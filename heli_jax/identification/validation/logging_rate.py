@@ -330,16 +330,18 @@ def fast_modes(
     for i, flight in enumerate(problem.training):
         here = {**{n: v for n, v in values.items() if n in problem.free}, **flight.known}
         modes, nyquist = _modes_of(problem, problem.params_with(here), flight), np.pi / flight.dt
+        if modes is None:
+            continue
         # The imaginary part alone: a fast decay without oscillation has no alias.
-        if modes is None or not np.any(modes.eigenvalues.imag >= _NEAR * nyquist):
+        swing, decay = np.imag(modes.eigenvalues), -np.real(modes.eigenvalues)
+        if not np.any(swing >= _NEAR * nyquist):
             continue
         slopes = _relative_slopes(problem, here, [n for n in here if n not in flight.known], modes)
         # A filter or a servo whose constants are given is simulated as it is, and has no alias.
-        past = modes.eigenvalues.imag >= _NEAR * nyquist
+        past = swing >= _NEAR * nyquist
         past &= np.any([np.abs(s) > _MOVED for s in slopes.values()], axis=0)
         if not past.any():
             continue
-        swing, decay = modes.eigenvalues.imag, -modes.eigenvalues.real
         # What is gone within a sample swings in none, under any alias, unless it swings many times
         # before it is gone: then its frequency was told by nothing.
         lost = past & ((decay * flight.dt < 1.0) | (swing > decay * _SWINGS))
