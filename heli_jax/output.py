@@ -191,14 +191,17 @@ _IN_FULL = 3
 
 def print_findings(findings: Sequence[Finding], *, verbose: bool) -> None:
     """The most severe findings in full, and the others by their titles."""
-    shown = findings if verbose else [f for f in findings if f.severity != "ok"][:_IN_FULL]
+    # Of what several flights or signals have alike the first will do.
+    by_topic = {f.topic: f for f in reversed(findings) if f.severity != "ok"}
+    first = [f for f in findings if f is by_topic.get(f.topic)]
+    shown = findings if verbose else first[:_IN_FULL]
     for f in shown:
         tell(f"{_MARKS[f.severity]} {f.topic}: {f.sentence}")
     rest = [f for f in findings if f not in shown]
     for said, severities in (
         ("also in doubt", ("refuse", "doubt")),
         ("notes", ("note",)),
-        ("well", ("ok",)),
+        ("passed", ("ok",)),
     ):
         titles = Counter(f.topic for f in rest if f.severity in severities)
         if titles:

@@ -98,6 +98,10 @@ class Check:
     log_notes: tuple[Finding, ...] = ()
     """what the readers of the logs assumed or did"""
 
+    def __repr__(self) -> str:
+        doubts = sentences(f for f in self.findings if f.bad)
+        return "\n".join([self.verdict.text, *(f"! {doubt}" for doubt in doubts)])
+
 
 # Compared by identity (eq=False): a field-wise == of records of arrays has no single truth value.
 
