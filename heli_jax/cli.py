@@ -383,10 +383,12 @@ def _fit_study(options: argparse.Namespace, study: "Study") -> int:
     _require_out(options)
     out = _directory(options)
     options.interrupts.words = lambda: resumable(out, directory.FINISHED)
-    options.interrupts.unwinds = True  # workers of dask have to be told
-    with _dask_client(options) as client:
-        how = {"client": client, "reports": options.reports, "say": options.say}
-        result = studies.run(study, out, studies.Options(options.resume, **how))
+    # Workers of dask have to be told; our own processes end with this one.
+    options.interrupts.unwinds = bool(options.scheduler)
+    # Without a scheduler --workers are processes of our own, for which dask is not needed.
+    with _dask_client(options) if options.scheduler else contextlib.nullcontext() as client:
+        how = {"workers": options.workers, "client": client, "reports": options.reports}
+        result = studies.run(study, out, studies.Options(options.resume, **how, say=options.say))
     simulation_output.print_study(result)
     tell(f"fits: {out / 'fits'}\nDataset: {out / studies.STORE}")
     return simulation_output.study_exit_code(result)

@@ -1,6 +1,5 @@
 """run_study: many fits of one configuration, each written when it is done."""
 
-import contextlib
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -32,10 +31,10 @@ class Options(NamedTuple):
     resume: bool = False
     """go on with what is in the directory; what failed is tried again"""
     workers: int | None = None
-    """processes of this machine: as many as there are cores unless given, one without dask"""
+    """processes of this machine: as many as there are cores unless given"""
     # Any: a dask Client, of an extra that is not installed everywhere.
     client: Any = None
-    """a dask.distributed Client whose workers fit, in place of processes of one's own"""
+    """a dask.distributed Client whose workers fit, in place of processes"""
     reports: bool = False
     """write each fit's page and figures too, which takes seconds a fit"""
     progress: Callable[[Progress], None] = lambda _: None
@@ -143,23 +142,17 @@ def _compute(tasks: Sequence[Task], places: Sequence[Path], options: Options) ->
 
 
 def _outcomes(tasks: Sequence[Task], options: Options) -> Iterator[tuple[int, Outcome]]:
-    """The fits as they are done, each by the place of its task."""
-    workers = min(options.workers or cores(), len(tasks))
-    try:
-        # An extra that is not installed everywhere.
-        from heli_jax.sweeps.cluster import connected, mapped
-    except ImportError:
-        workers = 1
-        options.say(Note("fits one after the other: the extra distributed is not installed"))
-    if options.client is None and workers == 1:
-        yield from ((k, fit_point(task)) for k, task in enumerate(tasks))
+    if options.client is not None:
+        # Here, since dask is an extra that is not installed everywhere.
+        from heli_jax.sweeps.cluster import mapped
+
+        for number, outcome in mapped(options.client, fit_point, tasks):
+            lost = failure("the dask workers that fitted it died", tasks[number])
+            yield number, lost if outcome is None else outcome
         return
-    with contextlib.ExitStack() as stack:
-        client = options.client
-        if client is None:
-            client = stack.enter_context(connected(None, workers, x64=True))
-        for k, outcome in mapped(client, fit_point, tasks, may_die=True):
-            yield k, outcome or failure("the workers that fitted it died", tasks[k])
+    from heli_jax.studies.processes import computed
+
+    yield from computed(tasks, min(options.workers or cores(), len(tasks)))
 
 
 def _write(out: Path, result: xr.Dataset) -> None:

@@ -1,5 +1,6 @@
 """Studies of fits: which there are, killed and resumed, failures, and the Dataset."""
 
+import io
 import json
 from pathlib import Path
 
@@ -13,7 +14,8 @@ from heli_jax.config.study import read_study
 from heli_jax.errors import InputError
 from heli_jax.studies import directory
 from heli_jax.studies import run as studies
-from heli_jax.studies.point import fit_point
+from heli_jax.studies.point import Outcome, fit_point
+from heli_jax.studies.worker import read_outcome, write_outcome
 
 ROOT = Path(__file__).parents[2]
 
@@ -175,8 +177,19 @@ def test_a_page_names_the_studys_command_and_its_point(config, tmp_path, monkeyp
     study = read_study(config, (), ["fit.free.Ixx.start=0.02,0.03"])
     assert study is not None
     task = studies._tasks(study, reports=True)[1]
-    monkeypatch.setattr("sys.argv", ["/opt/dask/worker.py"])
+    monkeypatch.setattr("sys.argv", ["/opt/heli_jax/studies/worker.py"])
     page = fit_point(task).files["report.html"].decode()
     assert f">{asked}</pre>" in page
     assert "Of a study the fit at fit.free.Ixx.start = 0.03<" in page
     assert "worker.py" not in page
+
+
+def test_an_answer_that_is_cut_off_is_none():
+    stream = io.BytesIO()
+    files = {"fit.json": b"{}\n", "figures/a.png": bytes(range(256))}
+    outcome = Outcome(files, None, ("bench.csv: ten rows were left out",))
+    write_outcome(stream, outcome)
+    whole = stream.getvalue()
+    assert read_outcome(io.BytesIO(whole)) == outcome
+    for cut in (0, 5, len(whole) - 1):
+        assert read_outcome(io.BytesIO(whole[:cut])) is None

@@ -256,7 +256,7 @@ _MAKES = 0.05
 """of the change of two modes that parameters make, the least beside the largest"""
 _REACH = math.log(300.0)
 """how far a parameter may be put"""
-_VISITS = 2
+_VISITS = 3
 """times that all unknowns follow after an exchange"""
 _DIFFERENCE = 1e-5
 """relative, of a parameter"""
@@ -281,15 +281,21 @@ def second_solutions(
     for held in _exchanged_modes(problem, here):
         # Held until the others have followed, or the modes would change back; then all of them
         # follow more than once, until they stay or are back.
-        point = valley.visit(held, {}, same=not optimum, priors=True)
+        before, point = here, valley.visit(held, {}, same=not optimum, priors=True)
         for _ in range(_VISITS):
-            if point is not None:
-                guess = {n: point.values[n] for n in here}
-                point = valley.visit({}, guess, same=not optimum, priors=True)
+            if point is None:
+                break
+            before = {n: point.values[n] for n in here}
+            point = valley.visit({}, before, same=not optimum, priors=True)
+            if point is not None and all(_alike(v, point.values[n]) for n, v in here.items()):
+                break
         # What the slopes expect to be within the interval is no other solution.
         if point is None or not (point.excess <= SAME and point.expected > _APART):
             continue
         there = {n: point.values[n] for n in here}
+        # What still moves is on its way to another place.
+        if not all(map(_alike, before.values(), there.values())):
+            continue
         changed = tuple(n for n, v in here.items() if not _alike(v, there[n]))
         known = (all(map(_alike, s.values.values(), there.values())) for s in solutions)
         if changed and not any(known):

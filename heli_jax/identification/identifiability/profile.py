@@ -218,17 +218,34 @@ def _end(
     [(t, root)] = line.roots(side, [min(expected, furthest)])
     if 1.0 / _AS_EXPECTED < root / reach < _AS_EXPECTED:
         return side * t
-    # A likelihood that levels off is no bound, wherever it passes the limit: an optimum of chance
-    # is one among many places where the noise may have put it. So the furthest point is asked too.
-    near = [factor * expected for factor in _OUTWARDS if factor * expected < furthest]
-    found = [(0.0, 0.0), *line.roots(side, [*near, furthest])]
-    if found[-1][1] < reach:
-        # A bound that was stated bounds it, a factor of ten does not.
-        bounded = transforms.at_bound(problem.free[u.name], line.value(side * furthest))
-        return side * furthest if bounded else None
-    k = next(k for k, (_, root) in enumerate(found) if root >= reach)
-    (inside, before), (outside, after) = found[k - 1], found[k]
-    return side * (inside + (outside - inside) * (reach - before) / (after - before))
+    inside, outside = (0.0, 0.0), (furthest, math.inf)
+
+    def outwards() -> Iterator[float]:
+        for factor in _OUTWARDS:
+            yield min(factor * expected, furthest)
+            if outside[1] < math.inf or inside[0] >= furthest:
+                break
+        # Once more where a straight line has the end.
+        yield between()
+        # A likelihood that levels off is no bound, wherever it passes the limit: an optimum of
+        # chance is one among many places where the noise may have put it.
+        if outside[0] < furthest:
+            yield furthest
+
+    def between() -> float:
+        share = (reach - inside[1]) / (outside[1] - inside[1])
+        return inside[0] + share * (outside[0] - inside[0])
+
+    for t, root in line.roots(side, outwards()):
+        if root < reach and t >= furthest:
+            # A bound that was stated bounds it, a factor of ten does not.
+            bounded = transforms.at_bound(problem.free[u.name], line.value(side * furthest))
+            return side * furthest if bounded else None
+        if root < reach:
+            inside = (t, root)
+        elif t < outside[0]:
+            outside = (t, root)
+    return side * between()
 
 
 def _furthest(problem: Problem, line: _Line, e: Evaluation, u: Unknown, side: int) -> float:
