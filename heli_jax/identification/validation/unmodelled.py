@@ -340,6 +340,9 @@ def _lines(
         most: robust sds at which the whitened residual is bounded.
     """
     moving, samples = moving_inputs(at), of_one_clock(at, e, name)
+    # A step may end where the simulation leaves the record.
+    if not samples:
+        return [], []
     k, m = len(at.layout.of_interest), len(moving)
     steps, lines = [J[i, name].shape[0] for i, _ in samples], []
     # A change of a parameter: a steady one over the flights in their order, and one halfway.
