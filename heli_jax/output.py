@@ -191,7 +191,7 @@ _IN_FULL = 3
 
 def print_findings(findings: Sequence[Finding], *, verbose: bool) -> None:
     """The most severe findings in full, and the others by their titles."""
-    # Of what several flights or signals have alike the first will do.
+    # Flights or signals with the same finding: the first stands for all.
     by_topic = {f.topic: f for f in reversed(findings) if f.severity != "ok"}
     first = [f for f in findings if f is by_topic.get(f.topic)]
     shown = findings if verbose else first[:_IN_FULL]

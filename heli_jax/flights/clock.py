@@ -75,9 +75,9 @@ slow log sooner: 20 s at 1 kHz in ms would be hours at 1 Hz in s"""
 def time_unit(text: str) -> str | None:
     """The unit of time that a text means: `ms` of Milliseconds, msec and Ms; None for others.
 
-    Of a clock, a capital is a way of writing: megaseconds nobody logs.
+    Capitals in a clock's unit are a way of writing: nobody logs megaseconds.
     """
-    # Of which the epoch does not matter: times count from the first sample.
+    # The epoch does not matter: times count from the first sample.
     text = _SINCE.split(text, maxsplit=1)[0]
     # The micro sign, and the Greek letter that looks the same.
     word = text.strip().casefold().replace("µ", "u").replace("μ", "u")
@@ -107,7 +107,7 @@ def likely_unit(stamps: np.ndarray | None) -> str:
     # From the coarsest unit on: the first in which the usual step is that of a log is taken.
     for unit, most, slow in (("s", _SLOWEST_STEP, 0.5), ("ms", 1e3, 100.0), ("us", 1e6, np.inf)):
         longest = _LONGEST_SLOW if step >= slow else _LONGEST_FLIGHT
-        # Of parts of a second nothing is finer.
+        # No common clock counts finer parts of a second.
         whole = unit == "ms" or step >= slow
         if not step >= most and not (whole and length * SECONDS[unit] > longest):
             return unit

@@ -14,7 +14,7 @@ from heli_jax.errors import InputError, nearest
 from heli_jax.finding import Finding
 from heli_jax.regular_file import size_words
 
-# What is said of a file.
+# Facts of a file.
 
 
 def wrong(path: str, problem: str, *place: str) -> InputError:

@@ -97,7 +97,7 @@ def mark_notes(channels: Iterable[tuple[str, np.ndarray]]) -> list[Finding]:
     """Notes on the marks that channels have, each of a name and numbers (N,) of any kind."""
     notes = []
     for name, numbers in channels:
-        # Of what was never logged nothing else is there, and a switch may have any value. A damaged
+        # A signal that was never logged has marks alone, and a switch may have any value. A damaged
         # log may hold NaNs that signal when they are converted.
         if (x := np.asarray(numbers)).dtype.kind in "biuf":
             with np.errstate(invalid="ignore"):
@@ -236,7 +236,7 @@ def _alone(out: np.ndarray, y: np.ndarray, most: int) -> np.ndarray:
 # Taken as measurements, the repeated values say that the signal stood still between two samples.
 
 REPEATS = ("auto", "keep", "missing")
-"""What is made of repeated values: missing samples where that is unmistakable, or as stated."""
+"""choices for repeated values: missing samples where that is unmistakable, or as stated"""
 
 _SHORTEST_RUN = 3
 """samples that a run of equal values has at least: two are equal by chance or resolution"""

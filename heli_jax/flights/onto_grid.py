@@ -146,8 +146,7 @@ def topic_clock(log: ChannelLog, topic: Topic, window: tuple[float, float] | Non
     elapsed = topic.times - log.first_time
     if elapsed.size and not np.all(np.abs(elapsed) <= LATEST):
         raise wrong(log.path, "got times that are no finite numbers, expected a clock", *place)
-    # What lies outside of the window may be as wrong as it likes: stamps that go back there do no
-    # harm.
+    # Stamps that go back outside of the window do no harm.
     if window is not None and np.any(np.diff(elapsed) <= 0):
         inside = np.flatnonzero((elapsed >= window[0]) & (elapsed <= window[1]))
         rows = slice(int(inside[0]), int(inside[-1]) + 1) if inside.size else slice(0, 0)

@@ -152,7 +152,7 @@ def _reader(path: Path) -> _Reader:
 def _by_content(head: bytes, is_table: bool) -> _Reader | None:
     """The reader of a file whose first bytes say what it is, whatever it is called.
 
-    What a table begins with is the user's own text, which may look like the mark of another format;
+    A table begins with the user's own text, which may look like the mark of another format;
     but an autopilot's log may have been given the name of a table.
     """
     for known in FORMATS:

@@ -137,7 +137,7 @@ def read_parts(
             left_out.append(f"{start:.6g} s to {end:.6g} s ({e.within})")
             why = e
             continue
-        # What the resampling made of a hold has the part's own reason.
+        # A hold that the resampling chose has the part's own reason.
         whole = {n: d.reason for n, d in holds.items() if d.reason and flight.hold[n] == d.hold}
         parts.append(dataclasses.replace(flight, hold_reason={**flight.hold_reason, **whole}))
     if not parts:
@@ -419,7 +419,7 @@ def _within(signal: ClockedSignal, request: Request) -> ClockedSignal:
     return dataclasses.replace(signal, clock=clock.part(rows), values=signal.values[rows])
 
 
-# What no fit can use.
+# Records that no fit can use.
 
 
 def require_some_time(flight: Flight) -> None:

@@ -82,14 +82,12 @@ _SETTINGS = (
 def connected(
     scheduler: str | None = None,
     workers: int | None = None,
-    x64: bool | None = None,
 ) -> Iterator[Client]:
     """A client of a scheduler at an address, or of a cluster on this machine that ends with it.
 
     Args:
         scheduler: address, as tcp://HOST:8786; a cluster of one's own unless given.
         workers: processes of that cluster; as many as dask thinks fit unless given.
-        x64: whether workers compute in float64; as this process unless given.
 
     Raises:
         InputError: nothing answers there, workers have other versions than this process, or a
@@ -97,8 +95,6 @@ def connected(
     """
     # pyright knows none of JAX's settings by their names.
     settings: dict[str, Any] = {name: getattr(jax.config, name) for name in _SETTINGS}
-    if x64 is not None:
-        settings["jax_enable_x64"] = x64
     with contextlib.ExitStack() as stack:
         stack.enter_context(_quiet())
         if scheduler is not None:

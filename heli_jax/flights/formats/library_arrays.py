@@ -250,10 +250,10 @@ def _data_set(path: Path, sets: DataSets, item: Any, name: str) -> None:
     if not holds_numbers(kind, item.ndim):
         sets.leave_out(name, kind, item.shape)
     elif not text_of(item.attrs.get("NAME", "")).startswith(_NO_VARIABLE):
-        # Of one in pieces a piece is unpacked as a whole.
+        # A data set in pieces is unpacked a whole piece at a time.
         sets.budget.require(int(np.prod(item.chunks or (0,), dtype=object)) * kind.itemsize)
         sets.budget.require(size * kind.itemsize)
-        # Of other attributes nothing is read: they may be of types that h5py does not know.
+        # Other attributes are not read: they may be of types that h5py does not know.
         counting = (*PACKING, *UNIT_ATTRIBUTES)
         attributes = {n: item.attrs[n] for n in counting if n in item.attrs}
         for field, values, own in _fields(name, np.asarray(item[()]), attributes):

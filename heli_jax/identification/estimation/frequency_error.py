@@ -411,7 +411,7 @@ def _slopes(
         )
         return (times(H, driving) + times(W, passing)).reshape(-1)
 
-    # Of what moves with the unknowns alone: all else has no derivative to go through.
+    # Only numbers that move with the unknowns: all others have no derivative to go through.
     moving = jax.tree.map(
         lambda d, v: None if d is None else v, slopes, value, is_leaf=lambda d: d is None
     )

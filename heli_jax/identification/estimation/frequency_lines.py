@@ -314,7 +314,7 @@ _SPARED = 0.1
 class Resolved(NamedTuple):
     """A model at the lines of a record, in b blocks of k lines; without a derivative.
 
-    What is made for one block stays in the caches.
+    The numbers of one block stay in the processor's caches.
     """
 
     record: Record
@@ -333,7 +333,7 @@ class Resolved(NamedTuple):
 
     def lines(self, v: Float[Array, "f N *c"]) -> Float[Array, "b k 2 *c f"]:
         """The record's part of signals over whole flights, at the lines of each block."""
-        # What acted in a part may have been logged before it: signals are delayed already.
+        # An input that acts in a part may have been logged before it: signals are delayed already.
         part = jnp.moveaxis(v[:, self.record.first : self.record.last], 0, -1)
         return by_block(stacked(lines_of(part)), len(self.W))
 
@@ -348,7 +348,7 @@ def by_block(v: Array, count: int) -> Array:
 def resolved(m: Matrices, record: Record, whitening: Complex[Array, "K p p"]) -> Resolved:
     """A model at the lines of a record."""
     (p, n), K = m.C.shape, record.lines
-    # Of a complex normal error each part has half of the variance.
+    # Each part of a complex normal error has half of the variance.
     W = by_block(2.0**0.5 * real(whitening).astype(m.C.dtype), -(-K * m.C.size // _NUMBERS))
     count, size = W.shape[:2]
     # Beyond the last line those that would follow it, so that nothing is singular there.

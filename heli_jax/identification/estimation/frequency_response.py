@@ -229,7 +229,7 @@ def _whitened(weights: ResponseWeights, S: Complex[Array, "k p m c"]) -> Float[A
     S = S / jnp.sum(w.seen, axis=0).astype(S.dtype)[None, :, None, None]
     dH = jnp.einsum("pkmz,kpzc->kpmc", weights.averages.P, S)
     rows = weights.whitening @ dH.reshape(k, -1, c)
-    # Of a complex normal error each part has half of the variance.
+    # Each part of a complex normal error has half of the variance.
     return 2.0**0.5 * jnp.concatenate([jnp.real(rows), jnp.imag(rows)]).reshape(-1, c)
 
 

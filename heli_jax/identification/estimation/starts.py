@@ -209,7 +209,7 @@ def _draw_values(free: Free, size: int, rng: np.random.Generator) -> np.ndarray:
     # keeps its sign.
     values = free.start * np.exp(width * rng.standard_normal(size))
     if transforms.changes_sign(free):
-        # Of the start's size; about the prior's mean where there is one, which knows more.
+        # As large as the start; about the prior's mean where there is one, which knows more.
         drawn = rng.standard_normal((2, size))
         values = transforms.scale(free) * np.exp(width * drawn[0]) * np.sign(drawn[1])
         if free.prior is not None:

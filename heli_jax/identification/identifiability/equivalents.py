@@ -293,7 +293,7 @@ def second_solutions(
         if point is None or not (point.excess <= SAME and point.expected > _APART):
             continue
         there = {n: point.values[n] for n in here}
-        # What still moves is on its way to another place.
+        # A point that still moves is no solution.
         if not all(map(_alike, before.values(), there.values())):
             continue
         changed = tuple(n for n, v in here.items() if not _alike(v, there[n]))

@@ -92,8 +92,8 @@ def standard_errors(
         plain = around._replace(valley=None)
         by_all, by_inputs = (verdict_of(problem, at.layout, one, plain) for one in (e, inputs))
         resting, more = by_disturbance(by_all, by_inputs)
-        # Of several outputs a pushed one moves the others, which is a response to a measured
-        # motion. A disturbance of one output has its spectrum alone.
+        # A disturbance of one of several outputs moves the others, which respond to a measured
+        # motion. With one output nothing but its spectrum is known.
         spectrum_alone = all(len(outputs) == 1 for outputs in at.layout.outputs)
         counts = white and not (spectrum_alone and (resting or more))
         by = e if counts else inputs

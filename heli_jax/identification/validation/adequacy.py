@@ -182,7 +182,7 @@ def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
     disturbed = evidence.error_ratio is not None
     # Linearising takes a compiled program of its own, so it is asked only where the answer counts.
     unstable = disturbed and evidence.ahead is None and is_unstable(problem, params)
-    # What never moves has an error and no VAF.
+    # An output that never moves has an error and no VAF.
     still = tuple(
         n for n, m in evidence.agreement.items() if np.isnan(m.vaf) and np.isfinite(m.rmse)
     )
