@@ -31,8 +31,11 @@ def ulog(topics, parameters=(), information=(), dropouts=(), start=10_000_000):
         out.append(_message("A", struct.pack("<BH", instance, i) + name.encode()))
     data = []
     for i, (_, _, fields, rows) in enumerate(topics):
-        code = "<H" + "".join(_code(kind) for kind, _ in fields)
-        data += [(row[0], _message("D", struct.pack(code, i, *row))) for row in rows]
+        # Firmware leaves out the padding at the end.
+        kinds = [_code(kind) for kind, field in fields if "_padding" not in field]
+        count = sum(int(kind[:-1] or 1) for kind in kinds)
+        code = "<H" + "".join(kinds)
+        data += [(row[0], _message("D", struct.pack(code, i, *row[:count]))) for row in rows]
     out += [message for _, message in sorted(data, key=lambda pair: pair[0])]
     out += [_message("O", struct.pack("<H", length)) for length in dropouts]
     return b"".join(out)

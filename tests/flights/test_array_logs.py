@@ -12,7 +12,7 @@ import xarray
 
 from heli_jax.errors import InputError
 from heli_jax.flights import Signal, describe_log, read_flight
-from heli_jax.flights.formats import library_arrays
+from heli_jax.flights.formats import apart
 from heli_jax.flights.open_log import open_log, open_table
 
 N = 50
@@ -111,7 +111,7 @@ def test_a_file_over_which_its_reader_dies_or_loops_is_no_log(tmp_path, monkeypa
     for fault in ("import os; os.abort()", "while True: pass"):
         (tmp_path / "h5py").mkdir(exist_ok=True)
         (tmp_path / "h5py" / "__init__.py").write_text(fault)
-        monkeypatch.setattr(library_arrays, "_SECONDS", 1)
+        monkeypatch.setattr(apart, "_SECONDS", 1)
         monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
         with pytest.raises(InputError):
             open_log(path)

@@ -63,7 +63,7 @@ def test_damage_ends_in_a_flight_or_a_sentence(tmp_path, name):
     FORMATS[name](path)
     assert outcome(path) in ("flight", "noted")
     ends = set()
-    count = COUNT_APART if path.suffix in (".mat", ".nc") else COUNT
+    count = COUNT_APART if path.suffix in (".mat", ".nc", ".ulg") else COUNT
     for words, data in damaged(path.read_bytes(), count):
         path.write_bytes(data)
         try:

@@ -9,14 +9,11 @@ conventions of the NetCDF User's Guide.
 
 import hashlib
 import re
-import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from heli_jax.errors import InputError
 from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.clock import SECONDS, is_called_time, likely_unit, split_unit, time_unit
 from heli_jax.flights.log import (
@@ -188,19 +185,6 @@ def holds_numbers(kind: np.dtype, dimensions: int) -> bool:
     return dimensions <= (1 if kind.names else _DEEPEST) and (
         bool(kind.names) or kind.kind in "biuf"
     )
-
-
-def guarded[T](path: Path, what: str, read: Callable[[], T]) -> T:
-    """Read with a library; any exception over a damaged file becomes an error of that file."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return read()
-    # Each library raises what its parser stumbles over: KeyError, TypeError, zlib.error, ...
-    except (Exception, MemoryError) as e:
-        if isinstance(e, InputError):
-            raise
-        raise wrong(str(path), f"is no whole {what} ({type(e).__name__})") from e
 
 
 class Packing(ValueError):

@@ -1,27 +1,15 @@
 """MATLAB (.mat), NetCDF (.nc) and HDF5 (.h5, .hdf5) files, read by SciPy and h5py in a process of
-its own.
+its own."""
 
-The libraries may loop, crash or fill the memory over a damaged file, and hear no Ctrl-C meanwhile.
-So this module starts itself as a program: it reads one file within limits, writes a line of JSON
-and the arrays behind it, as bytes, to standard output, and ends.
-"""
-
-import contextlib
 import importlib.util
-import json
-import signal
-import subprocess
-import sys
-import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from heli_jax import import_path
-from heli_jax.errors import InputError
 from heli_jax.finding import LEFT_OUT, note
+from heli_jax.flights.formats.apart import Content, Reader, read_apart
 from heli_jax.flights.formats.arrays import (
     LARGEST,
     MOST_ELEMENTS,
@@ -29,7 +17,6 @@ from heli_jax.flights.formats.arrays import (
     UNIT_ATTRIBUTES,
     ArrayTable,
     DataSets,
-    guarded,
     holds_numbers,
     text_of,
 )
@@ -39,14 +26,6 @@ from heli_jax.regular_file import read_regular
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 NETCDF_MAGICS = (b"CDF\x01", b"CDF\x02")
 MATLAB_MAGIC = b"MATLAB "
-_SECONDS, _RATE = 20, 10**7
-"""processor time [s] that a file may take, and bytes for which it has a second more"""
-_PATIENCE = 10
-"""times as long by the clock"""
-_BESIDE = 10**9
-"""bytes for Python and its libraries"""
-_COPIES = 4
-"""times that numbers may be in memory while they are unpacked"""
 _DEEPEST = 10
 """groups and structures within one another"""
 _NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
@@ -58,17 +37,19 @@ def open_mat(path: Path) -> ArrayTable:
     data = read_regular(path, "a MATLAB file", LARGEST)
     # MATLAB puts 512 bytes of its own in front of the mark of HDF5, which is 8 bytes long.
     is_hdf5 = data[:520].find(HDF5_MAGIC) >= 0 or data.startswith(b"MATLAB 7.3")
-    return _read_apart(path, "mat 7.3" if is_hdf5 else "mat", data)
+    if is_hdf5:
+        return _read(path, "mat 7.3", read_matlab_73, "HDF5 file", data)
+    return _read(path, "mat", read_matlab, "MATLAB file", data)
 
 
 def open_netcdf(path: Path) -> ArrayTable:
     """A NetCDF file, of version 4 where h5py is installed; errors as of `open_mat`."""
     data = read_regular(path, "a NetCDF file", LARGEST)
     if data.startswith(HDF5_MAGIC):
-        return _read_apart(path, "netcdf", data)
+        return _read(path, "netcdf", read_hdf5, "HDF5 file", data)
     if not data.startswith(NETCDF_MAGICS):
         raise wrong(str(path), "is no NetCDF file, expected one that begins with its mark")
-    return _read_apart(path, "netcdf 3", data)
+    return _read(path, "netcdf", read_netcdf_3, "NetCDF file", data)
 
 
 def open_hdf5(path: Path) -> ArrayTable:
@@ -76,83 +57,29 @@ def open_hdf5(path: Path) -> ArrayTable:
     data = read_regular(path, "an HDF5 file", LARGEST)
     if not data.startswith(HDF5_MAGIC):
         raise wrong(str(path), "is no HDF5 file, expected one that begins with its mark")
-    return _read_apart(path, "hdf5", data)
+    return _read(path, "hdf5", read_hdf5, "HDF5 file", data)
 
 
-def _read_apart(path: Path, kind: str, data: bytes) -> ArrayTable:
-    """The file as `main` reads it in a process of its own."""
-    what = _READERS[kind][0]
+def _read(path: Path, kind: str, reader: Reader, what: str, data: bytes) -> ArrayTable:
+    """The file as its reader reads it in a process of its own."""
     if what == "HDF5 file" and importlib.util.find_spec("h5py") is None:
         problem = "is an HDF5 file inside, for which h5py is needed: pip install 'heli_jax[logs]'"
         raise wrong(str(path), problem)
-    seconds = _SECONDS + len(data) // _RATE
-    arguments = (str(path), kind, str(len(data)), str(seconds))
-    process = subprocess.Popen(
-        [sys.executable, "-P", "-m", "heli_jax.flights.formats.library_arrays", *arguments],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        env=import_path.environment() | {"OPENBLAS_NUM_THREADS": "1"},
-    )
-    # Where the system sets no limit to its processor time.
-    watch = threading.Timer(_PATIENCE * seconds, process.kill)
-    watch.daemon = True
-    watch.start()
-    try:
-        with process:
-            answer: Any = process.stdout
-            head = json.loads(answer.readline() or "{}")
-            arrays = {}
-            for name, dtype, size in head.get("arrays", ()):
-                arrays[name] = np.empty(size, dtype)
-                answer.readinto(arrays[name].view(np.uint8))
-    finally:
-        watch.cancel()
-    if "error" in head:
-        raise InputError(head["error"])
-    if process.returncode:
-        slow = f"took more than {seconds} s to read: it is damaged, or save it without compression"
-        ended = process.returncode in (-signal.SIGKILL, -getattr(signal, "SIGXCPU", 0))
-        raise wrong(str(path), slow if ended else f"is no whole {what} (its reader crashed)")
-    notes = tuple(
-        note(code, words, *names, value=value) for code, words, names, value in head["notes"]
-    )
-    kind = "netcdf" if kind == "netcdf 3" else kind
-    return ArrayTable(str(path), kind, data, arrays, head["units"], notes)
+    facts, vectors, notes = read_apart(path, reader, what, len(data))
+    arrays = dict(zip(facts["units"], vectors, strict=True))
+    return ArrayTable(str(path), kind, data, arrays, facts["units"], tuple(notes))
 
 
-def main() -> None:
-    """Read the file that the arguments name: its path, kind, size [bytes] and a limit [s]."""
-    path, kind, size, seconds = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
-    sets = DataSets(Budget(str(path), size))
-    # The default ends the process at once, also within a library.
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    with contextlib.suppress(ImportError):
-        import resource
-
-        resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
-        most = _BESIDE + _COPIES * sets.budget.most
-        resource.setrlimit(resource.RLIMIT_AS, (most, most))
-    arrays: Mapping[str, np.ndarray] = {}
-    try:
-        what, read = _READERS[kind]
-        guarded(path, what, lambda: read(path, sets))
-        arrays, units, notes = sets.vectors()
-        head = {
-            "arrays": [(name, x.dtype.str, x.size) for name, x in arrays.items()],
-            "units": units,
-            "notes": [(n.code, n.sentence, n.subjects, n.value) for n in notes],
-        }
-    except InputError as e:
-        head = {"error": str(e)}
-    sys.stdout.buffer.write(json.dumps(head).encode() + b"\n")
-    for x in arrays.values():
-        sys.stdout.buffer.write(np.ascontiguousarray(x).data)
+def _content(sets: DataSets) -> Content:
+    arrays, units, notes = sets.vectors()
+    return Content({"units": units}, list(arrays.values()), notes)
 
 
-def _netcdf_3(path: Path, sets: DataSets) -> None:
+def read_netcdf_3(path: Path, budget: Budget) -> Content:
+    """Read the variables of a NetCDF file of version 3."""
     from scipy.io import netcdf_file
 
+    sets = DataSets(budget)
     with netcdf_file(path, mmap=False) as file:
         for name, variable in file.variables.items():
             values: Any = variable.data
@@ -160,12 +87,14 @@ def _netcdf_3(path: Path, sets: DataSets) -> None:
             # In the vehicle's own order of bytes.
             values = values.astype(values.dtype.newbyteorder("="))
             sets.add(str(name), values, variable._attributes)
+    return _content(sets)
 
 
-def _matlab(path: Path, sets: DataSets) -> None:
+def read_matlab(path: Path, budget: Budget) -> Content:
+    """Read the arrays of a MATLAB file, those of structures and cells too."""
     from scipy.io import loadmat
 
-    objects: dict[str, str] = {}
+    sets, objects = DataSets(budget), dict[str, str]()
 
     def take(name: str, value: Any, depth: int) -> None:
         if not isinstance(value, np.ndarray) or depth > _DEEPEST:
@@ -187,15 +116,15 @@ def _matlab(path: Path, sets: DataSets) -> None:
     for name, value in loadmat(path).items():
         if not name.startswith("__"):
             take(name, value, 0)
-    if not objects:
-        return
-    if sets.longest < 2:
+    if objects and sets.longest < 2:
         name, kind = next(iter(objects.items()))
         problem = f"holds {shown(name)}, a {kind} of MATLAB, which is no array; save its numbers"
         way = f"writetable or writetimetable({name}, 'flight.csv') writes what is read"
         raise wrong(str(path), f"{problem} as arrays, or of a table {way}")
-    each = listed(f"{shown(n)} ({kind})" for n, kind in objects.items())
-    sets.notes.append(note(LEFT_OUT, f"objects of MATLAB are left out: {each}", *objects))
+    if objects:
+        each = listed(f"{shown(n)} ({kind})" for n, kind in objects.items())
+        sets.notes.append(note(LEFT_OUT, f"objects of MATLAB are left out: {each}", *objects))
+    return _content(sets)
 
 
 def _indexed(name: str, count: int) -> list[str]:
@@ -203,9 +132,16 @@ def _indexed(name: str, count: int) -> list[str]:
     return [name] if count == 1 else [f"{name}[{i}]" for i in range(min(count, MOST_ELEMENTS))]
 
 
-def _hdf5(path: Path, sets: DataSets, between: str = "/") -> None:
-    """The numbers of a file by the path of groups that leads to them, `log/roll`."""
+def read_matlab_73(path: Path, budget: Budget) -> Content:
+    """Read a MATLAB file of version 7.3, by `log.roll`."""
+    return read_hdf5(path, budget, ".")
+
+
+def read_hdf5(path: Path, budget: Budget, between: str = "/") -> Content:
+    """Read the numbers of a file by the path of groups that leads to them, `log/roll`."""
     import h5py as library  # pyright: ignore[reportMissingImports]
+
+    sets = DataSets(budget)
 
     h5py: Any = library  # whose classes have no annotations
     seen: set[int] = set()
@@ -237,6 +173,7 @@ def _hdf5(path: Path, sets: DataSets, between: str = "/") -> None:
             # Single numbers, such as a rate.
             if value.size == 1 and value.dtype.kind in "iuf" and name not in file:
                 sets.add(name, np.float64(value).reshape(1), {})
+    return _content(sets)
 
 
 def _data_set(path: Path, sets: DataSets, item: Any, name: str) -> None:
@@ -274,17 +211,3 @@ def _fields(
     units = list(np.ravel(stated)) if np.size(stated) == len(names) else [""] * len(names)
     for field, unit in zip(names, units, strict=True):
         yield from _fields(f"{name}/{field}", values[field], {"units": unit})
-
-
-_READERS: dict[str, tuple[str, Any]] = {
-    "mat": ("MATLAB file", _matlab),
-    "netcdf 3": ("NetCDF file", _netcdf_3),
-    "mat 7.3": ("HDF5 file", lambda path, sets: _hdf5(path, sets, ".")),
-    "netcdf": ("HDF5 file", _hdf5),
-    "hdf5": ("HDF5 file", _hdf5),
-}
-"""what a file is called, and what reads it, by kind"""
-
-
-if __name__ == "__main__":
-    main()

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from heli_jax.finding import LEFT_OUT, note
+from heli_jax.flights.formats.apart import guarded
 from heli_jax.flights.formats.arrays import (
     LARGEST,
     ArrayTable,
     DataSets,
-    guarded,
     holds_numbers,
 )
 from heli_jax.flights.log import Budget, listed, shown, wrong
