@@ -228,7 +228,7 @@ def _drifting(run: FitRun) -> set[str]:
     if run.problem.noise_model != "disturbance":
         return set()
     for n in {*NOISES} & {*fit.estimates}:
-        # The start value comes from third differences of the noise.
+        # The start value is the noise estimated from third differences.
         if not fit.estimates[n].value <= _AS_SHOWN * run.problem.free[n].start:
             return set()
     ratios = {
