@@ -70,7 +70,7 @@ def searched() -> tuple[str, ...]:
 
 
 def pass_over_style_of_folder() -> None:
-    """Import Matplotlib outside the working folder if that has a matplotlibrc, which would be read."""
+    """Import Matplotlib elsewhere if the working folder has a matplotlibrc, which it would read."""
     if os.path.lexists("matplotlibrc"):
         with contextlib.chdir(os.sep):
             importlib.import_module("matplotlib")

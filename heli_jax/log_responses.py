@@ -94,7 +94,7 @@ def _held_out(flights: Sequence[Flight]) -> tuple[Finding, ...]:
 
 
 def between_samples(flights: Sequence[Flight], inputs: Collection[str]) -> list[Finding]:
-    """Return notes on how inputs move between samples where the reader decided it, with the effect."""
+    """Return notes on holds of inputs that the reader decided, with their effect."""
     mixed: dict[tuple[str, str], list[str]] = {}
     guessed: dict[str, str] = {}
     for name in inputs:

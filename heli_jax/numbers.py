@@ -152,7 +152,7 @@ def page_sentence(text: str) -> str:
 
 
 def _decimal(m: re.Match[str]) -> str | None:
-    """Return all digits of a number with an exponent; None if it reads better with a power of ten."""
+    """Return a number with exponent in full; None if it reads better with a power of ten."""
     value = Decimal(m[1]).scaleb(int(m[2]))
     sign = "+" if m[1].startswith("+") else ""
     return f"{sign}{value:f}" if _reads_well(value.adjusted()) or not value else None
@@ -219,7 +219,7 @@ def _power(value: float) -> int:
 
 
 def _reads_well(power: int) -> bool:
-    """True if numbers of this order of magnitude read well in full: 0.0032 and 12345, not 3.2·10⁻³."""
+    """True if numbers of this magnitude read well in full, such as 0.0032 and 12345."""
     return -4 < power < 5
 
 

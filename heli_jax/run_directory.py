@@ -120,7 +120,7 @@ def whole(path: Path, *, replaces: bool = False, or_beside: bool = False) -> Ite
 
 
 def _renamed(temporary: Path, path: Path, or_beside: bool) -> Path:
-    """Rename the directory, to the next free name if another process took `path`. Return the name."""
+    """Rename the directory, to the next free name if `path` is taken; return the name."""
     beside = (path.with_name(f"{path.name}-{number}") for number in itertools.count(2))
     place = path
     while or_beside and os.path.lexists(place):

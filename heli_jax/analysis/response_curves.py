@@ -278,7 +278,7 @@ def _with_slopes(
 
 
 class Acting(NamedTuple):
-    """Transfer function from an input to its effect on the model, with derivatives by q parameters."""
+    """Transfer function of an input's effect on the model, and its derivatives by q parameters."""
 
     gain: float = 1.0
     late: float = 0.0

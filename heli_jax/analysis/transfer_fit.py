@@ -53,7 +53,7 @@ class Coefficient(NamedTuple):
 
 
 class TransferFit(NamedTuple):
-    """Transfer function (b_m s^m + ... + b_0) / (s^n + a_{n-1} s^{n-1} + ... + a_0) exp(-delay s)."""
+    """(b_m s^m + ... + b_0) / (s^n + a_{n-1} s^{n-1} + ... + a_0) exp(-delay s)."""
 
     numerator: tuple[Coefficient, ...]
     """Numerator, highest power first."""
