@@ -5,11 +5,11 @@ $$\tau_f\dot a_1 = -a_1 - \tau_f q + \theta_{pitch} + \frac{\partial a_1}{\parti
   \tau_f\dot b_1 = -b_1 - \tau_f p + \theta_{roll} - \frac{\partial a_1}{\partial\mu}\mu_y
     - \tau_f\omega_k a_1$$
 
-with the cyclic pitch of eq. 11, $\tau_f = 16/(\gamma\Omega)$ and the Lock number $\gamma = \rho a
-c R^4/I_\beta$ (Mettler, Tischler and Kanade, CMU-RI-TR-00-03, 2000; Gavrilets, MIT thesis, 2003;
-Padfield, Helicopter Flight Dynamics). $\omega_k = k_\beta/(2 I_\beta\Omega)$ is the effect of a
-stiff hub: it raises the blade's frequency above $\Omega$, and a free tilt then rotates against the
-rotor's sense.
+with the cyclic pitch of eq. 11, $\tau_f = 16/(\gamma\Omega)$ and the Lock number
+$\gamma = \rho a c R^4/I_\beta$ (Mettler, Tischler and Kanade, CMU-RI-TR-00-03, 2000; Gavrilets,
+MIT thesis, 2003; Padfield, Helicopter Flight Dynamics). $\omega_k = k_\beta/(2 I_\beta\Omega)$ is
+the effect of a stiff hub. It raises the blade's frequency above $\Omega$, and a free tilt then
+rotates against the rotor's sense.
 
 Two effects are neglected: the blade's second derivative, at most $\gamma/16$ of the other terms,
 and coning. The rotor is a seesaw, whose blades do not cone. A rotor with a coning angle $a_0$
