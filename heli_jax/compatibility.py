@@ -165,7 +165,7 @@ def _without_noise(run: FitRun) -> bool:
 
 
 def _smooth(run: FitRun) -> bool:
-    """True if the estimated noise of an output, other than the gyros', is zero."""
+    """True if the estimated noise of an output is zero."""
     sizes = [np.nanstd(y) for s in run.fit.signals for y in s.measured.values()]
     return min(run.fit.noise.values(), default=1.0) < _NO_NOISE * max(sizes, default=0.0)
 

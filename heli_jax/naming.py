@@ -25,7 +25,7 @@ type Scalar = Float[Array, ""] | float
 """One number: a traced or concrete array of shape (), or a Python float."""
 
 type Number = Real[Array, ""] | Real[np.ndarray, ""] | np.number | int | float
-"""As Scalar, or any other number that JAX accepts: an int, a NumPy scalar."""
+"""A Scalar, or any other number that JAX accepts: an int, a NumPy scalar."""
 
 # Users define their own models and record classes. No base class or protocol fits all, since the
 # model chooses the field names. `Any` is assigned without a `type` statement, since beartype cannot

@@ -31,7 +31,7 @@ def _scalar(value: Any) -> Any:
     return value
 
 
-# Any, since the field's default stands where the class declares Scalar.
+# Any, since the default has another type than the declared Scalar.
 def _field(default: float | None = None, *, kw_only: bool = False) -> Any:
     if default is None:
         return eqx.field(converter=_scalar, kw_only=kw_only)

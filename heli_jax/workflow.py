@@ -60,8 +60,8 @@ class FitRun:
     began: float = field(default_factory=time.perf_counter)
     """Start of the work, by `time.perf_counter` [s]."""
 
-    # Figures are drawn anew, since a caller could change a stored one. Any, since only `report`
-    # imports matplotlib.
+    # Each call draws a new figure, since a caller could change a stored one. Any, since only
+    # `report` imports matplotlib.
     def figure(self, name: str) -> Any:
         """Draw a figure of the report as a matplotlib Figure: `response_OUTPUT`,
         `match_OUTPUT-INPUT`, `rls`, ...

@@ -106,7 +106,7 @@ class Pair(NamedTuple):
     half95: float = Z95
     """Half-width of a 95 % interval [sd]: Student's t for the number of averages."""
     added: np.ndarray | float = 0.0
-    """Subtracted error that windows add to H at the ends of records (`window_ends`)."""
+    """Subtracted error that windows add to H at the ends of records (`without_ends`)."""
 
 
 class Output(NamedTuple):

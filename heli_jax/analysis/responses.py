@@ -67,7 +67,7 @@ def responses(
     """Return the responses of each output to each input, with the other inputs accounted for.
 
     A response is NaN if inputs move as one, if an input does not move, or if an instrument is too
-    weak beside other causes of its input (`fieller`).
+    weak compared with other causes of its input (`sd_of_ratio`).
 
     Args:
         instruments: one excitation for each input, outside all feedback; without them, inputs are

@@ -75,8 +75,8 @@ def trim(
     """Return the trim of a helicopter model: hover, climb, forward and sideward flight.
 
     It solves for all sticks, the attitude, the tip-path plane, the flybar and the rotor speed
-    together. With a collective stick beside the throttle, the rotor turns at the vehicle's Omega.
-    Parameters must be concrete; `equilibrium` can be differentiated and batched.
+    together. With a collective stick in addition to the throttle, the rotor turns at the vehicle's
+    Omega. Parameters must be concrete; `equilibrium` can be differentiated and batched.
 
     Args:
         wind: velocity of the air along x, y and z [m/s], for a model with wind.

@@ -198,7 +198,7 @@ class TransferFunction(NamedTuple):
 
 
 def roll_transfer_function(p: Helicopter, *, stand: bool = False) -> TransferFunction:
-    r"""$H(s) = \phi/x_{roll}$ in closed form, eq. 23, optionally with the stand.
+    r"""Return $H(s) = \phi/x_{roll}$ in closed form, eq. 23, optionally with the stand.
 
     $$H = \frac{d_1 s^2 + d_2 s + d_3}{s(s^3 + c_1 s^2 + c_2 s + c_3)}$$
 

@@ -31,7 +31,7 @@ def translating() -> Iterator[None]:
     errors again.
 
     Raises:
-        UnsupportedError: in place of any other error.
+        UnsupportedError: for any other error.
     """
     try:
         yield
