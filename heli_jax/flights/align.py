@@ -119,7 +119,7 @@ def _coarse(a: np.ndarray, b: np.ndarray) -> tuple[int, float]:
                 "sign, or `reverse: true`"
             )
         raise NotAligned(
-            f"they hardly agree (correlation {r[best]:.2f} at the best lag), expected at least "
+            f"they are hardly correlated ( {r[best]:.2f} at the best lag), expected at least "
             f"{LEAST}"
         )
     rival = other_peak(r, best)
@@ -220,7 +220,7 @@ def _refined(
     left, slope = linearised(lag)
     curvature = float(slope @ slope)
     if abs(found.x[0]) > 0.999 * _REACH or not curvature > 0:
-        raise NotAligned("the lag is not told by the sum of squares, which has no minimum near")
+        raise NotAligned("the sum of squares has no minimum near the best lag")
     return lag, float(np.sqrt(t.size * _long_run(slope * left)) / curvature)
 
 

@@ -135,13 +135,15 @@ def guessed_log(table: Table, time: str | None, unit: str | None, rate: float | 
         why = clock.problem if clock else "no column looks like a clock"
         remedy = "expected --time NAME, a column of increasing times, or "
         remedy += (
-            "a file without the rows that go back" if clock else "--time-rate HZ, samples a second"
+            "a file without rows that go back in time"
+            if clock
+            else "--time-rate HZ, samples a second"
         )
         if not clock and texts:
             why += f" ({shown(texts[0].name)} is text{texts[0].strays and ': ' + texts[0].strays})"
         raise wrong(table.path, f"{why}, {remedy}")
     if clock.guessed:
-        words = f"column {shown(clock.column)} is taken for a clock in {clock.unit}"
+        words = f"column {shown(clock.column)} is taken as the clock in {clock.unit}"
         notes.append(note("clock.guessed", words, clock.column))
     rows = next((c.count for c in info.columns if c.name == clock.column), info.n_rows)
     # Arrays may have lengths of their own; rows of a table with empty cells are of one length.
