@@ -320,7 +320,7 @@ def _notes(experiment: Experiment, run: Trajectory) -> tuple[Finding, ...]:
         assert settings is not None
         ended = float(run.ended)
         words = (
-            f"the vehicle comes down to {settings.ground:g} m at {ended:.4g} s: nothing "
+            f"the vehicle descends to {settings.ground:g} m at {ended:.4g} s: nothing "
             "is written after that"
         )
         notes.append(note("simulation.ends-on-ground", words, value=ended))

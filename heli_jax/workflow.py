@@ -151,7 +151,7 @@ def _written(run: FitRun, out: Path, progress: Say) -> FitRun:
         failure.run = run
         raise failure from e
     if written.directory not in (out, before):
-        words = f"{out}: another process has made it meanwhile; written to {written.directory}"
+        words = f"{out}: another process created it; written to {written.directory}"
         progress(Note(words))
     return written
 
@@ -206,13 +206,15 @@ def _fit_run(
 def _keep(run: FitRun, out: Path, progress: Say) -> Path | None:
     """Write a fit before further intervals are sought, so that an interrupt does not lose it;
     returns its directory."""
-    words = "The further intervals that were asked for are not in it: the run was interrupted."
+    words = (
+        "The run was interrupted: the requested profile, bootstrap or NUTS intervals are missing."
+    )
     # Its own times: the run's go on.
     findings = (*run.fit.findings, note("uncertainty.interrupted", words))
     fitted = replace(run.fit, findings=findings, timing=dict(run.fit.timing))
     with stage("writing the fit", name="report before further intervals"):
         directory = _written(replace(run, fit=fitted), out, progress).directory
-    progress(f"the fit is in {directory}; what else was asked for comes into it")
+    progress(f"the fit is in {directory}; further intervals will be added to it")
     return directory
 
 

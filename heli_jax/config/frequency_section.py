@@ -76,7 +76,7 @@ class HandlingConfig(Section):
         if self.gain != 1.0 and self.response != "open-loop":
             raise ValueError(f"gain: expected response: open-loop with it, got {self.response}")
         if self.gain == 0.0:
-            raise ValueError("gain: expected another number than 0, which opens the loop")
+            raise ValueError("gain: expected a number other than 0")
         return self
 
 

@@ -173,7 +173,7 @@ def _check_rates(flight: Flight, where: str) -> None:
         if fastest > _FASTEST:
             raise InputError(
                 f"{where}: {n} reaches {fastest:.0f} rad/s, expected at most {_FASTEST:g} rad/s, "
-                "more than gyros show: is its unit another?"
+                "more than gyros measure: check its unit"
             )
 
 
@@ -185,8 +185,8 @@ def _check_moving(flight: Flight, where: str) -> None:
         # Fitted to a channel that stands still, every scale of the others would run away.
         if n not in stated and seen.size and np.ptp(seen) == 0.0:
             raise InputError(
-                f"{where}: {n} is {seen[0]:g} in all samples, expected one that moves: a sensor "
-                "that is dead says nothing of the others; leave it out, or choose another window"
+                f"{where}: {n} is {seen[0]:g} in all samples, expected a signal that moves: "
+                "remove the sensor, or choose another window"
             )
 
 

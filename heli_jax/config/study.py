@@ -105,7 +105,7 @@ def read_study(
     axes = {key: _logs(key, values, path) for key, values in axes.items()}
     for key, values in axes.items():
         if len({repr(v) for v in values}) < len(values):
-            raise InputError(f"{path}: study.{key}: a value stands twice, expected each once")
+            raise InputError(f"{path}: study.{key}: a value is given twice, expected each once")
     study = Study(path, content, axes)
     if study.size > _MOST:
         raise InputError(f"{path}: study: expected at most {_MOST} fits, got {study.size}")

@@ -104,17 +104,17 @@ def write_config(
     written = f"wrote {', '.join(map(str, (out, *paths)))}"
     notes = [note("configuration.written", written), *read.notes]
     if todo:
-        words = f"numbers that are yours to give, where {EDIT} stands: {todo}"
+        words = f"fill in {todo} values marked {EDIT}"
         notes.append(note("configuration.numbers-to-give", words, value=todo))
     lacking = [] if signals is None else [n for n, g in signals.inputs.items() if g is None]
     if signals is not None and not signals.outputs:
         outputs = ", ".join(naming.names(chosen.model.Outputs))
-        words = f"found none of {outputs} by its name: say which were logged, and as what"
+        words = f"no column name matches {outputs}: name the columns of those that were logged"
         notes.append(note("channels.lacking", words, *naming.names(chosen.model.Outputs)))
     if lacking:
         words = (
-            f"no channel that may be {' or '.join(lacking)} was found by name or motion: name the "
-            "stick's, or write {constant: 0} in place of {signal: EDIT} where it was not moved"
+            f"no channel looks like {' or '.join(lacking)}: name the stick's channel, or replace "
+            "{signal: EDIT} by {constant: 0} if the stick was not moved"
         )
         notes.append(note("channels.lacking", words, *lacking))
     if signals is not None:
@@ -123,16 +123,16 @@ def write_config(
         called = {n: names_of_output(n) for n in absent} | {n: names_of_input(n) for n in lacking}
         notes += _unread_notes((*lacking, *absent), called, read.unread)
     if vehicle_of_log := other_vehicle(read.autopilot):
-        words = f"the log's vehicle is {vehicle_of_log}: see that the model is one of it"
+        words = f"the log is of {vehicle_of_log}: check that the model fits it"
         notes.append(note("model.other-vehicle", words))
     if others:
         assert isinstance(chosen.name, dict)
         words = (
-            f"the model {chosen.name['linear']} is a guess by the stick that moves; a stand or a "
-            f"flybar no log tells: --model {' or '.join(name for name, _ in others)}"
+            f"the model {chosen.name['linear']} is a guess from the stick that moves; with a "
+            f"stand or a flybar use --model {' or '.join(name for name, _ in others)}"
         )
         notes.append(note("model.guessed", words))
-    words = f"look over what is marked GUESS; next: heli-jax check {out}"
+    words = f"check the lines marked GUESS, then run heli-jax check {out}"
     notes.append(note("configuration.guessed", words))
     return Written((out, *paths), tuple(notes))
 

@@ -106,7 +106,7 @@ def _read_table(table: Table, rate: float | None) -> Log:
         time = describe_table(table, None, None, _ASSUMED).time
         assert time is not None
         time = dataclasses.replace(time, counted=math.nan)
-        words = f"{_without_time(info)}: how many samples a second has is yours to say"
+        words = f"{_without_time(info)}: state its samples per second"
         notes = (note("clock.not-found", words),)
     if time.problem:
         if time.column in table.names:
@@ -145,7 +145,7 @@ def _require_whole_clock(table: Table, info: LogInfo) -> None:
     the samples: as rows of a stated rate they would be read as samples."""
     for c in info.columns:
         if c.strays and is_called_time(c.name):
-            problem = f"column {shown(c.name)}: {c.strays}; expected times, take such rows out"
+            problem = f"column {shown(c.name)}: {c.strays}; expected times: delete such rows"
             raise wrong(table.path, f"{problem} (--time-rate counts every row as a sample)")
 
 

@@ -54,7 +54,7 @@ def chosen_model(
     if name is None:
         vehicle = other_vehicle(log.autopilot)
         if vehicle:
-            problem = f"its vehicle is {vehicle}, and the models that are chosen for a log are of"
+            problem = f"the log is of {vehicle}, and the models that are chosen for a log are of"
             remedy = "expected --model NAME; heli-jax new-model makes one of your own"
             raise wrong(path, f"{problem} helicopters; {remedy}")
         name = _by_what_moves(log, path)
@@ -133,7 +133,7 @@ def _by_what_moves(log: Log, path: str) -> str:
         return "roll-flybarless"
     if not moving:
         listed = ", ".join(map(shown, names[:12]))
-        problem = "found by their names no stick that moves beside a rate or an angle of its axis"
+        problem = "no column names match a moving stick and a rate or angle of its axis"
         remedy = "expected --model and then the signals by hand"
         raise wrong(path, f"{problem} that moves, {remedy}; it holds {listed}")
     most = {model: float(np.nanmax(np.abs(values))) for model, values in moving.items()}

@@ -56,9 +56,8 @@ def scaled(
         # Blades and swashplates are tilted by less than half a right angle.
         most = _FULL_TILT if is_input else most
         if is_input and max(-low, high) > np.degrees(_FULL_TILT):
-            guess = (
-                f"GUESS: {low:.4g} to {high:.4g} is no blade's angle; scale: rad for 1 in the log"
-            )
+            guess = f"GUESS: {low:.4g} to {high:.4g} is too large for a blade angle; scale: rad per"
+            guess += " unit of the log"
             return Guess(channel, si, EDIT, remarks=(guess,))
         unit = "deg" if max(-low, high) > most else "rad"
     elif si == "rad/s":
@@ -69,12 +68,12 @@ def scaled(
         unit = "deg/s" if largest > _FASTEST_TURN or is_coarse else "rad/s"
     elif si == "1" and stated:
         # A command in degrees: of an angle, or of the swashplate.
-        remark = f"GUESS: {low:.4g} to {high:.4g} {stated}; scale: 1 over what full travel is in it"
+        remark = f"GUESS: {low:.4g} to {high:.4g} {stated}; scale: 1 / full travel in the log"
         return Guess(channel, "1", EDIT, remarks=(remark,))
     elif si == "1":
         return _of_stick(channel, low, high, full)
     elif units.fits("m", si):
-        guess = "GUESS: full travel of the input for 1 in the log is not known"
+        guess = "GUESS: scale unknown: full travel of the input per unit of the log"
         return Guess(channel, si, EDIT, remarks=(guess,))
     else:
         unit = si
@@ -125,7 +124,7 @@ def _are_counts(channel: str, values: np.ndarray, si: str) -> bool:
 
 def _of_counts(channel: str, values: np.ndarray, si: str) -> Guess:
     rest = float(np.median(values[: max(len(values) // 100, 5)]))
-    words = f"GUESS: counts, {rest:g} at the beginning; scale: {si} for a count"
+    words = f"GUESS: counts, {rest:g} at the start; scale: {si} per count"
     return Guess(channel, si, EDIT, rest, (words,))
 
 
@@ -135,14 +134,14 @@ def _of_stick(channel: str, low: float, high: float, full: float | None) -> Gues
     commanded = words_of(channel)[-3:-1] == ("rc", "command") and largest <= _FULL_COMMAND
     travel = _FULL_COMMAND if commanded else full
     if travel and _PARTS < largest <= travel:
-        remark = f"GUESS: {low:.4g} to {high:.4g}, {travel:g} at the stop"
+        remark = f"GUESS: {low:.4g} to {high:.4g}, full travel {travel:g}"
         return Guess(channel, "1", 1.0 / travel, remarks=(remark,))
     for most, unit, scale in ((_PARTS, "1", 1.0), (105.0, "%", 1.0), (1050.0, "1", 0.001)):
         if largest <= most:
             what = "thousandths" if scale != 1.0 else {"1": "parts of full travel"}.get(unit, unit)
-            remark = f"GUESS: {low:.4g} to {high:.4g} taken for {what}"
+            remark = f"GUESS: {low:.4g} to {high:.4g} taken as {what}"
             return Guess(channel, unit, scale, remarks=(remark,))
-    remark = f"GUESS: {low:.4g} to {high:.4g}; scale: 1 over what full travel is in the log"
+    remark = f"GUESS: {low:.4g} to {high:.4g}; scale: 1 / full travel in the log"
     return Guess(channel, "1", EDIT, remarks=(remark,))
 
 

@@ -193,7 +193,7 @@ def _by_correlation(
             continue
         channel, related = best
         made = scales.scaled(channel, log.series[channel], si, _full_travel(log), is_input=True)
-        why = f"GUESS: no name says so; {known[-1]} follows it with a correlation of {related:.2f}"
+        why = f"GUESS: no name matches; {known[-1]} follows it with a correlation of {related:.2f}"
         inputs[name] = made._replace(remarks=(why, *made.remarks))
         taken.append(channel)
 

@@ -18,24 +18,24 @@ from heli_jax.new_config.rate import two_digits
 from heli_jax.yaml_file import EDIT
 
 _MOST_LISTED = 12
-_UNSET = {"kappa": "a stand that does not spring", "zeta": "a stand that does not damp"}
+_UNSET = {"kappa": "a stand without a spring", "zeta": "a stand without damping"}
 """what a constant's default says where it is not zero for every vehicle"""
 _GUSTS = (
-    "  # With a disturbance, since gusts move real vehicles too; where none do, output-error",
-    "  # and no section disturbance.",
+    "  # filter-error models gusts. Without gusts use output-error and remove the section",
+    "  # disturbance.",
 )
-_NO_AXIS = (
-    "  # output-error: the model names no axis on which gusts could act (axes in its file).",
+_NO_AXIS = ("  # output-error, because the model's file names no axis on which gusts act (axes).",)
+_PRIOR_OF_A = (
+    "    # a: {prior: {mean: 5.5, sd: 0.3}} # without it a is exact: Ixx and If scale with a"
 )
-_PRIOR_OF_A = "    # a: {prior: {mean: 5.5, sd: 0.3}} # else taken as exact: Ixx and If go with it"
 _SMOOTH = (
-    "  # GUESS: output-error, since the outputs have no sensor's noise: the log was smoothed or",
-    "  # simulated, and filter-error needs the noise as the sensors gave it.",
+    "  # GUESS: output-error, because the outputs have no sensor noise: the log was smoothed or",
+    "  # simulated. filter-error needs unfiltered sensor noise.",
 )
 # Short words of YAML (on, y, null) and numbers are none of these.
 _PLAIN = re.compile(r"(?!(?i:on|off|yes|no|y|n|true|false|null)\Z)[A-Za-z][\w./%^-]*")
 
-_ROWS_OF_TOPICS = "# Hz; the rows are those of several topics, the outputs slower"
+_ROWS_OF_TOPICS = "# Hz; rows of several topics, the outputs slower"
 
 
 class Filtered(NamedTuple):
@@ -128,8 +128,8 @@ def configuration(
 
     """
     lines = [
-        f"# Made from {_comment(log)}. What is marked GUESS was guessed: look it over.",
-        "# heli-jax keys TEXT explains keys; heli-jax check says whether the log is enough.",
+        f"# Made from {_comment(log)}. Check the lines marked GUESS.",
+        "# heli-jax keys TEXT explains a key; heli-jax check tests the log before a fit.",
         *_models(others),
         f"model: {_value(chosen.name)}",
         *([] if vehicle is None else [f"vehicle: {_value(vehicle)}"]),
@@ -142,7 +142,7 @@ def configuration(
         lines.append(f"    rate: {rate:g}".ljust(33) + "# Hz; the grid of all signals")
     if preset is not None:
         lines += [
-            "    # window: auto               # or [first, last] s: the parts that say most",
+            "    # window: auto               # or [first, last] s: the most informative parts",
             *_preset(preset, preset_outputs, filtered),
         ]
     else:
@@ -156,7 +156,7 @@ def configuration(
         "fit:",
         *(_SMOOTH if smooth else _GUSTS if axes else _NO_AXIS),
         f"  method: {'filter-error' if axes else 'output-error'}",
-        "  free:                          # what is found, and where the search begins",
+        "  free:                          # estimated parameters and start values",
     ]
     lines += [
         f"    {name}: {{}}".ljust(33) + "# begins at the vehicle file's value"
@@ -164,12 +164,12 @@ def configuration(
         else f"    {name}: {{start: {_number(start)}}}"
         for name, start in free.items()
     ]
-    stays = "# stays at this, another vehicle's; found without the first #"
+    stays = "# fixed at another vehicle's value; remove the first # to estimate it"
     lines += [f"    # {n}: {{start: {_number(v)}}}".ljust(33) + stays for n, v in held.items()]
     if not chosen.linear and "a" in naming.names(chosen.model.Params) and "a" not in free:
         lines.append(_PRIOR_OF_A)
     guess, sure = late
-    why = f"GUESS: {_comment(guess)}" if guess else "where the stick was logged late or early"
+    why = f"GUESS: {_comment(guess)}" if guess else "if the stick was logged late or early"
     lines += [
         f"  {'' if sure else '# '}nuisance: {{time_shift: true}} # {why}",
         *([f"disturbance: {{on: [{', '.join(axes)}]}}"] if axes else []),
@@ -180,7 +180,7 @@ def configuration(
 
 def vehicle(model: Any, means: Mapping[str, tuple[str, float]]) -> str:
     """A vehicle file to fill in."""
-    lines = ["# Of your vehicle, measured or from its drawings; a source helps whoever reads it."]
+    lines = ["# Constants of your vehicle, measured or from drawings, with their source."]
     defaults, known = naming.defaults(model.Params), naming.names(model.Params)
     # Any number stands for one that has to be there: it only shows what the model reads.
     params = model.Params(**{n: defaults.get(n, 1.0) for n in known})
@@ -195,7 +195,7 @@ def vehicle(model: Any, means: Mapping[str, tuple[str, float]]) -> str:
             channel, mean = means[name]
             value, meaning = f"{mean:.5g}", f"{meaning}; GUESS: mean of {channel}"
         elif value != EDIT and name in _UNSET:
-            meaning = f"{meaning}; GUESS: {_UNSET[name]}; measure it, or let the fit find it"
+            meaning = f"{meaning}; GUESS: {_UNSET[name]}; measure it, or estimate it"
         lines.append(f"{name}: {{value: {value}, unit: {_value(unit)}}}   # {_comment(meaning)}")
     return "\n".join(lines) + "\n"
 
@@ -220,7 +220,7 @@ def _clock(time: TimeInfo | None, rate: float | None) -> list[str]:
         gaps = f"a gap of {longest:.4g} s" if len(time.gaps) == 1 else gaps
         words = f"{gaps}; fail refuses long ones"
         if time.runs > 1:
-            words = f"{time.runs} runs, in each of which the time begins anew"
+            words = f"{time.runs} runs, each with its own time"
         lines += [
             f"    gaps: split                  # {words}",
             f"    rate: {rate or two_digits(time.rate):g}".ljust(33)
@@ -233,8 +233,8 @@ def _models(others: Sequence[str]) -> list[str]:
     if not others:
         return []
     return [
-        "# GUESS: the model, by the stick that moves; no log tells a stand or a flybar, and a",
-        "# wrong model fits with confident numbers. As --model NAME these go with the signals too:",
+        "# GUESS: the model, from the stick that moves. A log does not show a stand or a flybar,",
+        "# and a wrong model gives wrong numbers. Other models of these signals (--model NAME):",
         *(f"#   {words}" for words in others),
     ]
 
@@ -288,8 +288,8 @@ def _preset(preset: str, outputs: Sequence[str], filtered: Mapping[str, Filtered
     lines = [f"    signals:                     {known}", f"      preset: {preset}"]
     if outputs:
         lines += [
-            "      # Without the angle, which the autopilot integrates from its gyros: its error",
-            "      # wanders, and filter-error takes it for white noise.",
+            "      # Without the angle: the autopilot integrates it from gyros, its error drifts,",
+            "      # and filter-error assumes white noise.",
             f"      preset_outputs: [{', '.join(outputs)}]",
         ]
     if filtered:
@@ -310,8 +310,8 @@ def _left_out(wandering: Mapping[str, Guess]) -> list[str]:
         line
         for name, signal in wandering.items()
         for line in (
-            f"        # GUESS: without {name}, whose error looks integrated from a gyro: it",
-            "        # wanders, and filter-error takes it for white noise.",
+            f"        # GUESS: without {name}, which looks integrated from a gyro: its error",
+            "        # drifts, and filter-error assumes white noise.",
             *(f"        # {words.strip()}" for words in _signal(name, signal, "")),
         )
     ]
@@ -319,11 +319,11 @@ def _left_out(wandering: Mapping[str, Guess]) -> list[str]:
 
 def _unknown(model: Any) -> list[str]:
     """Outputs of which no name tells, for the user to name or to take out."""
-    lines = ["        # No name tells of an output: take out those that were not logged."]
+    lines = ["        # No name matches an output: delete those that were not logged."]
     for name in naming.names(model.Outputs):
         meaning, unit = naming.meaning(model.Outputs, name), naming.unit(model.Outputs, name) or "1"
         lines += [f"        # {name}: {_comment(meaning)}"] if meaning else []
-        words = "in what the log has it" if unit == "1" else f"such as {unit}"
+        words = "unit in the log" if unit == "1" else f"such as {unit}"
         lines.append(f"        {name}: {{signal: {EDIT}, unit: {EDIT}}}   # {words}")
     return lines
 
@@ -335,7 +335,7 @@ def _ranges(ranges: Mapping[str, tuple[float, float]]) -> list[str]:
     lines = [f"      #   {_comment(n)}: {low:.4g} to {high:.4g}" for n, (low, high) in shown]
     more = len(moving) - len(shown)
     lines += [f"      #   and {more} more: heli-jax info"] if more > 0 else []
-    return ["      # What moves in the log:", *lines] if lines else []
+    return ["      # Channels that move:", *lines] if lines else []
 
 
 def _missing(chosen: Chosen, signals: Signals) -> list[str]:
@@ -359,8 +359,8 @@ def _instruments(excitations: Mapping[str, str]) -> list[str]:
     if not excitations:
         return []
     return [
-        "      # What an autopilot added to the stick, by the channel's name. With it,",
-        "      # method: frequency-error is right in closed loop too (docs/frequency-fits.md).",
+        "      # Excitation that an autopilot added to the stick. With it,",
+        "      # method: frequency-error is unbiased in closed loop (docs/frequency-fits.md).",
         "      # instruments:",
         *(f"      #   {n}: {{signal: {_value(c)}}}   # GUESS" for n, c in excitations.items()),
     ]
@@ -373,7 +373,7 @@ def _signal(name: str, guess: Guess | None, meaning: str, settings: str = "") ->
     if guess is None:
         # A constant that nobody knows moves nothing: the user says which channel it is.
         stays = "; {constant: 0} if it did not move"
-        return [*words, f"        {name}: {{signal: {EDIT}}}   # no channel's name says so{stays}"]
+        return [*words, f"        {name}: {{signal: {EDIT}}}   # no channel name matches{stays}"]
     keys = [f"signal: {_value(guess.channel)}", f"unit: {_value(guess.unit)}"]
     if guess.offset:
         keys.append(f"offset: {guess.offset:g}")
