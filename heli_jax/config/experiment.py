@@ -362,7 +362,7 @@ def _vehicle(config: Config, path: Path, model: Model) -> Vehicle:
 
 
 def _of_model(config: Config, path: Path, model: Model) -> Vehicle:
-    """Return the vehicle of a model in Python, whose Params define the constants and their units."""
+    """Return the vehicle of a model in Python, whose Params define the constants and units."""
     fitted = _found_by_fit(config)
     if config.vehicle is None and not fitted:
         raise InputError(
