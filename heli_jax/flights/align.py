@@ -213,7 +213,7 @@ def _refined(
         gains = np.linalg.lstsq(others, both, rcond=None)[0]
         left, slope = (both - others @ gains).T
         whole = np.zeros((2, t.size))
-        # The sign: the derivative of the residual by the lag is that of the shifted signal.
+        # Positive, because b(t - lag) has the derivative -b'(t - lag) by the lag.
         whole[:, seen] = left, gains[0, 0] * slope
         return whole
 

@@ -146,7 +146,7 @@ def _outputs(
     log: Log,
     signals: text.Signals | None,
 ) -> Sequence[str]:
-    """Return the log's channels for outputs (`asked` of the preset; all if empty), else for inputs."""
+    """Return the log's channels for outputs (`asked` or all of the preset), else for inputs."""
     if signals is not None:
         taken = signals.outputs or signals.inputs
         return [g.channel for g in taken.values() if g is not None]

@@ -141,7 +141,7 @@ def spelled_out(names: Sequence[str]) -> dict[str, str]:
 
 
 def by_number(called: Sequence[str], names: Sequence[str]) -> list[str]:
-    """Return the channels identified by a number alone, such as `chan1_raw` and `servoRaw.servo1`."""
+    """Return the channels identified by a number, such as `chan1_raw` and `servoRaw.servo1`."""
     forms = {tuple(c.split()) for c in called}
     return [n for n in names if _numbered(n) in forms]
 
@@ -162,7 +162,7 @@ def _without_fillers(words: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def of_known_unit(names: Sequence[str], log: Mapping[str, Series], si: str) -> str:
-    """Return the first channel, or one with the same words and a known unit: rc_aileron(percent)."""
+    """Return the first channel, or one with the same words and a known unit."""
     words = words_of(names[0])
     alike = [n for n in names if words_of(n) == words]
     known = (n for n in alike if units.fits(log[n].unit or without_unit(n)[1] or "none", si))

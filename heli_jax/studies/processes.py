@@ -138,7 +138,7 @@ def computed(tasks: Sequence[Task], workers: int) -> Iterator[tuple[int, Outcome
 
 
 def _cache(stack: contextlib.ExitStack) -> str:
-    """Return the folder of compiled programs that all workers share, so that each is compiled once."""
+    """Return the folder of compiled programs that all workers share, to compile each only once."""
     folder: Any = jax.config.jax_compilation_cache_dir  # pyright: ignore
     if folder:
         return str(Path(folder).absolute())
