@@ -85,8 +85,8 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
     interpolated, or low-pass filtered if the rate decreases. Samples in a long gap are missing.
 
     Raises:
-        InputError: the log cannot be read, a signal or a clock is missing, the signals have several
-            clocks and no rate is given, or rate and window are invalid.
+        InputError: the log cannot be read; a signal or a clock is missing; the signals have several
+            clocks and no rate is given; or rate or window is invalid.
     """
     # Checked before the log is opened, which may take minutes.
     require_rate_and_window(str(path), selection.rate, selection.window)

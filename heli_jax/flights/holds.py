@@ -32,11 +32,10 @@ random walk 0.02, steps under 0.5 % of noise 0.96."""
 def decide(values: np.ndarray) -> Decision:
     """Decide what an input (N,), in any unit, does between samples, by how it moves.
 
-    An input commanded in steps moves in jumps, whether it holds for two samples (logged faster than
-    sampled) or two hundred, also with noise of a few counts. A smooth motion, with or without
-    pauses, has hardly any jumps, nor has a step over several samples. An input with both is mixed.
-    Moves by one count of the log decide nothing: they are the resolution of a slow motion or of
-    noise.
+    An input commanded in steps moves in jumps, also with noise of a few counts. It may hold for two
+    samples (logged faster than sampled) or two hundred. A smooth motion, with or without pauses,
+    has hardly any jumps, nor has a step over several samples. An input with both is mixed. Moves by
+    one count of the log decide nothing: they are the resolution of a slow motion or of noise.
     """
     largest = float(np.abs(values).max())
     if largest > 0:

@@ -355,8 +355,8 @@ def _uneven(path: str, clock: TopicClock, uneven: Uneven) -> InputError:
     problem = f"a step of {uneven.step:.6g} s where {uneven.usual:.6g} s is usual"
     if uneven.drift is not None:
         problem = f"the times leave a uniform grid by {uneven.drift:.2g} samples"
-    # If a gap is too long to be bridged, a rate would only cause the next error, and the parts
-    # beside the gap may be uniform.
+    # If a gap is too long to be bridged, a rate would only cause the next error. The parts beside
+    # the gap may be uniform.
     bridged = np.diff(clock.seconds).max() <= longest_gap(clock.seconds) * (1 + 1e-9)
     remedy = f"`rate: {1 / uneven.usual:.4g}` to resample, or " if bridged else ""
     remedy += "a window without such steps" + ("" if bridged else " or `gaps: split`")

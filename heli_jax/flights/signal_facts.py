@@ -112,10 +112,10 @@ class SignalFacts:
     def rounding(self, dt: float) -> float:
         """Return the rms error of rounding that remains at a step of `dt` [s].
 
-        Rounding to steps of q adds an rms error of q / sqrt(12) if the signal moves by more than a
-        step between samples or has noise of that size. The error is then white, and the low-pass
-        filter before a lower rate reduces it. If a value stays for several samples, their errors
-        are equal and do not average out.
+        Rounding to steps of q adds an rms error of q / sqrt(12). The error is white if the signal
+        moves by more than a step between samples, or has noise of that size. The low-pass filter
+        before a lower rate then reduces it. If a value stays for several samples, their errors are
+        equal and do not average out.
         """
         run = self.usual / self.moves if self.moves > 0 else dt
         return self.step / 12**0.5 * min(1.0, (run / dt) ** 0.5)

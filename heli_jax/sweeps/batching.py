@@ -86,7 +86,7 @@ def _fused_or_xla(
 
 
 def _chunk_for(job: Job, kind: str, n_devices: int, lanes: int, shares: int) -> int:
-    """Return the elements of a chunk: whole blocks of all devices, within limits of time and memory."""
+    """Return the elements of a chunk: whole blocks of all devices, limited by time and memory."""
     step = BLOCKS * lanes * n_devices
     each = (jax.tree.leaves(shapes(job, i)) for i in range(len(job.flights)))
     heaviest = max(sum(v.size * v.dtype.itemsize for v in leaves) for leaves in each)

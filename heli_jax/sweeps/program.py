@@ -62,7 +62,7 @@ def _shapes(
 
 @functools.lru_cache(maxsize=32)
 def _compiled(plan: Plan, devices: tuple[Any, ...], lanes: int) -> tuple[Any, Any, Any]:
-    """Return the functions for steady flights and for elements, and the sharding of mapped arrays."""
+    """Return the functions for steady flights and elements, and the sharding of mapped arrays."""
     # Cached, because every flight of a sweep and every sweep of the same plan uses it.
     run, split = spread(functools.partial(design_point, plan), devices, lanes)
     return trims_of(plan, lanes), run, split

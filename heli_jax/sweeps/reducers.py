@@ -1,8 +1,8 @@
 """Reducers: numbers computed from each run of a sweep during the simulation.
 
 A reducer starts with running values, updates them at every sample, and computes its result at the
-end, so no part of the run is stored. A function of a whole run may replace it; the runs of one
-block are then stored for it.
+end. No part of the run is stored. A function of a whole run may replace it; the runs of one block
+are then stored for it.
 """
 
 # `Any` below: the running values of a user's Streaming are any pytree, and without a signal it gets

@@ -189,8 +189,8 @@ def job(
         options: options of the runs.
 
     Raises:
-        ValueError: an axis or a result that the model or the flights cannot have, a vehicle that
-            lacks something, an unknown solver or precision, float64 while JAX has it switched off.
+        ValueError: an axis or a result that the model or the flights cannot have; an incomplete
+            vehicle; an unknown solver or precision; float64 while JAX has it switched off.
         TypeError: a design or a result of another kind.
     """
     # The model first: the other checks use its names, and a wrong model would fail there far from

@@ -303,7 +303,7 @@ def _blanked(values: np.ndarray, lost: np.ndarray) -> np.ndarray:
 
 
 def _eigenvalues(A: np.ndarray) -> np.ndarray:
-    """Return eigenvalues (k, n), slowest first, the lower of a pair first; NaN unless A is finite."""
+    """Return eigenvalues (k, n), slowest first, lower of a pair first; NaN unless A is finite."""
     # NumPy raises if one matrix has NaN, and then no element of the chunk would have eigenvalues.
     finite = np.all(np.isfinite(A), axis=(1, 2))
     values = np.linalg.eigvals(np.where(finite[:, None, None], A, 0.0)).astype(np.complex128)
