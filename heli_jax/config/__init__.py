@@ -1,4 +1,4 @@
-"""Experiment configurations: YAML, validated, and the problems that they describe."""
+"""Experiment configurations: validated YAML, and the problems that they describe."""
 
 from heli_jax.config.experiment import Experiment, in_wind, load, resolved
 from heli_jax.config.logs import first_signals, read_flights, signals

@@ -1,4 +1,4 @@
-"""Errors of sensors, found by `heli-jax compatibility`, taken off the signals of a flight."""
+"""Sensor errors, found by `heli-jax compatibility` and removed from the signals of a flight."""
 
 import dataclasses
 from collections.abc import Iterable, Iterator
@@ -19,7 +19,7 @@ from heli_jax.yaml_file import read_mapping
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 _LATEST = 1.0
-"""s; a delay beyond is another unit, or another clock"""
+"""Longest delay [s]; a longer one indicates another unit or another clock."""
 
 
 class Conversion(Section):
@@ -39,15 +39,15 @@ class SignalCorrection(Section):
     """Correction of one signal of a log: (1 + scale) truth + bias, late by the delay."""
 
     of: str = ""
-    """what it is, for the reader"""
+    """description of the signal, for the reader"""
     unit: str
-    """of the log's numbers, and of the bias"""
+    """unit of the log's numbers and of the bias"""
     scale: Annotated[Finite, Field(gt=-0.9)] = 0.0
     bias: Finite = 0.0
     delay: Annotated[Finite, Field(ge=-_LATEST, le=_LATEST)] = 0.0
-    """s"""
+    """delay [s]"""
     conversion: Conversion = Conversion()
-    """by which the log's numbers were read when this was found"""
+    """conversion of the log's numbers when the error was found"""
 
 
 class Corrections(Section):
@@ -55,17 +55,17 @@ class Corrections(Section):
 
     found_by: str = ""
     verdict: str = ""
-    """for the reader; without corrections where the log's signals do not fit together"""
+    """summary for the reader; no corrections if the log's signals are inconsistent"""
     signals: dict[str, SignalCorrection] = {}
-    """by name in the log"""
+    """corrections by name in the log"""
     lever_arm: dict[str, Finite] = {}
     """x_imu, y_imu, z_imu [m]"""
     not_determined: list[str] = []
-    """errors that the record did not determine, and that are therefore not corrected"""
+    """errors that are not identifiable from the record and therefore not corrected"""
 
 
 def read_corrections(path: Path, where: str) -> Corrections:
-    """A file of corrections.
+    """Read a file of corrections.
 
     Raises:
         InputError: it cannot be read, or something in it is wrong.
@@ -83,32 +83,32 @@ def read_corrections(path: Path, where: str) -> Corrections:
 
 
 class Logged(NamedTuple):
-    """A signal of the model, and which of the log it is."""
+    """A signal of the model and its signal in the log."""
 
     role: str
-    """inputs or outputs"""
+    """`inputs` or `outputs`."""
     name: str
-    """the model's"""
+    """Name in the model."""
     signal: Signal
 
 
 def logged_signals(flight: Flight) -> Iterator[Logged]:
-    """The signals that a flight has from its logs, inputs first."""
+    """Yield the signals that a flight has from its logs, inputs first."""
     if flight.source is None:
         return
     for role, signals in (("inputs", flight.source.inputs), ("outputs", flight.source.outputs)):
         for name, signal in signals.items():
-            if signal.constant is None:  # a constant is stated, and no sensor showed it
+            if signal.constant is None:  # a constant is stated, not measured
                 yield Logged(role, name, signal)
 
 
 def conversion_of(signal: Signal) -> Conversion:
-    """Return the conversion by which the log's numbers were read."""
+    """Return the conversion of the log's numbers."""
     return Conversion(scale=signal.scale, offset=signal.offset, invert=signal.invert)
 
 
 def with_corrections(model: Model, flight: Flight, corrections: Corrections, where: str) -> Flight:
-    """The flight without the errors of its sensors; what was done stands in its notes.
+    """Return the flight without its sensor errors; its notes list the corrections.
 
     Raises:
         InputError: none of its signals is corrected, or a unit is not that of the correction.
@@ -143,8 +143,8 @@ def with_corrections(model: Model, flight: Flight, corrections: Corrections, whe
 
 
 def with_notes(flight: Flight, notes: Iterable[Finding]) -> Flight:
-    """The flight with further notes of its reader."""
-    # A flight that a script made has no source, and nobody who would read a note on it.
+    """Return the flight with further notes from its reader."""
+    # A flight made by a script has no source for notes.
     if flight.source is None:
         return flight
     source = dataclasses.replace(flight.source, notes=(*flight.source.notes, *notes))
@@ -157,13 +157,13 @@ def _factor(each: Logged, correction: SignalCorrection, where: str) -> float:
     place = f"{where}.corrections: {signal.name}"
     with located(place):
         stated, of_correction = (units.factor(u, signal.si) for u in (signal.unit, correction.unit))
-    # Read as degrees there and as radians here, one of the two fits was of other numbers.
+    # With different units, one of the two fits used wrong numbers.
     if not np.isclose(stated, of_correction, rtol=1e-9):
         raise InputError(
             f"{place}: expected the unit that it was corrected in, {correction.unit}, "
             f"got {signal.unit}"
         )
-    # With another sign or zero the errors would be added and not taken off.
+    # With another sign or offset, the correction would add the errors.
     here, there = conversion_of(signal), correction.conversion
     if here != there:
         raise InputError(
@@ -174,23 +174,23 @@ def _factor(each: Logged, correction: SignalCorrection, where: str) -> float:
 
 
 def _earlier(x: np.ndarray, samples: float, role: str) -> np.ndarray:
-    """A signal (N,) that was logged late by so many samples, at its own time."""
+    """Return a signal (N,) at its own time; it was logged late by `samples`."""
     if not samples:
         return x
     n = np.arange(x.size)
-    # A sample beside a gap is in between what is there and what is not: NaN.
+    # A sample beside a gap is between a known and a missing value: NaN.
     moved = np.interp(n + samples, n, x)
     moved[(n + samples > x.size - 1) | (n + samples < 0)] = np.nan
     if role == "outputs":
         return moved
-    # An input acts all the time: at the ends it stays.
+    # An input acts all the time, so it is constant at the ends.
     return np.interp(n + samples, n, x)
 
 
 def _lever_arm(
     model: Model, flight: Flight, corrections: Corrections
 ) -> tuple[dict[str, float], list[Finding]]:
-    """Return the place of a model's accelerometers, and a note on it."""
+    """Return the position of a model's accelerometers, and a note on it."""
     arm = corrections.lever_arm
     if not arm:
         return {}, []
@@ -198,6 +198,6 @@ def _lever_arm(
     if not set(arm) <= set(naming.names(model.Params)):
         words = f"lever arm not used, model {model.name} has none: {words}"
         return {}, [note("corrections.left-out", words, *arm)]
-    # What the configuration says of this flight goes before.
+    # The configuration's value for this flight has priority.
     new = {n: v for n, v in arm.items() if n not in flight.known}
     return new, [note("corrections.applied", f"lever arm of the accelerometer: {words}", *arm)]

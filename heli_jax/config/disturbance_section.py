@@ -9,13 +9,15 @@ from heli_jax.errors import nearest
 
 
 def _has_unit(value: Any) -> bool:
-    """True if this is one number with its unit, and not one for each of several by name."""
+    """True if this is one number with its unit, not a mapping of numbers by name."""
     return isinstance(value, dict) and "value" in value
 
 
 def _size_choice(value: Any) -> Any:
-    """One number above zero, or one for each of several disturbances by name; in SI, or as {value,
-    unit}; None as if it were left out."""
+    """Return one positive number, or one by name for each of several disturbances.
+
+    Numbers are in SI, or have the form {value, unit}; None means left out.
+    """
     if value is None:
         return None
     if isinstance(value, dict) and not _has_unit(value):
@@ -25,14 +27,14 @@ def _size_choice(value: Any) -> Any:
 
 def _size(value: Any) -> Any:
     number = value["value"] if _has_unit(value) else value
-    # In Python true is the number 1. Infinity has no spread to draw from, and no time constant.
+    # In Python true is the number 1. Infinity has no spread to draw from, and is no time constant.
     real = isinstance(number, int | float) and not isinstance(number, bool)
     if not (real and 0 < number < float("inf")):
         raise ValueError(
             "expected a number above zero (SI, or {value, unit}), or of several disturbances one "
             f"for each by name, got {number!r:.60}"
         )
-    # Its unit is checked where the model is known, which has the unit of what is pushed.
+    # The unit is checked where the model, and so the unit of the disturbed state, is known.
     return value if _has_unit(value) else float(value)
 
 
@@ -55,41 +57,41 @@ _Size = Annotated[
 
 
 class DisturbanceConfig(Section):
-    """Random pushes on derivatives of states: simulation draws them, filter error estimates them.
+    """Random disturbances of state derivatives: simulation draws them, filter error estimates them.
 
-    `axis: roll` and `on: [roll]` mean the same.
+    `axis: roll` and `on: [roll]` are equivalent.
     """
 
-    # One axis, whose parameters are sigma_w and tau_w without a name behind them; `on` with several
-    # gives each state a size of its own.
+    # `axis` has the parameters sigma_w and tau_w without a suffix; `on` with several gives each
+    # state a size of its own.
     axis: str | None = None
     """one of the model's axes: roll, pitch, yaw, heave, ..."""
-    # Any, since the validators before it have said what it may be, here and below.
+    # Any here and below, because the validator before it defines the allowed values.
     on: Annotated[
         Any, BeforeValidator(_on_choice, json_schema_input_type=str | list[str] | None)
     ] = None
-    """states or axes, each with a disturbance of its own"""
-    # Two poles for a push that is smoother than a lag of white noise; both have the same time
+    """states or axes, each with its own disturbance"""
+    # Two poles make a disturbance smoother than lagged white noise; both have the same time
     # constant.
     poles: Literal[1, 2] = 1
     """1: an Ornstein-Uhlenbeck process; 2: passed through a second lag"""
     sigma_w: _Size = None
-    """standard deviation, in the state's unit per second (SI) or as {value, unit}, of several by
-    name: needed to simulate, an initial guess for filter error"""
+    """standard deviation, in the state's unit per second (SI) or as {value, unit}, by name for
+    several; required to simulate, an initial guess for filter error"""
     tau_w: _Size = None
-    """correlation time [s], of several by name or one number for all: as sigma_w"""
+    """correlation time [s], by name for several or one number for all, as sigma_w"""
     fixed: list[str] = []
-    """parameters that filter error does not estimate: sigma_w, tau_w (of several sigma_w_p,
-    ...), sigma_y (the outputs' sd)"""
+    """parameters that filter error does not estimate: sigma_w, tau_w (for several sigma_w_p, ...),
+    sigma_y (the outputs' sd)"""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of what is disturbed, as in the file."""
+        """Names of the disturbed states or axes, as in the file."""
         return self.on if self.axis is None else (self.axis,)
 
     @property
     def has_units(self) -> bool:
-        """True if some number has a unit of its own and is not in SI yet."""
+        """True if some number has its own unit and is not in SI yet."""
         values = (self.sigma_w, self.tau_w)
         return any(
             _has_unit(v) or (isinstance(v, dict) and any(map(_has_unit, v.values())))
@@ -98,14 +100,13 @@ class DisturbanceConfig(Section):
 
     @property
     def parameters(self) -> dict[str, float | None]:
-        """By the name of each parameter its value, None where none is given."""
-        # The names of parameters have to be those that `with_disturbance` gives them.
+        """Value of each parameter by name, None if not given."""
+        # The names must be those that `with_disturbance` gives to the parameters.
         several, values = len(self.names) > 1, {}
         for name in self.names:
             for key in ("sigma_w", "tau_w"):
                 value = getattr(self, key)
-                # One number stands for all, which only a time constant may: it is in seconds
-                # whatever is pushed.
+                # Only a time constant may be one number for all: it is in seconds for any state.
                 by_name = isinstance(value, dict) and not _has_unit(value)
                 of_it = value.get(name) if by_name else value
                 values[f"{key}_{name}" if several else key] = of_it
@@ -123,15 +124,14 @@ class DisturbanceConfig(Section):
                 if name not in self.names:
                     raise ValueError(f"{key}: {name!r} is not disturbed{nearest(name, self.names)}")
         if len(self.names) > 1 and (isinstance(self.sigma_w, float) or _has_unit(self.sigma_w)):
-            # Of states in different units one number would mean a different thing on each.
+            # For states in different units, one number would have different meanings.
             example = ", ".join(f"{n}: {_plain(self.sigma_w)}" for n in self.names)
             raise ValueError(f"sigma_w: expected a value for each, as {{{example}}}, got one")
         for name in self.fixed:
             if name not in (*self.parameters, "sigma_y"):
                 known = ", ".join((*self.parameters, "sigma_y"))
                 raise ValueError(f"fixed: expected some of {known}, got {name!r}")
-            # What is left out begins with a guess from the record, and a guess is no value to be
-            # kept.
+            # A missing value starts with a guess from the record, and a guess must not be fixed.
             if name != "sigma_y" and self.parameters[name] is None:
                 raise ValueError(f"{name}: missing, expected its value, since it is fixed")
         return self

@@ -1,4 +1,4 @@
-"""An experiment: a configuration read and validated, with what it names at hand."""
+"""An experiment: a validated configuration with its model and vehicle."""
 
 import contextlib
 import math
@@ -27,19 +27,19 @@ from heli_jax.yaml_file import EDIT, parse_value, read_mapping
 
 
 class Experiment(NamedTuple):
-    """A validated configuration with what it names at hand."""
+    """A validated configuration with its model, vehicle and open logs."""
 
     config: Config
     path: Path
-    """the file it came from; its folder is where relative paths begin"""
+    """The configuration file; relative paths begin at its folder."""
     model: Model
     vehicle: Vehicle
     logs: OpenedLogs
-    """those that were opened for the model's sake, until the flights are read"""
+    """Logs that the model needed, kept open until the flights are read."""
 
     @contextlib.contextmanager
     def located(self, section: str) -> Iterator[None]:
-        """Put the place before an error: the section, or where the vehicle's constants are."""
+        """Prefix an error with its place: the section, or the vehicle's file."""
         try:
             with located(f"{self.path}: {section}" if section else str(self.path)):
                 yield
@@ -50,8 +50,9 @@ class Experiment(NamedTuple):
 
 
 def load(path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = ()) -> Experiment:
-    """Read and validate a configuration, its model and its vehicle; a log is opened where its
-    settings are part of the model, no other yet.
+    """Read and validate a configuration, its model and its vehicle.
+
+    A log is opened only if its settings are part of the model.
 
     Args:
         path: the configuration (YAML); paths in it begin at its folder.
@@ -66,17 +67,15 @@ def load(path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = ()) ->
 def read_overridden(
     path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = ()
 ) -> dict[str, Any]:
-    """Return the content of a configuration's file with overrides in place, as `load` does; not yet
-    validated.
+    """Return the content of a configuration file with overrides, as `load` does, not validated.
 
     Raises:
-        InputError: no such file, no YAML, or an override that cannot be put in.
+        InputError: no such file, no YAML, or an invalid override.
         TypeError: `path` is no path.
     """
     require_kind("config", path, (str, Path), "the path of a configuration, 'fit.yaml'")
     content = read_mapping(path)
-    # Before the validation, so that an override is checked as what the file says is, and may set a
-    # key that the file leaves out.
+    # Before the validation, so that an override is checked like the file and may add a key.
     if isinstance(overrides, Mapping):
         for key, value in overrides.items():
             set_value(content, str(key), value, f"override {key!r:.80}")
@@ -84,7 +83,7 @@ def read_overridden(
     keys: set[str] = set()
     for text in overrides:
         key, value, where = parse_override(text)
-        # The last of several would win without a word.
+        # Otherwise the last of several would silently win.
         if key in keys:
             raise InputError(
                 f"{where}: {key} is set twice, expected one value (several make a study of fits: "
@@ -96,21 +95,21 @@ def read_overridden(
 
 
 def from_content(content: dict[str, Any], path: Path) -> Experiment:
-    """The experiment that the content of a configuration describes.
+    """Return the experiment that the content of a configuration describes.
 
     Args:
-        content: as YAML holds it; is not kept.
-        path: the file that it is of, which need not exist: messages name it, and relative paths
-            begin at its folder.
+        content: content of the YAML file; is not kept.
+        path: the file, which need not exist: messages name it, and relative paths begin at its
+            folder.
 
     Raises:
         InputError: anything in it is wrong.
     """
     config = _validated(completed(content, str(path)), str(path))
-    # The model before the vehicle, since its Params say which constants a vehicle may have.
+    # The model comes before the vehicle, because its Params define the vehicle's constants.
     logs = OpenedLogs()
     model = _model(config, path, logs)
-    # From here on nobody has to know that numbers may have units.
+    # After this step all numbers are in SI.
     config = _in_si(config, model, path)
     vehicle = _vehicle(config, path, model)
     return Experiment(config, path, model, vehicle, logs)
@@ -120,12 +119,12 @@ def _model(config: Config, path: Path, logs: OpenedLogs) -> Model:
     folder = path.absolute().parent
     if isinstance(config.model, LinearConfig):
         if config.corrections is not None:
-            # Corrections are of the equations of the whole helicopter; the entries of a linear
-            # model are what its file says.
+            # Corrections apply to the equations of the full helicopter; a linear model's entries
+            # come from its file.
             raise InputError(f"{path}: corrections: a linear model takes none")
         return _started(config, path, _linear(config.model, path).model, logs)
     model = models.by_name(config.model, f"{path}: model", folder)
-    # Looked up without corrections first: a name that no model has is an error of `model`.
+    # First without corrections, so that an unknown name is an error of `model`.
     if config.corrections is not None:
         where = f"{path}: corrections"
         model = models.by_name(config.model, where, folder, corrections=config.corrections)
@@ -133,7 +132,7 @@ def _model(config: Config, path: Path, logs: OpenedLogs) -> Model:
 
 
 def _linear(model: LinearConfig, path: Path) -> LinearModel:
-    """The linear model that a configuration names; the same file is read once."""
+    """Return the linear model of a configuration; each file is read once."""
     try:
         return linear_model(model.linear, path.parent)
     except InputError as e:
@@ -141,11 +140,10 @@ def _linear(model: LinearConfig, path: Path) -> LinearModel:
 
 
 def _started(config: Config, path: Path, model: Model, logs: OpenedLogs) -> Model:
-    """The model with the configuration's devices around it, and its initial state."""
-    # The devices first: their states can be named in the initial state as those of the bare model
-    # are.
+    """Return the model with the configuration's devices and initial state."""
+    # Devices first, because the initial state may include their states.
     model = with_onboard(model, config.onboard, path)
-    # Behind all of them, since it is what the autopilot did to what its sensors had.
+    # Outermost, because it models the autopilot's processing of its sensors.
     model = with_measurement(model, config.flights, path, logs)
     if not config.initial_state:
         return model
@@ -153,7 +151,7 @@ def _started(config: Config, path: Path, model: Model, logs: OpenedLogs) -> Mode
 
 
 def in_wind(experiment: Experiment) -> Experiment:
-    """The experiment with a model that has the wind as inputs.
+    """Return the experiment with a model that has the wind as inputs.
 
     Raises:
         InputError: the model takes no wind.
@@ -161,7 +159,7 @@ def in_wind(experiment: Experiment) -> Experiment:
     config, path = experiment.config, experiment.path
     if isinstance(config.model, LinearConfig):
         raise InputError(f"{path}: simulate.wind: a linear model takes no wind")
-    # Anew by name: the wind's inputs are part of the model, and the initial state goes with it.
+    # Built again by name: the wind's inputs are part of the model, and so is the initial state.
     model = models.by_name(
         config.model,
         f"{path}: simulate.wind",
@@ -173,7 +171,7 @@ def in_wind(experiment: Experiment) -> Experiment:
 
 
 def parse_override(text: str) -> tuple[str, Any, str]:
-    """Key and value of a `key.path=value` text, and what a message on it begins with.
+    """Return key, value and the prefix of messages for a `key.path=value` text.
 
     Raises:
         InputError: it is no such text.
@@ -182,17 +180,16 @@ def parse_override(text: str) -> tuple[str, Any, str]:
     where = f"--set {text!r:.80}"
     if not equals or not key.strip():
         raise InputError(f"{where}: expected key.path=value")
-    # The value is read as YAML reads it, so that --set fit.seed=1 is a number and =null switches a
-    # section off.
+    # Parsed as YAML, so that --set fit.seed=1 is a number and =null switches a section off.
     return key.strip(), parse_value(value, where), where
 
 
-# What YAML holds is Any below: a mapping, a list or a value, at any depth.
+# YAML content is Any below: a mapping, a list or a value, at any depth.
 def set_value(content: dict[str, Any], key: str, value: Any, where: str) -> None:
-    """Put a value at `key.path`, in sections that are made where they are missing.
+    """Set a value at `key.path`, and create missing sections.
 
     Raises:
-        InputError: there is something else than a section or a list on the way.
+        InputError: the path passes through a value that is no section or list.
     """
     *above, last = key.split(".")
     at: Any = content
@@ -212,12 +209,12 @@ def _child(at: Any, name: str, where: str) -> Any:
     if isinstance(at, list):
         return at[_index(at, name, where)]
     if isinstance(at, dict):
-        return at.setdefault(name, {})  # a misspelt section is refused as an unknown key later
+        return at.setdefault(name, {})  # a misspelt section is refused later as an unknown key
     raise InputError(f"{where}: the key before {name!r} must be a section or a list")
 
 
 def _index(at: list[Any], name: str, where: str) -> int:
-    # No index from the end and none beyond it: a list is changed, never lengthened.
+    # No negative index and none beyond the end: a list is changed, never extended.
     if not name.isdigit() or int(name) >= len(at):
         raise InputError(f"{where}: got {name!r}, expected a number from 0 to {len(at) - 1}")
     return int(name)
@@ -227,13 +224,12 @@ def _validated(content: dict[str, Any], where: str) -> Config:
     try:
         config = Config.model_validate(content)
     except pydantic.ValidationError as e:
-        # Of a key that may hold one of several kinds pydantic reports each: those of the kind that
-        # stands there say what is wrong. An unknown key is the likeliest cause of the others (what
-        # it was meant for is missing), so it comes first. One error at a time: a list of twenty is
-        # not read.
+        # For a key with several allowed kinds pydantic reports errors of each; those of the actual
+        # kind are useful. An unknown key comes first, because it is the likeliest cause of the
+        # others. Only one error is shown: nobody reads a list of twenty.
         errors = sorted(e.errors(), key=_of_least_use)
         raise InputError(f"{where}: {_sentence(errors[0])}") from None
-    # Where a text may stand it would be a channel's name, or a unit.
+    # Where a text is allowed, it would be taken as a channel's name or a unit.
     if places := list(_still_to_edit(content)):
         others = ", ".join(map(_place, places[1:]))
         more = f"; {EDIT} stands also at {others}" if others else ""
@@ -242,7 +238,7 @@ def _validated(content: dict[str, Any], where: str) -> Config:
 
 
 def _still_to_edit(at: Any, place: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
-    """The places in which a user has to say something yet."""
+    """Yield the places that the user still has to fill in."""
     if at == EDIT and place:
         yield place
     children = at.items() if isinstance(at, dict) else enumerate(at) if isinstance(at, list) else ()
@@ -256,17 +252,17 @@ def _edit_words(place: tuple[str | int, ...]) -> str:
 
 
 _KIND = re.compile(r"(str|int|float|bool|[A-Z]\w*Config|(list|dict|tuple|literal|constrained)\W.*)")
-"""a member of a union, which stands in pydantic's places as if it were a key"""
+"""Member of a union, which pydantic inserts into places as if it were a key."""
 
 
 def _of_least_use(error: ErrorDetails) -> tuple[bool, bool]:
-    """Order errors by how much they say: those of a kind that does not stand there come last."""
+    """Sort key of errors: those of another kind than the actual value come last."""
     return _is_of_another_kind(error), error["type"] != "extra_forbidden"
 
 
 def _is_of_another_kind(error: ErrorDetails) -> bool:
     kinds = [part for part in error["loc"] if isinstance(part, str) and _KIND.fullmatch(part)]
-    # Of the kind that stands there, unless the value as a whole is what is wrong.
+    # Only if the value as a whole is not the error.
     return bool(kinds) and error["loc"][-1] == kinds[-1] and not error["type"].startswith("value")
 
 
@@ -274,8 +270,7 @@ def _sentence(error: ErrorDetails) -> str:
     place = _place(error["loc"])
     value = error.get("input")
     if error["type"] == "extra_forbidden":
-        # The nearest of those that stand at the same place: a key of another section would be no
-        # help.
+        # Only keys of the same section are useful suggestions.
         known = _known_keys(error["loc"])
         return f"{place}: unknown key{nearest(str(error['loc'][-1]), known)}"
     if error["type"] == "missing":
@@ -285,7 +280,7 @@ def _sentence(error: ErrorDetails) -> str:
     if _is_of_another_kind(error):
         kind = expected([part for part in error["loc"] if not _KIND.fullmatch(str(part))])
         return f"{place}: got {value!r:.60}, expected {kind}"
-    # pydantic's sentence without its own beginning, made part of ours: "Input should be ...".
+    # pydantic's sentence without its beginning becomes part of ours: "Input should be ...".
     message = str(error["msg"]).removeprefix("Value error, ")
     message = message[0].lower() + message[1:]
     if error["type"] == "list_type" and isinstance(value, str | int | float):
@@ -296,8 +291,8 @@ def _sentence(error: ErrorDetails) -> str:
         return (
             f"{place}: got {value!r:.60}, expected a section of keys and values ({keys}){without}"
         )
-    # A section says where it is; quoted, it would fill the line. Our own validators say what they
-    # got in their message.
+    # A section states its place; quoting it would fill the line. Our own validators already quote
+    # the value.
     if isinstance(value, dict | list) or error["type"] == "value_error":
         return f"{place}: {message}"
     return f"{place}: got {value!r:.60}, {message.replace('input should be', 'expected')}"
@@ -311,7 +306,7 @@ _MEANT = {
     "scale": "the input's full travel in the stated unit over its full travel in the log's numbers",
     "start": "a value of the parameter to begin from, right to a factor of three or so",
 }
-"""by the last word of a key what `heli-jax new` could not know"""
+"""Values that `heli-jax new` cannot know, by the last word of the key."""
 
 
 def _place(loc: tuple[int | str, ...]) -> str:
@@ -325,14 +320,14 @@ def _place(loc: tuple[int | str, ...]) -> str:
 
 
 def _known_keys(loc: tuple[int | str, ...]) -> list[str]:
-    """The keys of the section that an unknown key stands in."""
+    """Return the known keys of the section that contains an unknown key."""
     section: Any = Config
     for part in loc[:-1]:
         if isinstance(part, int):
             continue
         fields = getattr(section, "model_fields", None)
-        # The user's own names, such as that of a parameter below `free`, are in no section: the
-        # section is still the one that the mapping's values are of.
+        # A user's own name, such as a parameter below `free`, is in no section. The section is then
+        # that of the mapping's values.
         if fields is None or part not in fields:
             continue
         section = _section(fields[part].annotation) or section
@@ -340,7 +335,7 @@ def _known_keys(loc: tuple[int | str, ...]) -> list[str]:
 
 
 def _section(annotation: Any) -> Any:
-    """The configuration class within an annotation such as list[FlightConfig] | None."""
+    """Return the configuration class within an annotation such as list[FlightConfig] | None."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     for inner in getattr(annotation, "__args__", ()):
@@ -355,8 +350,8 @@ def _vehicle(config: Config, path: Path, model: Model) -> Vehicle:
         vehicle = _of_linear(config, config.model, path, model)
     else:
         vehicle = _of_model(config, path, model)
-    # Checked here for all kinds of models: a mass or a time constant of zero divides, and what
-    # comes of that would be told far from its name.
+    # Checked here for all kinds of models: a mass or a time constant of zero divides, and later
+    # errors would not name it.
     for name in model.positive:
         constant = vehicle.constants.get(name)
         if constant is not None and constant.value <= 0:
@@ -367,8 +362,7 @@ def _vehicle(config: Config, path: Path, model: Model) -> Vehicle:
 
 
 def _of_model(config: Config, path: Path, model: Model) -> Vehicle:
-    """The vehicle of a model in Python, whose Params say which constants there can be, and in
-    which units."""
+    """Return the vehicle of a model in Python, whose Params define the constants and units."""
     fitted = _found_by_fit(config)
     if config.vehicle is None and not fitted:
         raise InputError(
@@ -382,16 +376,16 @@ def _of_model(config: Config, path: Path, model: Model) -> Vehicle:
 
 
 def _found_by_fit(config: Config) -> tuple[str, ...]:
-    """The parameters that a fit finds without any value at hand."""
-    # A regression of the records needs no start, so neither the configuration nor the vehicle has
-    # to have one.
+    """Return the parameters that a fit finds without a start value."""
+    # A regression of the records needs no start, so neither the configuration nor the vehicle must
+    # have one.
     if config.fit is None or config.fit.start.method == "given":
         return ()
     return tuple(config.fit.free)
 
 
 def _of_linear(config: Config, model: LinearConfig, path: Path, built: Model) -> Vehicle:
-    """The values of a linear model's file, with those of the configuration in their place."""
+    """Return the values of a linear model's file, overridden by the configuration."""
     read = _linear(model, path)
     vehicle, where = config.vehicle, f"{path}: vehicle"
     if isinstance(vehicle, str):
@@ -408,30 +402,30 @@ def _of_linear(config: Config, model: LinearConfig, path: Path, built: Model) ->
         )
     if built.Params is read.model.Params:
         return own
-    # Devices around the model have parameters of their own, which the file does not know.
+    # Devices around the model have parameters that the file does not contain.
     entries = {n: c._asdict() for n, c in own.constants.items()}
     return vehicle_from_mapping({**vehicle, **entries}, where, built.Params)
 
 
 def resolved(experiment: Experiment) -> dict[str, Any]:
-    """The configuration written out so that it runs again from anywhere.
+    """Return the complete configuration, so that it runs again from anywhere.
 
-    Paths of logs become absolute; the vehicle stands in it with units and sources.
+    Paths of logs become absolute; the vehicle is included with units and sources.
     """
     config, path = experiment.config, experiment.path
-    # Without what is None: an absent key means the same, and stays right where a default changes.
+    # Without None: a missing key means the same, and stays right if a default changes.
     content = config.model_dump(mode="json", exclude_none=True, by_alias=True)
-    # But the one key whose absence means something else.
+    # Except the one key whose absence has another meaning.
     if config.rls is None:
         content["rls"] = None
-    # A shipped model keeps its name, which means the same on any vehicle.
+    # A shipped model keeps its name, which is valid on any computer.
     if isinstance(config.model, LinearConfig) and not is_shipped(config.model.linear):
         content["model"] = {"linear": str((path.parent / config.model.linear).resolve())}
     for free in content.get("fit", {}).get("free", {}).values():
         if math.isnan(free["start"]):  # left out, and YAML's .nan is refused
             del free["start"]
     for flight in content.get("flights", []):
-        # With links resolved too: the run's config.yaml is read from its own directory.
+        # Links are resolved too, because the run's config.yaml is read from its own directory.
         for log in (flight, *flight["also"]):
             log["log"] = str((path.parent / log["log"]).resolve())
         if "corrections" in flight:
@@ -439,7 +433,7 @@ def resolved(experiment: Experiment) -> dict[str, Any]:
     for design in _designs(content.get("sweep")):
         if "file" in design:
             design["file"] = str((path.parent / design["file"]).resolve())
-    # As read, not as converted: a reader of the copy sees the number and the unit of the source.
+    # As read, not as converted: a reader of the copy sees the number and unit of the source.
     content["vehicle"] = {
         name: {"value": c.value, "unit": c.unit, "source": c.source}
         for name, c in experiment.vehicle.constants.items()
@@ -448,7 +442,7 @@ def resolved(experiment: Experiment) -> dict[str, Any]:
 
 
 def _designs(design: dict[str, Any] | None) -> Iterator[dict[str, Any]]:
-    """A design's section and those in it."""
+    """Yield a design's section and those in it."""
     if design is not None:
         yield design
         for part in design.get("of", []):
@@ -456,7 +450,7 @@ def _designs(design: dict[str, Any] | None) -> Iterator[dict[str, Any]]:
 
 
 def _in_si(config: Config, model: Model, path: Path) -> Config:
-    """The configuration with plain numbers in SI for the initial state and the disturbance."""
+    """Return the configuration with the initial state and the disturbance in SI."""
     changes: dict[str, Any] = {}
     if config.initial_state:
         changes["initial_state"] = _initial_state(config, model, path)
@@ -467,7 +461,7 @@ def _in_si(config: Config, model: Model, path: Path) -> Config:
             params = with_disturbance(model, disturbance.names, disturbance.poles).Params
         converted = {}
         for key in ("sigma_w", "tau_w"):
-            # The units are those that the disturbed model gives to its parameters.
+            # The disturbed model defines the units of its parameters.
             of_key = {n: _si(n, params) for n in disturbance.parameters if n.startswith(key)}
             converted[key] = _converted(getattr(disturbance, key), key, of_key, where)
         changes["disturbance"] = disturbance.model_copy(update=converted)
@@ -475,7 +469,7 @@ def _in_si(config: Config, model: Model, path: Path) -> Config:
 
 
 def _initial_state(config: Config, model: Model, path: Path) -> dict[str, float]:
-    """The configuration's initial state [SI]."""
+    """Return the configuration's initial state [SI]."""
     where, states = f"{path}: initial_state", naming.names(model.State)
     require_known(config.initial_state, states, where, f"model {model.name} has no state")
     return {
@@ -488,15 +482,15 @@ def _si(name: str, record: type) -> str | None:
     return naming.unit(record, name)
 
 
-# Any: None, a number, {value, unit}, or one of these for each of several disturbances by name.
+# Any: None, a number, {value, unit}, or one of these by name for several disturbances.
 def _converted(value: Any, key: str, si: Mapping[str, str | None], where: str) -> Any:
-    """A disturbance's sizes or time constants, in the shape in which they stand in the file."""
+    """Return a disturbance's sizes or time constants [SI], in the form of the file."""
     if isinstance(value, Mapping) and "value" not in value:
         return {
             n: _one(v, f"{key}.{n}", si.get(f"{key}_{n}", si.get(key)), where)
             for n, v in value.items()
         }
-    # One number for several may only be a time constant, whose unit is that of all.
+    # One number for several disturbances can only be a time constant; they share its unit.
     return None if value is None else _one(value, key, next(iter(si.values())), where)
 
 

@@ -1,4 +1,4 @@
-"""Outputs of a model that follow an input within a sample, as an acceleration does the stick."""
+"""Outputs of a model that follow an input within a sample, such as an acceleration."""
 
 from collections.abc import Mapping
 
@@ -12,23 +12,27 @@ from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.flights.flight import Signal
 
 _AT_ONCE = 0.1
-"""of the largest answer to a step within a second: an output that jumps by less does not jump"""
+"""Smallest immediate step response of an output that jumps, relative to its largest within a
+second."""
 _WITHIN = 0.5
-"""likewise, of what it does within a sample"""
+"""Smallest step response after one sample of an output that follows, likewise."""
 _HORIZON = 1.0
-"""s"""
+"""Length of the step response [s]."""
 _MOST_STEPS = 200
 
 
 def follows(
     experiment: Experiment, rate: float | None, inputs: Mapping[str, Signal]
 ) -> Mapping[tuple[str, str], bool]:
-    """The inputs that an output follows within a sample, and whether at the very sample.
+    """Return the pairs of input and output that follow within a sample.
 
-    By the linearisation with the free parameters at their starts.
+    The value is True if the output jumps at the same sample. The model is linearised with the free
+    parameters at their starts.
 
     Args:
-        rate: to which a log is resampled [Hz]; None where it is not, and nobody has to know.
+        experiment: the configuration.
+        rate: rate to which a log is resampled [Hz]; None without resampling, which needs no pairs.
+        inputs: inputs of the log.
     """
     model = experiment.model
     if rate is None or all(s.hold == "linear" for s in inputs.values()):
@@ -41,7 +45,7 @@ def follows(
     if not np.isfinite(both).all():
         return {}
     step = scipy.linalg.expm(both)
-    # Columns: the state from rest, a while after each input has made a unit step.
+    # Columns: the step response of the state to each input, from rest.
     x, after = np.zeros((n, m)), [np.abs(D)]
     for _ in range(min(int(np.ceil(_HORIZON * rate)), _MOST_STEPS)):
         x = step[:n, :n] @ x + step[:n, n:]
@@ -59,14 +63,14 @@ def follows(
 
 
 def _params(experiment: Experiment) -> naming.Record:
-    """The vehicle with the free parameters at their starts, and at one where none is known."""
+    """Return the vehicle with the free parameters at their starts, or at one if unknown."""
     params, fit = experiment.vehicle.params, experiment.config.fit
     known = naming.asdict(params)
     starts = {}
     for name, free in ({} if fit is None else fit.free).items():
         if name in known:
             here = [float(v) for v in (free.start, np.asarray(known[name]))]
-            # A coefficient that a fit begins at zero is one all the same.
+            # A coefficient with start zero counts as one.
             value = next((v for v in here if np.isfinite(v) and v != 0.0), 1.0)
             starts[name] = jnp.asarray(value, jnp.result_type(float))
     return naming.replace(params, **starts)

@@ -1,9 +1,10 @@
-"""Filters of a log's signals before they were logged, by the settings in the log.
+"""Filters of signals before they were logged, from the settings in the log.
 
 PX4 filters `vehicle_angular_velocity` and `vehicle_acceleration` (VehicleAngularVelocity.cpp,
-VehicleAcceleration.cpp), ArduPilot the gyros and accelerometers of all its messages but the raw
-ones (AP_InertialSensor_Backend.cpp), Betaflight and Rotorflight `gyroADC` (gyro_init.c). Angles and
-velocities are estimated by Kalman filters and the like, of which no setting says what they did.
+VehicleAcceleration.cpp). ArduPilot filters the gyros and accelerometers of all messages except the
+raw ones (AP_InertialSensor_Backend.cpp). Betaflight and Rotorflight filter `gyroADC` (gyro_init.c).
+Angles and velocities come from Kalman filters and similar estimators, whose effect no setting
+describes.
 """
 
 import re
@@ -19,11 +20,12 @@ class LoggedFilters(NamedTuple):
     """Filters of a signal, as far as the settings state them."""
 
     filters: tuple[Filter, ...]
-    """those with fixed constants"""
+    """Filters with fixed constants."""
     settings: tuple[str, ...]
-    """that say so, as `NAME = value`"""
+    """Settings that state them, as `NAME = value`."""
     unknown: tuple[str, ...]
-    """settings of filters that move in flight, which no constants describe, or of unknown kind"""
+    """Settings of filters that move in flight or are of unknown kind, which no constants describe.
+    """
 
 
 def logged_filters(firmware: str, settings: Settings, channel: str) -> LoggedFilters | None:
@@ -35,7 +37,7 @@ def logged_filters(firmware: str, settings: Settings, channel: str) -> LoggedFil
 
 
 class _Reading:
-    """Settings as they are read, with what has been used."""
+    """Settings of a log, and the filters collected from them."""
 
     def __init__(self, firmware: str, settings: Settings) -> None:
         self.firmware, self.settings = firmware, settings
@@ -44,35 +46,35 @@ class _Reading:
         self.unknown: list[str] = []
 
     def numbers(self, name: str) -> list[float]:
-        """The numbers of a setting; none where it is not there or holds something else."""
+        """Return the numbers of a setting; empty if it is absent or holds something else."""
         try:
             return [float(part) for part in str(self.settings[name]).split(",")]
         except (KeyError, ValueError):
             return []
 
     def number(self, name: str) -> float:
-        """The number of a setting; zero, which switches a filter off, where there is none."""
+        """Return the number of a setting; zero, which switches a filter off, if absent."""
         return next(iter(self.numbers(name)), 0.0)
 
     def add(self, name: str, *filters: Filter) -> None:
-        """Filters that a setting states."""
+        """Add filters that a setting states."""
         self.filters += filters
         self.used.append(f"{name} = {self.settings[name]}")
 
     def moving(self, *names: str) -> None:
-        """Filters that follow the flight, where a setting of these is not zero."""
+        """Note settings of filters that follow the flight, if they are not zero."""
         self.unknown += [f"{n} = {self.settings[n]}" for n in names if any(self.numbers(n))]
 
     @property
     def result(self) -> LoggedFilters:
-        """All of it."""
+        """All filters so far."""
         return LoggedFilters(tuple(self.filters), tuple(self.used), tuple(self.unknown))
 
 
 def _px4_gyro(read: _Reading) -> LoggedFilters | None:
     if "IMU_GYRO_CUTOFF" not in read.settings:
         return None
-    # NF_FREQ was the one static notch before version 1.12, NF0 and NF1 the two since.
+    # NF_FREQ was the only static notch before version 1.12; NF0 and NF1 replaced it.
     for stem in ("IMU_GYRO_NF_", "IMU_GYRO_NF0_", "IMU_GYRO_NF1_"):
         name = f"{stem}FREQ" if stem.endswith("NF_") else f"{stem}FRQ"
         hz, width = read.number(name), read.number(f"{stem}BW")
@@ -89,7 +91,7 @@ def _biquad(read: _Reading, name: str) -> None:
 
 
 def _accel(name: str) -> Callable[[_Reading], LoggedFilters | None]:
-    """The reader of a channel that has one low-pass."""
+    """Return the reader of a channel with one low-pass."""
 
     def read(reading: _Reading) -> LoggedFilters | None:
         if name not in reading.settings:
@@ -103,27 +105,27 @@ def _accel(name: str) -> Callable[[_Reading], LoggedFilters | None]:
 def _ardupilot_gyro(read: _Reading) -> LoggedFilters | None:
     if "INS_GYRO_FILTER" not in read.settings:
         return None
-    # The static notch of version 3.x and 4.0.
+    # The static notch of versions 3.x and 4.0.
     hz, width = read.number("INS_NOTCH_FREQ"), read.number("INS_NOTCH_BW")
     if read.number("INS_NOTCH_ENABLE") and hz > width / 2 > 0:
         attenuation = read.number("INS_NOTCH_ATT") or 40.0
         notch = Filter("notch", hz, _octave_q(hz, hz - width / 2), attenuation)
         read.add("INS_NOTCH_FREQ", notch)
-    # The harmonic notches follow the rotor, its throttle or a spectrum, in most of their modes.
+    # Harmonic notches follow the rotor, its throttle or a spectrum in most of their modes.
     read.moving("INS_HNTCH_ENABLE", "INS_HNTC2_ENABLE")
     _biquad(read, "INS_GYRO_FILTER")
     return read.result
 
 
 def _octave_q(centre: float, edge: float) -> float:
-    """Q of a notch from its centre and lower edge [Hz] (filterGetNotchQ; NotchFilter.cpp)."""
+    """Return the Q of a notch from its centre and lower edge [Hz] (filterGetNotchQ)."""
     return centre * edge / (centre**2 - edge**2)
 
 
 def _blackbox_gyro(read: _Reading) -> LoggedFilters | None:
     rotorflight = read.firmware.startswith("Rotorflight")
     types = _ROTORFLIGHT if rotorflight else _BETAFLIGHT
-    # Before version 4.3 of Betaflight: gyro_lowpass_hz and its like.
+    # Before version 4.3, Betaflight used gyro_lowpass_hz and similar names.
     stages = [
         stage
         for stage in (
@@ -140,7 +142,7 @@ def _blackbox_gyro(read: _Reading) -> LoggedFilters | None:
         _decimation(read)
     for type_name, name, moving in stages:
         hz, kind = read.number(name), next(iter(read.numbers(type_name)), -1.0)
-        if rotorflight and kind == 0:  # none; in Betaflight a lag
+        if rotorflight and kind == 0:  # none in Rotorflight, a lag in Betaflight
             continue
         if _moves(read.numbers(moving), hz, rotorflight):
             read.moving(moving)
@@ -159,7 +161,7 @@ def _blackbox_gyro(read: _Reading) -> LoggedFilters | None:
 
 
 def _rotorflight_raw(read: _Reading) -> LoggedFilters | None:
-    """Return the filters of `gyroRAW`, which is taken behind the decimation."""
+    """Return the filters of `gyroRAW`, which is logged after the decimation."""
     if "gyro_decimation_hz" not in read.settings:
         return None
     _decimation(read)
@@ -167,7 +169,7 @@ def _rotorflight_raw(read: _Reading) -> LoggedFilters | None:
 
 
 def _decimation(read: _Reading) -> None:
-    # The sensor's samples are brought to the loop's rate behind a Bessel filter of fourth order.
+    # A fourth-order Bessel filter precedes the decimation to the loop's rate.
     hz = read.number("gyro_decimation_hz")
     if hz > 0:
         first = Filter("biquad", 1.603357516 * hz, 0.805538282)
@@ -175,8 +177,11 @@ def _decimation(read: _Reading) -> None:
 
 
 def _moves(limits: list[float], hz: float, rotorflight: bool) -> bool:
-    """True if a low-pass follows throttle or headspeed: by its lower limit in Betaflight; in
-    Rotorflight the fixed frequency lies between the two limits as well."""
+    """True if a low-pass follows throttle or headspeed.
+
+    In Betaflight the limits decide it; in Rotorflight the fixed frequency is also between the two
+    limits.
+    """
     if len(limits) != 2 or not limits[0] > 0:
         return False
     return limits[0] <= hz <= limits[1] if rotorflight else limits[1] > limits[0]
@@ -189,14 +194,14 @@ def _pt(kind: Literal["pt1", "pt2", "pt3"]) -> Callable[[float], Filter]:
     return lambda hz: Filter(kind, hz)
 
 
-# In the order of the enumerations in their filter.h. Rotorflight 4.6 has PT4 in between, which
-# moves the last four; its types from 6 on are therefore not read.
+# In the order of the enumerations in their filter.h. Rotorflight 4.6 inserts PT4, which moves the
+# last four, so its types from 6 on are not read.
 _BETAFLIGHT: _Kinds = {
     0: _pt("pt1"), 1: lambda hz: Filter("biquad", hz), 2: _pt("pt2"), 3: _pt("pt3"),
 }  # fmt: skip
 _ROTORFLIGHT: _Kinds = {
     1: _pt("pt1"), 3: _pt("pt1"), 4: _pt("pt2"), 5: _pt("pt3"),
-    2: lambda hz: Filter("biquad", 1.272019649 * hz, 0.577350269),  # Bessel's
+    2: lambda hz: Filter("biquad", 1.272019649 * hz, 0.577350269),  # Bessel
 }  # fmt: skip
 
 _CHANNELS: tuple[tuple[str, Callable[[_Reading], LoggedFilters | None]], ...] = (

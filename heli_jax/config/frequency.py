@@ -13,8 +13,7 @@ from heli_jax.finding import Finding, note
 def asked_handling(
     experiment: Experiment, logged: Collection[str] = ()
 ) -> tuple[HandlingPair, ...]:
-    """Responses whose handling qualities are shown: those that the configuration names, or else
-    those of the model's axes.
+    """Return the responses for handling qualities: those configured, or those of the model's axes.
 
     Raises:
         InputError: the model has no such input or output, or the output is no angle and no rate.
@@ -58,13 +57,15 @@ def missing_handling(experiment: Experiment, logged: Collection[str]) -> tuple[F
 def check_pairs(
     experiment: Experiment, section: str, pairs: Sequence[TransferConfig | HandlingConfig]
 ) -> None:
-    """Refuse pairs of input and output that the model has not.
+    """Refuse pairs of input and output that the model lacks.
 
     Args:
-        section: of `frequency` that they stand in.
+        experiment: the configuration.
+        section: their section of `frequency`.
+        pairs: the pairs.
 
     Raises:
-        InputError: one of them.
+        InputError: one of them is unknown.
     """
     for i, pair in enumerate(pairs):
         for role, record in (
@@ -77,7 +78,7 @@ def check_pairs(
 
 
 def units_of(experiment: Experiment) -> dict[str, str]:
-    """SI units of the model's inputs and outputs, by name; 1 where it states none."""
+    """Return SI units of the model's inputs and outputs, by name; 1 if it states none."""
     model = experiment.model
     records = (model.Inputs, model.Outputs)
     return {n: naming.unit(r, n) or "1" for r in records for n in naming.names(r)}

@@ -20,22 +20,22 @@ _Band = Annotated[tuple[_Positive, _Positive], AfterValidator(_increasing)]
 
 
 class TransferConfig(Section):
-    """A transfer function to be fitted to one response."""
+    """A transfer function to fit to one response."""
 
     input: str
-    """the model's name"""
+    """name of the model's input"""
     output: str
-    """the model's name"""
+    """name of the model's output"""
     zeros: Annotated[int, Field(ge=0, le=8)] = 0
-    """number of the transfer function's roots"""
+    """number of zeros"""
     poles: Annotated[int, Field(ge=1, le=8)]
-    """number of the transfer function's roots"""
+    """number of poles"""
     delay: bool = True
     """true: with a delay"""
     band: _Band | None = None
-    """[Hz]; all frequencies unless given"""
+    """band [Hz]; default all frequencies"""
     coherence: _Coherence = 0.6
-    """frequencies of less are left out"""
+    """least coherence of the frequencies used"""
 
     @model_validator(mode="after")
     def _proper(self) -> "TransferConfig":
@@ -47,23 +47,23 @@ class TransferConfig(Section):
 
 
 class PairConfig(Section):
-    """A response that is to be fitted."""
+    """A response to fit."""
 
     input: str
-    """the model's name"""
+    """name of the model's input"""
     output: str
-    """the model's name"""
+    """name of the model's output"""
     band: _Band | None = None
-    """[Hz]; that of all unless given"""
+    """band [Hz]; default the common one"""
     coherence: _Coherence | None = None
-    """likewise"""
+    """least coherence; default the common one"""
 
 
 class HandlingConfig(Section):
-    """A response that handling qualities are read off."""
+    """A response for handling qualities."""
 
     input: str
-    """the model's name"""
+    """name of the model's input"""
     output: str
     """an angle, or a rate [rad/s], whose response is integrated"""
     response: Literal["rate", "attitude-command", "open-loop"] = "rate"
@@ -84,18 +84,18 @@ class FrequencyConfig(Section):
     """Frequencies, and the length of the windows."""
 
     band: _Band | None = None
-    """first and last frequency [Hz]; unless given two periods in a window to 0.4 of the rate"""
+    """first and last frequency [Hz]; default two periods in a window to 0.4 of the rate"""
     window: _Positive | None = None
-    """length [s]; unless given a fifth of the longest flight, 30 s at most"""
+    """length of a window [s]; default a fifth of the longest flight, at most 30 s"""
     points: Annotated[int, Field(ge=8, le=2000)] | None = None
-    """frequencies, equally spaced in the logarithm; 120 unless given, and for fit.method:
-    frequency-response all that are independent"""
+    """number of frequencies, equally spaced in the logarithm; default 120, and for fit.method:
+    frequency-response all independent ones"""
     coherence: _Coherence = 0.0
-    """least partial coherence of fit.method: frequency-response, in the mean over an octave"""
+    """least partial coherence for fit.method: frequency-response, as the mean over an octave"""
     pairs: Annotated[list[PairConfig], Field(min_length=1)] | None = None
-    """responses that are fitted; all unless given"""
+    """responses to fit; default all"""
     transfer_functions: list[TransferConfig] = []
-    """fitted to the responses of the logs, by `heli-jax frf`"""
+    """transfer functions that `heli-jax frf` fits to the responses of the logs"""
     handling: list[HandlingConfig] | None = None
-    """responses whose handling qualities are shown; unless given those of roll, pitch and yaw to
-    their sticks; [] for none"""
+    """responses whose handling qualities are shown; default those of roll, pitch and yaw to their
+    sticks; [] for none"""

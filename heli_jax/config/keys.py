@@ -1,4 +1,4 @@
-"""The keys of a configuration, from the classes that check them: for editors and readers."""
+"""Keys of a configuration, from the classes that check them: for editors and readers."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from heli_jax.config.schema import Config
 
 _URL = "https://json-schema.org/draft/2020-12/schema"
-# Of a mapping the name is the user's: of a signal, a parameter, a state.
+# In a mapping the name is the user's: of a signal, a parameter or a state.
 _NAME = "NAME"
 _MOST_CHOICES = 20
 
@@ -15,38 +15,37 @@ class Key(NamedTuple):
     """One key of a configuration."""
 
     path: str
-    """in full: `flights[].signals.inputs.NAME.unit`"""
+    """Full path: `flights[].signals.inputs.NAME.unit`."""
     kind: str
-    """what may stand there, in words"""
+    """Allowed values, in words."""
     default: str | None
-    """as it would stand in the file; None where the key has to be there"""
+    """Default as in the file; None for a required key."""
     meaning: str
-    """empty where the name says it all"""
+    """Meaning; empty if the name is enough."""
 
 
 def json_schema() -> dict[str, Any]:
-    """The JSON schema of a configuration, by which editors complete and check YAML."""
+    """Return the JSON schema of a configuration, by which editors complete and check YAML."""
     schema = _plain(Config.model_json_schema())
     return {"$schema": _URL, **schema, "title": "heli_jax configuration"}
 
 
 def keys() -> list[Key]:
-    """All keys, sections before what stands in them."""
+    """Return all keys, sections before their content."""
     schema = json_schema()
     return list(_walk(schema, schema, "", ()))
 
 
 def matching(pattern: str) -> list[Key]:
-    """The keys whose path holds a text, in any case; else those whose meaning does."""
+    """Return the keys whose path contains a text, ignoring case; else those whose meaning does."""
     text, every = pattern.strip().lower(), keys()
     by_path = [k for k in every if text in k.path.lower()]
-    # A word of the meaning finds a key whose name the reader does not know.
+    # The meaning is searched for readers who do not know the name of a key.
     return by_path or [k for k in every if text in k.meaning.lower()]
 
 
 def expected(place: Sequence[str | int]) -> str:
-    """Return the values that are allowed at a place of a configuration: `number or list of
-    number`."""
+    """Return the allowed values at a place of a configuration: `number or list of number`."""
     schema = json_schema()
     at: Any = schema
     for part in place:
@@ -72,7 +71,8 @@ def _walk(
         default = None if name in required else _written(field.get("default"))
         yield Key(place, _kind(schema, field), default, field.get("description", ""))
         for part, suffix in _within(schema, field):
-            # A section may stand within itself, as an axis in a list of axes: told once.
+            # A section may be nested in itself, such as an axis in a list of axes; it is listed
+            # once.
             title = part.get("title", "")
             if title not in above:
                 yield from _walk(schema, part, place + suffix, (*above, title))
@@ -81,12 +81,12 @@ def _walk(
 def _within(
     schema: Mapping[str, Any], field: Mapping[str, Any]
 ) -> Iterator[tuple[Mapping[str, Any], str]]:
-    """The sections within a field, and what stands between its path and their keys."""
+    """Yield the sections within a field, and the text between its path and their keys."""
     seen: set[str] = set()
     for option in _options(field):
         if "$ref" in option:
             name = option["$ref"].rsplit("/", 1)[1]
-            # A field may take one section or a list of it, whose keys are the same.
+            # A field may take one section or a list of it, with the same keys.
             if name not in seen:
                 seen.add(name)
                 yield schema["$defs"][name], ""
@@ -105,7 +105,7 @@ def _options(field: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 def _kind(schema: Mapping[str, Any], field: Mapping[str, Any]) -> str:
     words = (_one_kind(schema, option) for option in _options(field))
-    # Null is a default that can be written, and says nothing of what else can.
+    # Null is a valid default, but does not describe the other values.
     return " or ".join(dict.fromkeys(w for w in words if w != "null")) or "null"
 
 
@@ -158,8 +158,7 @@ def _written(default: Any) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """The schema without NaN, of which JSON knows nothing: such a default is none; each description
-    in one line."""
+    """Return the schema without NaN defaults, which JSON lacks; each description on one line."""
     if isinstance(value, dict):
         return {k: _plain(v) for k, v in value.items() if not (k == "default" and v != v)}
     if isinstance(value, str):

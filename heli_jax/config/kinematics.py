@@ -38,21 +38,22 @@ SIZES = {
     "wind_e": 10.0,
     "wind_d": 3.0,
 }
-"""how large an error may well be, SI: the sd of its prior, and the unit of the search. A record
-that says no more than this does not determine the error"""
+"""Typical size of each error [SI]: the sd of its prior, and the unit of the search. A record
+without more information does not determine the error."""
 
 NOISES = {"noise_gyro": RATES, "noise_accel": FORCES}
-"""of what is integrated, by the model's parameter"""
+"""Inputs whose noise is integrated, by the model's parameter."""
 
 
 def errors_of(model: Model, outputs: Iterable[str]) -> dict[str, Free]:
-    """The errors that a log's signals allow to be free, each from zero with a prior of its size.
+    """Return the errors that can be free with a log's signals, each from zero with its prior.
 
     Args:
-        model: of `heli_jax.dynamics.kinematics`.
+        model: from `heli_jax.dynamics.kinematics`.
+        outputs: the log's outputs.
     """
     measured = set(outputs)
-    # An airspeed alone is the only velocity there is: a steady wind is then no part of the motion.
+    # If airspeed is the only velocity, a steady wind has no effect on the motion.
     windy = "V" in measured and bool(measured & {*GROUND, *POSITION})
     known = set(naming.names(model.Params))
     return {
@@ -63,8 +64,9 @@ def errors_of(model: Model, outputs: Iterable[str]) -> dict[str, Free]:
 
 
 def completed(content: dict[str, Any], where: str) -> dict[str, Any]:
-    """A configuration's content with what `model: kinematics` leaves out filled in: the model that
-    its signals allow, all errors free, no bias beside them.
+    """Fill in a configuration's content for `model: kinematics`.
+
+    The defaults are the model for its signals, all errors free, and no bias besides them.
 
     Raises:
         InputError: accelerometers without a velocity to compare them with, or the reverse.
@@ -76,27 +78,28 @@ def completed(content: dict[str, Any], where: str) -> dict[str, Any]:
         model = kinematics(inputs, outputs)
     fit = content.get("fit") or {}
     if not isinstance(fit, dict) or not isinstance(fit.get("nuisance", {}), dict):
-        return content  # the validation says what is wrong with it
+        return content  # the validation reports the error
     vehicle = content.get("vehicle")
     given = {str(n) for n in vehicle} if isinstance(vehicle, dict) else set()
     free = {
         n: {"start": f.start, "prior": {"mean": f.prior.mean, "sd": f.prior.sd}}
         for n, f in errors_of(model, outputs).items()
-        # Who gives a value knows the error: it is not searched for.
+        # A stated value means that the error is known, so it is not free.
         if f.prior is not None and n not in given
     }
-    # A bias of the outputs or an offset of the inputs would be a second name of the same error, and
-    # one delay among so many needs no search over its valleys.
+    # A bias of the outputs or an offset of the inputs would duplicate an error. One delay among so
+    # many errors needs no search over its local minima.
     nuisance = {"bias": False, "input_offset": False, **fit.get("nuisance", {})}
-    # Gyros are inputs, and their noise is integrated: a filter knows that, a simulation does not.
+    # Gyros are inputs, and their noise is integrated; a filter models that, a simulation does not.
     fit = {"method": "filter-error", "free": free, "starts": 1, **fit, "nuisance": nuisance}
-    # No baseline: recursive least squares takes one output of one stick.
+    # No baseline, because recursive least squares takes one output of one stick.
     return {"vehicle": {}, "rls": None, **content, "model": model.name, "fit": fit}
 
 
 def between_samples(model: Model, inputs: Mapping[str, Signal]) -> dict[str, Signal]:
-    """The inputs of a kinematic model, moving between samples where the configuration says nothing
-    of it: a rate is measured, nobody commands it in steps.
+    """Return the inputs of a kinematic model, linear between samples by default.
+
+    A rate is measured, not commanded in steps.
     """
     if not is_kinematic(model):
         return dict(inputs)
@@ -107,8 +110,10 @@ def between_samples(model: Model, inputs: Mapping[str, Signal]) -> dict[str, Sig
 
 
 def _names(content: dict[str, Any], role: str) -> set[str]:
-    """The inputs or outputs that any flight names; none where the configuration is malformed, which
-    its validation says."""
+    """Return the inputs or outputs that any flight names.
+
+    It is empty if the configuration is malformed, which its validation reports.
+    """
     names: set[str] = set()
     flights = content.get("flights")
     for flight in flights if isinstance(flights, list) else []:
@@ -120,8 +125,7 @@ def _names(content: dict[str, Any], role: str) -> set[str]:
 
 
 def _named(signals: dict[str, Any], role: str) -> set[str]:
-    """Return the named signals of one log; a preset supplies all inputs that the outputs asked of
-    it need."""
+    """Return the named signals of one log, with all inputs that its preset's outputs need."""
     named, asked = signals.get(role), signals.get("preset_outputs")
     names = {str(n) for n in named} if isinstance(named, dict) else set()
     asked = {str(n) for n in asked} if isinstance(asked, list) else set()
@@ -131,20 +135,22 @@ def _named(signals: dict[str, Any], role: str) -> set[str]:
 
 
 _STRAIGHT_UP = 1.6
-"""rad"""
+"""Pitch angle beyond which the unit is wrong [rad]."""
 _FASTEST = 75.0
-"""rad/s; gyros go to 2000 deg/s, a few to 4000"""
+"""Fastest rate [rad/s]; gyros go to 2000 deg/s, a few to 4000."""
 
 
 def prepared(model: Model, flight: Flight, where: str) -> Flight:
-    """A flight for a kinematic model: roll and yaw without jumps of a turn.
+    """Return a flight for a kinematic model, with roll and yaw unwrapped.
 
     Args:
-        model: any; the flight of another than a kinematic one stays as it is.
+        model: any model; only a kinematic one changes the flight.
+        flight: the flight.
+        where: place in the configuration, for messages.
 
     Raises:
-        InputError: the vehicle points so steeply up or down that its angles mean nothing, turns
-            faster than gyros measure, or a channel never moves.
+        InputError: the vehicle's pitch is too steep for Euler angles, it turns faster than gyros
+            measure, or a channel never moves.
     """
     if not is_kinematic(model):
         return flight
@@ -159,7 +165,7 @@ def prepared(model: Model, flight: Flight, where: str) -> Flight:
         )
     _check_rates(flight, where)
     _check_moving(flight, where)
-    # The kinematics turn on where a log begins again at -180 deg.
+    # The kinematics continue past -180 deg, where a log wraps.
     turned = {n: _unwrapped(y) for n, y in flight.outputs.items() if n in ANGLES}
     if all(np.array_equal(y, flight.outputs[n], equal_nan=True) for n, y in turned.items()):
         return flight
@@ -182,7 +188,7 @@ def _check_moving(flight: Flight, where: str) -> None:
     stated = {n for n, u in signals.items() if u.constant is not None}
     for n, x in {**flight.inputs, **flight.outputs}.items():
         seen = x[np.isfinite(x)]
-        # Fitted to a channel that stands still, every scale of the others would run away.
+        # In a fit to a constant channel, the scales of the others would diverge.
         if n not in stated and seen.size and np.ptp(seen) == 0.0:
             raise InputError(
                 f"{where}: {n} is {seen[0]:g} in all samples, expected a signal that moves: "
@@ -191,66 +197,72 @@ def _check_moving(flight: Flight, where: str) -> None:
 
 
 def _unwrapped(angle: np.ndarray) -> np.ndarray:
-    """Without jumps of a turn (N,) [rad]; samples that are missing stay so."""
+    """Unwrap an angle (N,) [rad]; missing samples stay missing."""
     out, seen = angle.copy(), np.isfinite(angle)
     out[seen] = np.unwrap(angle[seen])
     return out
 
 
 def noise_of(model: Model, flights: Sequence[Flight]) -> dict[str, float]:
-    """Return the drift of angles and velocities in a second by the noise of gyros and
-    accelerometers, by the model's parameter, from the third differences of the logged signals.
+    """Return the drift of angles and velocities in a second from sensor noise, by parameter.
+
+    It comes from the third differences of the logged gyro and accelerometer signals.
 
     Args:
-        model: of `heli_jax.dynamics.kinematics`.
+        model: from `heli_jax.dynamics.kinematics`.
+        flights: the flights.
     """
     known, noise = naming.names(model.Params), {}
     for parameter, names in NOISES.items():
         if parameter in known:
             # White noise of sd s in every sample adds s dt to an angle: s sqrt(dt) in a second.
-            # Imported here: a second, of which models without sensors' errors have no need.
+            # Imported here, because it takes a second that other models do not need.
             from heli_jax.numerics.white_noise import noise_guess
 
             walks = [noise_guess(f.inputs[n]) * f.dt**0.5 for f in flights for n in names]
-            # One intensity for three axes, as the model has it: their rms.
+            # The model has one intensity for three axes: their rms.
             noise[parameter] = float(np.sqrt(np.mean(np.square(walks))))
     return noise
 
 
 _FAINTEST = 1e-6
-"""of a drift in a second, SI: below what any log shows, and above zero, which has no logarithm"""
+"""Smallest drift in a second [SI]: below the resolution of any log, and above zero for the
+logarithm."""
 
 
 def free_noise(model: Model, params: Record, flights: Sequence[Flight]) -> dict[str, Free]:
-    """The noise of a kinematic model's inputs as parameters to be estimated, where nobody stated
-    it: third differences are where the search begins, but a filter before the log takes all noise
-    out of them, and none of what gyros and angles differ by otherwise is in them.
+    """Return the input noise of a kinematic model as free parameters, unless stated.
+
+    The start is from third differences. It is not the result, because a filter before the log
+    removes that noise, and other differences between gyros and angles are not in it.
 
     Args:
-        model: any; none of another than a kinematic one.
+        model: any model; empty unless it is kinematic.
+        params: its parameters.
+        flights: the flights.
     """
     if not is_kinematic(model):
         return {}
-    # Zero is the default and no statement: no gyro is without noise.
+    # Zero is the default, not a statement: no gyro is without noise.
     missing = {n: v for n, v in noise_of(model, flights).items() if not getattr(params, n) > 0}
     return {n: Free(max(v, _FAINTEST), sign="keep") for n, v in missing.items()}
 
 
 def sharpened(model: Model, flight: Flight) -> Flight:
-    r"""The flight with rates and forces whose straight lines between samples have the area of the
-    motion.
+    r"""Correct rates and forces so that lines between samples have the integral of the motion.
 
-    Lines cut corners: of a motion at omega they keep 1 - (omega dt)^2 / 12 of the area, which a fit
-    would take for the sensor's scale. Each sample less a twelfth of its second difference brings
-    it back, but for (omega dt)^4 / 240; of white noise in the samples it changes the drift by what
-    the first and the last add (Euler and Maclaurin's correction of the trapezoidal rule).
+    Lines cut corners. Of a motion at omega they keep 1 - (omega dt)^2 / 12 of the integral, which a
+    fit would attribute to the sensor's scale. Each sample minus a twelfth of its second difference
+    restores it up to (omega dt)^4 / 240. With white noise in the samples, only the first and the
+    last sample change the drift (Euler and Maclaurin's correction of the trapezoidal rule).
 
     Args:
-        model: any; the flight of another than a kinematic one stays as it is.
+        model: any model; only a kinematic one changes the flight.
+        flight: the flight.
     """
     if not is_kinematic(model):
         return flight
-    # Second differences, at the ends those of their neighbours.
+    # Second differences; the ends copy those of their neighbours.
     inputs = {
         n: u - np.pad(np.diff(u, 2), 1, mode="edge") / 12.0
         if flight.hold.get(n) == "linear" and u.size > 2
@@ -261,16 +273,18 @@ def sharpened(model: Model, flight: Flight) -> Flight:
 
 
 _STEP, _EXPLICIT = 0.005, 0.02
-"""s; a local linearisation holds the derivatives of the kinematics as they are at a step's begin,
-and misses r' theta' h^2/3 of a rate: at 20 ms as much as the noise of a gyro leaves unknown of its
-bias. Explicit steps follow them to the fourth order"""
+"""Longest steps of integration [s], for local linearisation and for explicit methods. Local
+linearisation keeps the derivatives at the start of a step and misses r' theta' h^2/3 of a rate. At
+20 ms that equals the uncertainty of a gyro's bias from its noise. Explicit steps are of fourth
+order."""
 
 
 def substeps_of(model: Model, flights: Sequence[Flight]) -> int:
-    """Steps in a sample for a kinematic model, which has no fast dynamics of its own.
+    """Return the steps per sample for a kinematic model, which has no fast dynamics of its own.
 
     Args:
-        model: of `heli_jax.dynamics.kinematics`, bare or with devices around it.
+        model: from `heli_jax.dynamics.kinematics`, bare or with devices around it.
+        flights: the flights.
     """
     step = _EXPLICIT if model.explicit else _STEP
     return max(1, *(math.ceil(f.dt / step - 1e-9) for f in flights))

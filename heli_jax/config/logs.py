@@ -1,4 +1,4 @@
-"""The flights that a configuration names."""
+"""The flights of a configuration."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -40,7 +40,7 @@ from heli_jax.flights.request import taken_note
 from heli_jax.identification.methods import objective_of
 
 _PULSE = (800.0, 2200.0)
-"""us; what receivers and servos know"""
+"""Pulse widths of receivers and servos [us]."""
 _OFFSET_AND_SCALE = "such as offset: 1500, scale: 0.002"
 
 
@@ -55,7 +55,7 @@ def require_flights(experiment: Experiment) -> None:
 
 
 def with_log(experiment: Experiment, log: str) -> Experiment:
-    """The configuration with a log in place of its own, read as its first flight's is.
+    """Return the configuration with a log in place of its own, read like its first flight.
 
     Raises:
         InputError: the configuration has no flight.
@@ -68,11 +68,12 @@ def with_log(experiment: Experiment, log: str) -> Experiment:
 
 
 def read_flights(experiment: Experiment, *, gain: bool = False) -> tuple[Flight, ...]:
-    """The flights that a configuration names, in SI.
+    """Read the flights of a configuration, in SI.
 
     Args:
-        gain: whether a plain number is allowed for an input with a unit: an estimated gain then
-            carries the unit.
+        experiment: the configuration.
+        gain: True if an input with a unit may be a plain number: an estimated gain then carries the
+            unit.
 
     Raises:
         InputError: no flights, or one that cannot be read.
@@ -89,30 +90,30 @@ def read_flights(experiment: Experiment, *, gain: bool = False) -> tuple[Flight,
 
 
 def _read_flight(experiment: Experiment, i: int, f: FlightConfig, gain: bool) -> tuple[Flight, ...]:
-    """The flight, or where a gap splits it its parts."""
+    """Read one flight, or its parts if a gap splits it."""
     model = experiment.model
     # As the path in the configuration: flights[0].known, flights[0].signals.inputs.x_roll.unit.
     where = f"{experiment.path}: flights[{i}]"
     _check(model, f, where)
     time, path = f.signals.time, experiment.path.parent / f.log
-    # Only where the log has to be asked before its signals are known: a wrong unit or a reversed
-    # window is otherwise told before minutes of reading.
+    # The log is opened here only if its content decides the signals. Otherwise a wrong unit or a
+    # reversed window is reported before minutes of reading.
     asked = f.signals.preset is not None or f.signals.ccpm is not None
     swashplate = None if f.signals.ccpm is None else f.signals.ccpm.swashplate()
     logs = experiment.logs
     opened = logs.open(path, f.flight) if asked else logs.get(path, f.flight)
     named = _resolved(experiment, f, f"{where}.signals", opened if asked else None)
-    # Of all logs together: what one lacks may stand in another.
+    # Signals of all logs together: one log may supply what another lacks.
     everything = _with_also(named, f, where)
     inputs, outputs = _of_model(model, everything, f"{where}.signals", gain)
     instruments = _instrument_signals(model, f.signals, f"{where}.signals")
-    # of `Flight`, which knows no file
+    # for errors of `Flight`, which knows no file
     with located(where):
-        # A flight as it is unless asked otherwise: parts have initial states of their own.
+        # A flight is split only on request, because each part has an initial state of its own.
         runs = (time.runs if time is not None else None) or ""
         flights = (read_parts if f.gaps == "split" or runs else read_flight)(
             path if opened is None else opened,
-            # None is passed on: whether a log needs the name of its clock is known once it is open.
+            # None is passed on: whether a log needs a clock's name is known once it is open.
             time=_clock(time),
             inputs={n: inputs[n] for n in named.inputs} | instruments,
             outputs={n: outputs[n] for n in named.outputs},
@@ -142,7 +143,7 @@ def _read_flight(experiment: Experiment, i: int, f: FlightConfig, gain: bool) ->
 
 
 def _noise_given(experiment: Experiment) -> bool:
-    """True if filter error takes the outputs' stated noise as it is."""
+    """True if filter error uses the outputs' stated noise without estimating it."""
     fit, disturbance = experiment.config.fit, experiment.config.disturbance
     if fit is None or disturbance is None or objective_of(fit.method).noise_model != "disturbance":
         return False
@@ -150,9 +151,9 @@ def _noise_given(experiment: Experiment) -> bool:
 
 
 def _check(model: Model, f: FlightConfig, where: str) -> None:
-    """Refuse what can be refused before the log is read."""
-    # A constant of one flight alone is part of the vehicle, so only a parameter can be one: a
-    # misspelt name would leave the vehicle's value in its place without a word.
+    """Refuse errors that are visible before the log is read."""
+    # A constant of one flight belongs to the vehicle, so only a parameter can be one. A misspelt
+    # name would silently keep the vehicle's value.
     known = naming.names(model.Params)
     require_known(f.known, known, f"{where}.known", f"model {model.name} has no parameter")
     if f.window == "auto" and f.hold_out:
@@ -164,15 +165,15 @@ def _check(model: Model, f: FlightConfig, where: str) -> None:
 def _treated(
     experiment: Experiment, flights: Sequence[Flight], f: FlightConfig, where: str
 ) -> tuple[Flight, ...]:
-    """The flights as they are to be fitted: what the configuration takes off its signals is off."""
+    """Return the flights for the fit, with the configured corrections applied."""
     model, corrections = experiment.model, None
     if f.corrections is not None:
         place = experiment.path.parent / f.corrections
         corrections = read_corrections(place, f"{where}.corrections")
     treated = []
     for flight in flights:
-        # Jumps of a turn before the notch, which would ring at them; delays behind it, since they
-        # leave samples without a value.
+        # Angles are unwrapped before the notch, which would ring at the jumps. Delays come after
+        # it, because they leave samples without a value.
         flight = with_notches(prepared(model, flight, where), f.notch or (), f"{where}.notch")
         if corrections is not None:
             flight = with_corrections(model, flight, corrections, where)
@@ -181,7 +182,7 @@ def _treated(
 
 
 def _with_also(named: Resolved, f: FlightConfig, where: str) -> Resolved:
-    """Return the signals with those stated of the inputs and outputs of further logs."""
+    """Return the signals with those of further logs."""
     merged: dict[str, dict[str, Any]] = {
         role: dict(getattr(named, role)) for role in ("inputs", "outputs")
     }
@@ -205,7 +206,7 @@ def _also(
     inputs: Mapping[str, Signal],
     outputs: Mapping[str, Signal],
 ) -> Also:
-    """A further log, its signals with units as `signals` checked them."""
+    """Return a further log, with the units of its signals as checked by `signals`."""
     align, time = also.align, also.signals.time
     path = experiment.path.parent / also.log
     opened = experiment.logs.get(path, also.flight)
@@ -223,11 +224,12 @@ def _also(
 
 
 def as_configured(experiment: Experiment, selection: Selection) -> Selection:
-    """Return the selection of a log if a configuration's first flight states its signals.
+    """Return the selection of a log, completed by a configuration's first flight.
 
     Args:
-        selection: goes before what the configuration says of rate, flight and clock. Without
-            signals of its own the columns are the model's inputs and outputs, in SI.
+        experiment: the configuration.
+        selection: overrides the configuration's rate, flight and clock. Without signals of its own,
+            the columns are the model's inputs and outputs, in SI.
 
     Raises:
         InputError: the configuration has no flight.
@@ -247,7 +249,7 @@ def as_configured(experiment: Experiment, selection: Selection) -> Selection:
 
 
 def _clock(time: TimeConfig | None) -> Signal | None:
-    """The clock of a table, as a configuration names it."""
+    """Return the clock of a table, as a configuration states it."""
     if time is None:
         return None
     if time.rate is not None:
@@ -256,7 +258,7 @@ def _clock(time: TimeConfig | None) -> Signal | None:
 
 
 def _of_clock(selection: Selection, time: TimeConfig | None) -> dict[str, Any]:
-    """The fields of a selection that name the clock, where it does not itself."""
+    """Return the fields of a selection that define the clock, unless it does so itself."""
     if time is None or selection.time is not None or selection.time_rate is not None:
         return {}
     unit = time.unit if time.rate is None else None
@@ -264,7 +266,7 @@ def _of_clock(selection: Selection, time: TimeConfig | None) -> dict[str, Any]:
 
 
 def _columns(experiment: Experiment) -> NamedBy:
-    """Return the names of columns after the inputs and outputs of the first flight."""
+    """Return the names of columns from the inputs and outputs of the first flight."""
     config, path = experiment.config, experiment.path
     first, where = config.flights[0], f"{path}: flights[0]"
     gain = config.fit is not None and config.fit.nuisance.input_gain
@@ -289,8 +291,7 @@ def _columns(experiment: Experiment) -> NamedBy:
 
 
 def first_signals(experiment: Experiment) -> Resolved:
-    """The signals of the first flight as the configuration and its preset name them, without a look
-    into the log.
+    """Return the signals of the first flight by the configuration and its preset, without the log.
 
     Raises:
         InputError: the preset does not supply an input.
@@ -303,12 +304,12 @@ def first_signals(experiment: Experiment) -> Resolved:
 def _resolved(
     experiment: Experiment, f: FlightConfig, where: str, log: Table | ChannelLog | None = None
 ) -> Resolved:
-    """The signals of a flight's own log; what further logs hold is not asked of its preset."""
+    """Return the signals of a flight's own log; its preset skips those in further logs."""
     elsewhere = {n for a in f.also for n in (*a.signals.inputs, *a.signals.outputs)}
     onboard = experiment.config.onboard
     stated = f.signals
     if "inputs" in stated.model_fields_set and not stated.inputs and stated.preset is None:
-        # Said to be none, and not forgotten: a free decay.
+        # Explicitly no inputs: a free decay.
         names = [n for n in naming.names(experiment.model.Inputs) if n not in elsewhere]
         none = {n: InputConfig(constant=0.0) for n in names}
         f = f.model_copy(update={"signals": stated.model_copy(update={"inputs": none})})
@@ -318,7 +319,7 @@ def _resolved(
 def _of_model(
     model: Model, named: Resolved, where: str, gain: bool
 ) -> tuple[dict[str, Signal], dict[str, Signal]]:
-    """Inputs and outputs as signals, with the words of the preset that named them."""
+    """Return inputs and outputs as signals, with the origin stated by their preset."""
 
     def with_origins(role: str, by_name: dict[str, Signal]) -> dict[str, Signal]:
         words = {name: named.origins.get((role, name), "") for name in by_name}
@@ -334,10 +335,10 @@ def _of_model(
 def _unstated_units(
     model: Model, stated: Resolved, source: Source | None = None
 ) -> tuple[Finding, ...]:
-    """A note for each signal whose numbers are read as SI, or in the file's unit, because no
-    unit is stated.
+    """Return a note for each signal without a stated unit.
 
-    Numbers in degrees that are read as radians fit as well, and every estimate is wrong by 57.
+    Its numbers are read as SI, or in the file's unit. Degrees read as radians fit as well, but
+    every estimate is wrong by a factor of 57.
     """
     notes = []
     as_read = ({}, {}) if source is None else (source.inputs, source.outputs)
@@ -347,7 +348,7 @@ def _unstated_units(
             if name in read and (taken := taken_note(name, read[name])):
                 notes.append(taken)
                 continue
-            # Plain numbers have no unit to mistake.
+            # Plain numbers have no unit that could be wrong.
             si = naming.unit(record, name)
             if signal.unit is None and si is not None and not units.is_plain(si):
                 words = f"{name}: no unit stated, taken as {si}"
@@ -374,24 +375,26 @@ def signals(
     """Return the columns of the model's inputs or outputs, with units checked.
 
     Args:
-        role: whether they are its inputs or its outputs.
-        gain: whether a plain number is allowed for an input with a unit.
+        model: the model.
+        role: `inputs` or `outputs`.
+        stated: their sections by name.
+        where: place of the section, for messages.
+        gain: True if an input with a unit may be a plain number.
 
     Raises:
-        InputError: a name that the model lacks, an input that is missing, no output at all, a
-            unit that is unknown or of the wrong kind.
+        InputError: a name that the model lacks, an input that is missing, no output at all, a unit
+            that is unknown or of the wrong kind.
     """
     record = model.Inputs if role == "inputs" else model.Outputs
     known = naming.names(record)
     require_known(stated, known, f"{where}.{role}", f"model {model.name} has no {role[:-1]}")
     missing = [n for n in known if n not in stated]
-    # Every input acts on the vehicle, so none can be left out; of the outputs one is enough.
+    # Every input acts on the vehicle, so none may be missing; one output is enough.
     if role == "inputs" and missing:
         remedy = f"where it did not act, {missing[0]}: {{constant: 0}}"
         problem = f"{missing[0]} missing, model {model.name} needs it; {remedy}"
         raise InputError(f"{where}.inputs: {problem}")
-    # No output, no residual: there would be nothing to fit, and nothing to compare a simulation
-    # with.
+    # Without an output there is no residual to fit, and nothing to compare a simulation with.
     if not stated:
         raise InputError(f"{where}.{role}: expected one of {', '.join(known)}, got none")
     out = {}
@@ -399,7 +402,7 @@ def signals(
         place = f"{where}.{role}.{name}.unit"
         si = naming.unit(record, name)
         unit = config.unit if config.unit is not None else (si or "1")
-        # Inputs have a hold and no sd, outputs the reverse.
+        # Inputs have a hold and no sd; outputs have an sd and no hold.
         sd, hold = getattr(config, "sd", None), getattr(config, "hold", "auto")
         missing = [] if config.missing is None else config.missing
         out[name] = Signal(
@@ -419,7 +422,7 @@ def signals(
 
 def _si(unit: str, si: str | None, place: str, gain: bool, role: str) -> str:
     try:
-        # A model of one's own may state no units: the log's unit is converted to SI all the same.
+        # A user's model may state no units; the log's unit is still converted to SI.
         if si is None:
             return units.si_of(unit)
         # A stick in plain numbers: the estimated gain is then in the model's unit per 1.
@@ -428,10 +431,10 @@ def _si(unit: str, si: str | None, place: str, gain: bool, role: str) -> str:
         units.factor(unit, si)
     except ValueError as e:
         hint = ""
-        # The remedy only where it is one: for sticks logged in percent or counts.
+        # The remedy applies only to sticks logged in percent or counts.
         if si is not None and unit.strip() in ("", "1", "-", "%", "stick", "dimensionless"):
             hint = "; or set fit.nuisance.input_gain: true, and the estimated gain carries the unit"
-        # A receiver's pulse width is a time, and no stick of any model is one.
+        # A receiver's pulse width is a time, and no model has a stick in units of time.
         if role == "inputs" and si is not None and units.is_time(unit):
             example = f'{_OFFSET_AND_SCALE}, unit: "1"'
             if not units.is_plain(si):
@@ -444,9 +447,7 @@ def _si(unit: str, si: str | None, place: str, gain: bool, role: str) -> str:
 
 
 def _pulse_width_doubts(flight: Flight) -> tuple[Finding, ...]:
-    """A doubt for each input whose numbers look like pulse widths and are taken as something
-    else.
-    """
+    """Return a doubt for each input that looks like pulse widths but has another unit."""
     doubts = []
     for name, signal in (flight.source.inputs if flight.source else {}).items():
         # A rotor's speed in rpm has such numbers too.
@@ -471,7 +472,7 @@ _PREFIX = "instrument of "
 
 
 def _instrument_signals(model: Model, config: SignalsConfig, where: str) -> dict[str, Signal]:
-    """The instruments as further inputs of the log, by a name that says which input they excite.
+    """Return the instruments as further inputs of the log, named after the excited input.
 
     Raises:
         InputError: an input that the model lacks, a constant, or a unit that is unknown.
@@ -485,7 +486,7 @@ def _instrument_signals(model: Model, config: SignalsConfig, where: str) -> dict
             raise InputError(f"{place}: expected a signal of the log, got a constant")
         unit = stated.unit or "1"
         with located(f"{place}.unit"):
-            # Its size does not matter: a response by instrument is a quotient of two.
+            # The size does not matter: an instrumental response is a quotient of two.
             si = units.si_of(unit)
         signals[_PREFIX + name] = Signal(
             stated.signal, unit, si, hold=stated.hold, **stated.conversion
@@ -494,10 +495,11 @@ def _instrument_signals(model: Model, config: SignalsConfig, where: str) -> dict
 
 
 def _with_instruments(flight: Flight, instruments: Mapping[str, Signal]) -> Flight:
-    """The flight with its instruments apart from its inputs.
+    """Move the instruments of a flight from its inputs.
 
     Args:
-        instruments: as `_instrument_signals` named them.
+        flight: the flight.
+        instruments: names from `_instrument_signals`.
     """
     if not instruments:
         return flight

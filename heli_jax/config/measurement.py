@@ -27,27 +27,30 @@ type _Channel = tuple[tuple[Filter, ...], float]
 
 
 _MOST = 2 * 10**8
-"""bytes of all files that are kept open: a larger one is parsed again, which spares the memory"""
+"""Largest total size of files kept open [bytes]; a larger one is parsed again to save memory."""
 
 type _Key = tuple[str, int | None, int, int]
 
 
 class OpenedLogs:
-    """Logs of one configuration, each parsed once until the flights are read: for the firmware's
-    settings, which are part of the model, and for the flights."""
+    """Logs of one configuration, each parsed once until the flights are read.
+
+    They are used for the firmware's settings, which are part of the model, and for the flights.
+    """
 
     def __init__(self) -> None:
         self._logs: dict[_Key, Table | ChannelLog] = {}
 
     def __reduce__(self) -> tuple:
-        # An experiment that goes to another process has its logs read there.
+        # An experiment sent to another process reads its logs there.
         return OpenedLogs, ()
 
     def open(self, path: Path, number: int | None) -> Table | ChannelLog:
-        """The log, opened now or before.
+        """Return the log, opened now or before.
 
         Args:
-            number: which flight of several, from 1.
+            path: path of the log.
+            number: number of the flight in a log of several, from 1.
 
         Raises:
             InputError: it cannot be read.
@@ -61,23 +64,24 @@ class OpenedLogs:
         return self._logs[key]
 
     def get(self, path: Path, number: int | None) -> Table | ChannelLog | None:
-        """The log if it is open.
+        """Return the log if it is open, else None.
 
         Args:
-            number: which flight of several, from 1.
+            path: path of the log.
+            number: number of the flight in a log of several, from 1.
         """
         return self._logs.get(_key(path, number))
 
     def close(self) -> None:
-        """Keep none any longer."""
+        """Release all logs."""
         self._logs.clear()
 
 
 def _key(path: Path, number: int | None) -> _Key:
-    # With time and size: a log that was written anew is another one.
+    # With time and size, so that a rewritten log counts as another one.
     try:
         stat = path.stat()
-    except OSError:  # the reader says what is wrong with it
+    except OSError:  # the reader reports the fault
         return str(path.absolute()), number, 0, 0
     return str(path.absolute()), number, stat.st_mtime_ns, stat.st_size
 
@@ -85,24 +89,27 @@ def _key(path: Path, number: int | None) -> _Key:
 def with_measurement(
     model: Model, flights: Sequence[FlightConfig], path: Path, logs: OpenedLogs
 ) -> Model:
-    """The model with the filters and delays that the flights state for their outputs.
+    """Return the model with the filters and delays that the flights state for their outputs.
 
     Args:
-        model: with the devices of `onboard` around it.
+        model: with the devices of `onboard`.
+        flights: sections of the flights.
+        path: the configuration file.
+        logs: open logs.
 
     Raises:
-        InputError: two flights state different ones, a log does not say what it is asked, or the
-            model cannot have them.
+        InputError: two flights state different ones, a log lacks the settings, or the model cannot
+            have them.
     """
     channels: dict[str, tuple[_Channel, int]] = {}
     for i, flight in enumerate(flights):
         parts = (flight, *flight.also)
         for part, name, output in ((p, n, o) for p in parts for n, o in p.signals.outputs.items()):
             if name not in naming.names(model.Outputs):
-                continue  # refused where the log is read, with the names that there are
+                continue  # refused where the log is read, with the known names
             channel = _channel(part, f"flights[{i}].signals.outputs.{name}", output, path, logs)
             first, at = channels.setdefault(name, (channel, i))
-            # One model serves all flights, so that one program does.
+            # All flights share one model, so that one compiled program is enough.
             if first != channel:
                 raise InputError(
                     f"{path}: flights[{i}].signals.outputs.{name}: its filter and delay "
@@ -118,15 +125,15 @@ def with_measurement(
 
 
 def _channel(part: Any, where: str, output: OutputConfig, path: Path, logs: OpenedLogs) -> _Channel:
-    """The filters and the delay of one output."""
+    """Return the filters and the delay of one output."""
     filters: list[Filter] = []
     for config in output.filter or ():
         if config.kind != FROM_LOG:
             filters.append(config.filter)
             continue
         log = logs.open(path.parent / part.log, part.flight)
-        # First, or a misspelt channel would be taken for one of which the log says nothing.
-        # What is computed from channels stands in no log.
+        # Checked first, or a misspelt channel would look like one without settings. Derived
+        # channels are not in the log.
         derived = "(" in output.signal or output.signal.startswith("ccpm.")
         if not derived and output.signal not in log.names:
             near = nearest(output.signal[:60], {n[:60] for n in log.names})
@@ -152,7 +159,7 @@ def _words(channel: _Channel) -> str:
 
 
 def filter_words(filter: Filter) -> str:
-    """A filter in words, as a configuration would have it."""
+    """Return a filter in words, as in a configuration."""
     more = "" if filter.q is None else f", q {filter.q:.3g}"
     if not math.isinf(filter.attenuation):
         more += f", {filter.attenuation:g} dB"
@@ -162,8 +169,7 @@ def filter_words(filter: Filter) -> str:
 def filter_cautions(
     source: Source | None, outputs: Mapping[str, OutputConfig]
 ) -> tuple[Finding, ...]:
-    """Return cautions on an output's filter that the log's settings state and the configuration
-    does not model."""
+    """Return cautions on filters that the log states and the configuration does not model."""
     if source is None:
         return ()
     said = []
@@ -183,10 +189,10 @@ def filter_cautions(
 
 
 def coloured_noise_cautions(flight: Flight, model: Model) -> tuple[Finding, ...]:
-    """Outputs whose noise went through a modelled low-pass and is not white at the flight's rate,
-    where filter error is told the measurement noise and so estimates no other.
+    """Return doubts on outputs whose fixed noise is not white.
 
-    The noise is then taken for a disturbance or a faster vehicle.
+    Their noise passed a modelled low-pass, and filter error does not estimate it. The noise is then
+    attributed to a disturbance or a faster vehicle.
     """
     return tuple(
         Finding(
@@ -209,12 +215,12 @@ def _not_modelled(name: str, output: OutputConfig, logged: LoggedFilters) -> Fin
     lowpasses = [f for f in filters if f.kind != "notch"]
     what = f"low-passed at {cutoff(lowpasses):.3g} Hz" if lowpasses else "notched"
     late = 1e3 * sum(f.delay for f in filters)
-    # All of the line: of an output that a preset supplies the configuration has none.
+    # The whole line, because the configuration has none for an output from a preset.
     line = [f'signal: "{output.signal}"', *([f"unit: {output.unit}"] if output.unit else [])]
     line += [f"scale: {output.scale:g}"] * (output.scale != 1.0)
     line += [f"offset: {output.offset:g}"] * (output.offset != 0.0)
     line += ["invert: true"] * output.invert
-    # The inputs were not: were both filtered alike, the vehicle would look the same.
+    # The inputs were not filtered; if both were filtered alike, the vehicle would look the same.
     words = (
         f"{name} was {what} by the autopilot ({', '.join(_short(s) for s in logged.settings)}), "
         f"which delays it by about {late:.1f} ms, and the inputs were not: what is estimated takes "
@@ -229,23 +235,24 @@ def _short(setting: str) -> str:
 
 
 _BANDS = 12
-"""of equal width in the logarithm"""
+"""Number of frequency bands, of equal logarithmic width."""
 _LOWEST, _HIGHEST = 0.05, 0.4
-"""of the rate, between which noise is looked for: slower is motion, and resampling takes what is
-faster"""
+"""Lowest and highest frequency of the bands, relative to the rate. Below is motion; above,
+resampling removes the noise."""
 _LEFT, _THERE = 0.25, 0.6
-"""of its power, what the filter leaves from one band to a faster one at most, and what is there at
-least"""
+"""Largest power ratio of a faster to a slower band that the filter leaves, and smallest measured
+ratio."""
 _FOLDS = 20
-"""multiples of the rate from which noise folds down"""
+"""Multiples of the rate from which noise is aliased."""
 _ROUNDED = 10.0
-"""times the power of the log's rounding, which is white behind any filter, that is there"""
+"""Smallest ratio of noise to the power of the log's rounding, which is white after any filter."""
 _SEGMENT, _FEWEST = 256, 1500
-"""samples of a spectrum, and of a record to have one: its bands are known to a tenth then"""
+"""Samples of a spectral segment, and fewest samples of a record; its bands are then known to 10 %.
+"""
 
 
 def unfiltered_cautions(flight: Flight, outputs: Mapping[str, OutputConfig]) -> tuple[Finding, ...]:
-    """A doubt for each output whose noise did not come through its filter."""
+    """Return a doubt for each output whose noise did not pass its stated filter."""
     said = []
     for name, output in outputs.items():
         filters = [f for f in _stated(flight, output) if f.kind != "notch"]
@@ -280,15 +287,18 @@ def _stated(flight: Flight, output: OutputConfig) -> list[Filter]:
 def _not_taken(
     y: np.ndarray, dt: float, filters: list[Filter]
 ) -> tuple[float, float, float, float] | None:
-    """Return the most significant pair of bands: their frequencies [Hz], the power of the faster
-    over that of the slower one, and the part that the filters leave; None if noise falls off."""
+    """Return the most significant pair of bands, or None if the noise was filtered.
+
+    The four values are their frequencies [Hz], the power of the faster over that of the slower
+    band, and the part that the filters leave.
+    """
     from scipy.signal import welch
 
     rate = 1.0 / dt
     hz, power = welch(y, rate, nperseg=_SEGMENT)
     edges = np.geomspace(_LOWEST, _HIGHEST, _BANDS + 1) * rate
     folds = np.arange(-_FOLDS, _FOLDS + 1) * rate
-    # Medians, since vibration stands in lines.
+    # Medians, because vibration is in narrow lines.
     rows = [(hz >= low) & (hz < high) for low, high in pairwise(edges)]
     measured = np.array([np.median(power[row]) for row in rows if row.any()])
     centre = np.array([np.mean(hz[row]) for row in rows if row.any()])

@@ -1,4 +1,4 @@
-"""The section `onboard`: devices around a model, from the swashplate outwards."""
+"""Section `onboard`: devices around a model, from the swashplate outwards."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -22,7 +22,7 @@ def _one_or_several(value: object) -> object:
 
 
 NamesOrPairs = list[str] | dict[str, str]
-# The most states that `with_delays` takes: refused here, where the key has a place.
+# Largest order that `with_delays` accepts; checked here, where the key has a place.
 Order = Annotated[int, Field(ge=1, le=8)]
 
 
@@ -31,8 +31,8 @@ class ServosConfig(Section):
 
     on: list[str]
     """inputs that these servos move"""
-    # Off unless asked for: it is the one device here that makes a linear model nonlinear, which
-    # costs the exact step.
+    # Off by default: it is the only device here that makes a linear model nonlinear, and the exact
+    # step is then not available.
     rate_limit: bool = False
     """true: limit their speed (rate_servo)"""
     delay: bool = False
@@ -45,7 +45,7 @@ class RateLoopConfig(Section):
     """A flybarless unit (`with_rate_loop`)."""
 
     on: NamesOrPairs | None = None
-    """sticks, or by stick the state that is its rate; those of roll and pitch unless given"""
+    """sticks, or the state of the rate by stick; default those of roll and pitch"""
     integral: bool = True
     """true: integral term Ki"""
     feedforward: bool = True
@@ -58,9 +58,9 @@ class GyroConfig(Section):
     """A gyro on the tail (`with_gyro`)."""
 
     on: NamesOrPairs | None = None
-    """the pedal, or by pedal the state that is its rate; that of yaw unless given"""
+    """pedal, or the state of the rate by pedal; default that of yaw"""
     heading_hold: bool = True
-    """true: the pedal commands a rate that is held; false: damper alone"""
+    """true: the pedal commands a rate that is held; false: damper only"""
     lag: bool = True
     """true: first-order lag of its gyro (tau_gyro)"""
 
@@ -69,32 +69,32 @@ class SensorsConfig(Section):
     """Sensors of the log (`with_sensors`)."""
 
     imu: bool = False
-    """adds the specific forces ax, ay, az at the place of the accelerometer"""
+    """adds the specific forces ax, ay, az at the accelerometer's position"""
     angular_acceleration: bool = False
     """adds the derivatives of the rates"""
     airspeed: bool = False
     """adds the airspeed and its components at the probe"""
     lowpass: list[str] = []
-    """outputs behind a first-order lag (tau_lowpass)"""
+    """outputs with a first-order lag (tau_lowpass)"""
     delay: NamesOrPairs = []
-    """outputs that are late, or by output the parameter that is its delay"""
+    """outputs with a delay, or the delay's parameter by output"""
     order: Order = ORDER
-    """states by which each delay is approximated"""
+    """states of the approximation of each delay"""
 
 
 class DelaysConfig(Section):
     """Delays of inputs and outputs (`with_delays`)."""
 
     inputs: NamesOrPairs = []
-    """names, or by name the parameter"""
+    """names, or the parameter by name"""
     outputs: NamesOrPairs = []
-    """names, or by name the parameter"""
+    """names, or the parameter by name"""
     order: Order = ORDER
-    """states by which each delay is approximated"""
+    """states of the approximation of each delay"""
 
 
 FROM_LOG = "from log"
-"""the kind of filter that the log's own settings state"""
+"""Kind of filter that the log's own settings state."""
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
@@ -102,7 +102,7 @@ class FilterConfig(Section):
     """A filter between a sensor and the log (`Filter`)."""
 
     kind: Literal["pt1", "pt2", "pt3", "biquad", "notch", "from log"]
-    """kind of low-pass or notch; from log: by the settings in the log"""
+    """kind of low-pass or notch; from log: from the settings in the log"""
     hz: _Positive | None = None
     """cut-off (3 dB) of a low-pass, or centre of a notch"""
     q: _Positive | None = None
@@ -127,8 +127,8 @@ class FilterConfig(Section):
 
     @property
     def filter(self) -> Filter:
-        """The filter of these numbers; not for one from the log."""
-        assert self.hz is not None  # `_consistent`
+        """Filter with these numbers; not valid for one from the log."""
+        assert self.hz is not None  # checked in `_consistent`
         q = self.q if self.bandwidth is None else self.hz / self.bandwidth
         numbers = {} if self.attenuation is None else {"attenuation": self.attenuation}
         return Filter(self.kind, self.hz, q, **numbers)
@@ -154,16 +154,16 @@ Notches = list[_Positive]
 
 
 class VibrationConfig(Section):
-    """Sources of vibration, by which lines of the spectrum are named."""
+    """Sources of vibration, which identify lines of the spectrum."""
 
     rotor: _Positive
-    """speed of the rotor, in rad/s unless `unit` says otherwise"""
+    """speed of the rotor, in rad/s unless `unit` is another"""
     unit: str = "rad/s"
     """unit of the speed: rad/s, rpm, Hz"""
 
 
 class OnboardConfig(Section):
-    """Devices between stick and blade, motion and log, each in series with the one before it."""
+    """Devices between stick and blade, motion and log, each in series with the previous one."""
 
     servos: Annotated[
         list[ServosConfig],
@@ -181,18 +181,20 @@ class OnboardConfig(Section):
 
 
 def with_onboard(model: Model, config: OnboardConfig | None, path: Path) -> Model:
-    """The model with the devices of a configuration around it.
+    """Return the model with the devices of a configuration.
 
     Args:
+        model: the model.
         config: the section, or None.
+        path: the configuration file.
 
     Raises:
         InputError: a device that the model cannot have.
     """
     if config is None:
         return model
-    # The order is part of the meaning: a rate loop commands servos that stand before it, sensors
-    # see the motion that comes of both, and the delay of the radio is outside of all.
+    # The order matters: a rate loop commands the servos, sensors measure the resulting motion, and
+    # the radio's delay is outermost.
     steps: list[tuple[str, Callable[..., Model], BaseModel]] = [
         *(("servos", with_servos, servos) for servos in config.servos),
         *(
@@ -208,6 +210,6 @@ def with_onboard(model: Model, config: OnboardConfig | None, path: Path) -> Mode
     ]
     for key, function, section in steps:
         with located(f"{path}: onboard.{key}"):
-            # By name: a key that the function lacks, or the reverse, is an error here.
+            # By name: a key that only the function or only the section has is an error here.
             model = function(model, **dict(section))
     return model

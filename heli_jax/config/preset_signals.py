@@ -1,4 +1,4 @@
-"""Signals of a model by a preset: which channel of this log is which input and output."""
+"""Signals of a model from a preset: the channel of each input and output in this log."""
 
 from collections.abc import Collection
 from typing import Any, NamedTuple
@@ -24,17 +24,17 @@ from heli_jax.flights.preset import (
 )
 
 _STICKS = {"rate_loop": ("lat", "lon", "x_roll", "x_pitch"), "gyro": ("ped", "x_yaw")}
-"""what a rate loop and a gyro stand behind unless the configuration names it"""
+"""Default inputs of a rate loop and a gyro."""
 _CCPM = dict(zip(("collective", "cyclic_roll", "cyclic_pitch"), CCPM, strict=True))
 _MOST_NAMES = 12
-"""of topics, in a sentence"""
+"""Most names of topics in a sentence."""
 
 
 class Resolved(NamedTuple):
-    """The signals of one flight, each with a channel.
+    """Signals of one flight, each with a channel.
 
-    `origins` says by role and name where unit, axes and sign of those of a preset come from, and
-    `notes` which outputs were left out.
+    `origins` has the source of unit, axes and sign by role and name, for signals from a preset.
+    `notes` list the outputs that were left out.
     """
 
     inputs: dict[str, InputConfig]
@@ -51,14 +51,19 @@ def resolve(
     log: Table | ChannelLog | None = None,
     elsewhere: Collection[str] = (),
 ) -> Resolved:
-    """The signals that a configuration states, completed by its preset.
+    """Return the signals of a configuration, completed by its preset.
 
     Args:
+        model: the model.
         stated: the section `signals`.
+        where: place of the section, for messages.
+        onboard: the section `onboard`, if any.
+        log: the log, if it is open.
+        elsewhere: signals from further logs.
 
     Raises:
-        InputError: an input that neither the configuration nor the preset supplies, or an output
-            that was asked for; no output at all.
+        InputError: an input that neither the configuration nor the preset supplies, or a missing
+            output that was requested; no output at all.
     """
     inputs, outputs = dict(stated.inputs), dict(stated.outputs)
     if stated.preset is None:
@@ -87,7 +92,7 @@ def resolve(
     if not outputs and not elsewhere:
         problem = f"{where}: preset {stated.preset} supplies no output of model {model.name}: "
         raise InputError(problem + ", ".join(left.values()) + search.holdings())
-    # In the model's own order, whichever of the two named them.
+    # In the model's own order, independent of the source.
     inputs = {n: inputs[n] for n in (*naming.names(model.Inputs), *inputs) if n in inputs}
     words = f"outputs that preset {stated.preset} left out: {', '.join(left.values())}"
     notes = (note("channels.lacking", words, *left),) if left else ()
@@ -95,7 +100,7 @@ def resolve(
 
 
 def _pilot(onboard: OnboardConfig | None) -> set[str]:
-    """The inputs that are the pilot's sticks: those in front of a rate loop or a gyro."""
+    """Return the inputs that are the pilot's sticks: those before a rate loop or a gyro."""
     if onboard is None:
         return set()
     devices = (("rate_loop", onboard.rate_loop), ("gyro", onboard.gyro))
@@ -115,7 +120,7 @@ def _wanted(model: Model, stated: SignalsConfig, where: str) -> tuple[str, ...]:
 
 
 def _keys(chosen: Alternative) -> dict[str, Any]:
-    """The keys of a configuration that say the same; Any: text, numbers and a boolean."""
+    """Return the equivalent keys of a configuration; Any: text, numbers and a boolean."""
     return {
         "signal": chosen.channel,
         "unit": chosen.unit,
@@ -126,7 +131,7 @@ def _keys(chosen: Alternative) -> dict[str, Any]:
 
 
 class _Search(NamedTuple):
-    """A preset asked for the signals of one log."""
+    """Search of a preset's signals in one log."""
 
     table: Preset
     stated: SignalsConfig
@@ -134,11 +139,11 @@ class _Search(NamedTuple):
     where: str
 
     def require_format(self) -> None:
-        """Refuse a preset none of whose channels is in a log of another format."""
+        """Refuse a preset for another format, unless the log has one of its channels."""
         log, table = self.log, self.table
         if log is None or log.format in table.formats:
             return
-        # A table may well have the names of the channels, as `heli-jax convert` writes them.
+        # A table may have the names of the channels, as `heli-jax convert` writes them.
         if any(choose(log, alternatives) for alternatives in table.signals.values()):
             return
         others = [name for name in presets() if log.format in preset(name).formats]
@@ -150,7 +155,7 @@ class _Search(NamedTuple):
 
     def input(self, model: Model, name: str, pilot: bool) -> Alternative:
         known = model_inputs().get(name)
-        # What is an output elsewhere is an input where sensors are compared with each other.
+        # The kinematic model has measured outputs as inputs.
         if is_kinematic(model) and (sensor := model_outputs().get(name)) is not None:
             known = ModelSignal(sensor, sensor)
         if known is None:
@@ -160,7 +165,7 @@ class _Search(NamedTuple):
         if chosen is None:
             problem = f"{name}: {why}, expected it by name"
             raise InputError(f"{self.where}.inputs: {problem}{self.holdings()}")
-        # Two inversions are none.
+        # Two inversions cancel.
         return Alternative(**{**vars(chosen), "invert": chosen.invert != known.invert})
 
     def output(self, name: str) -> tuple[Alternative | None, str]:
@@ -168,7 +173,7 @@ class _Search(NamedTuple):
         return (None, "no preset knows it") if signal is None else self._signal(signal)
 
     def _signal(self, signal: str) -> tuple[Alternative | None, str]:
-        """The channel of a signal, or why there is none."""
+        """Return the channel of a signal, or why there is none."""
         table = self.table
         alternatives = table.signals.get(signal, ())
         if self.stated.ccpm is not None and signal in _CCPM:
@@ -183,18 +188,18 @@ class _Search(NamedTuple):
         return choose(self.log, alternatives), f"the log has no {signal} in {tried}"
 
     def origin(self, chosen: Alternative) -> str:
-        """Source of unit, axes and sign."""
+        """Return the source of unit, axes and sign."""
         return f"by preset {self.table.title}: {chosen.source}"
 
     def holdings(self) -> str:
-        """Channels that the log has, as the end of a sentence."""
+        """Return the channels in the log, as the end of a sentence."""
         if self.log is None:
             return ""
         names = list(self.log.names)
         if isinstance(self.log, ChannelLog):
-            # Topics without the numbers of their instances.
+            # Topics without instance numbers.
             names = list(dict.fromkeys(t.name.split("[")[0] for t in self.log.topics))
         more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
         listed = ", ".join(shown(name)[1:-1] for name in names[:_MOST_NAMES])
-        # `wrong` takes out what a terminal would obey: names come from the file.
+        # `wrong` removes control characters: names come from the file.
         return str(wrong(f"; {self.log.path} holds", f"{listed}{more}"))

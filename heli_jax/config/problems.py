@@ -1,4 +1,4 @@
-"""The problem that a configuration describes."""
+"""Fit problem of a configuration."""
 
 import dataclasses
 import importlib.util
@@ -32,10 +32,10 @@ if TYPE_CHECKING:
 
 
 def problem(experiment: Experiment) -> Problem:
-    """The problem that a configuration's `fit` describes, its logs read.
+    """Return the problem of a configuration's `fit`, with its logs read.
 
     Raises:
-        InputError: no fit or no flight, a log that cannot be read, or parts that do not fit.
+        InputError: no fit or no flight, a log that cannot be read, or parts that do not match.
     """
     config, path = experiment.config, experiment.path
     if config.fit is None:
@@ -47,10 +47,10 @@ def problem(experiment: Experiment) -> Problem:
     nuisance = _nuisance(config.fit)
     flights = read_flights(experiment, gain=nuisance.input_gain)
     for flight in flights:
-        if not flight.hold_out:  # which is simulated, and not fitted
+        if not flight.hold_out:  # a hold-out flight is simulated, not fitted
             require_some_time(flight)
             require_moving_outputs(flight)
-    # By name: a field that Free has and the configuration lacks, or the reverse, is an error here.
+    # By name: a field that only Free or only the configuration has is an error here.
     free = {
         name: Free(**{**dict(f), "prior": None if f.prior is None else Prior(**dict(f.prior))})
         for name, f in config.fit.free.items()
@@ -60,12 +60,12 @@ def problem(experiment: Experiment) -> Problem:
         _require_disturbance(experiment, "fit.method")
     of_method = _of_method(experiment, config.fit.method, flights, free)
     model = of_method["model"]
-    # One number for all flights, since they share one compiled program: the slowest log's.
+    # One number for all flights, because they share a compiled program: that of the slowest log.
     substeps = max(substeps_for(f.dt, model.fastest) for f in flights)
     with experiment.located("fit"):
         whole = Problem(
             **of_method,
-            # Not before the noise of the inputs is known, which it makes larger.
+            # Not before the noise of the inputs is known, because sharpening increases it.
             flights=tuple(sharpened(model, f) for f in flights),
             nuisance=nuisance,
             substeps=substeps_of(model, flights) if is_kinematic(model) else substeps,
@@ -74,12 +74,12 @@ def problem(experiment: Experiment) -> Problem:
             frequency=_responses(experiment),
         )
         whole = with_chosen_windows(whole)
-    # Of the flights that are fitted: by now their windows are chosen.
+    # Only for the fitted flights, whose windows are chosen by now.
     return _started_in_frequency(experiment, whole)
 
 
 def _require_disturbance(experiment: Experiment, place: str) -> None:
-    # A model with process noise of its own needs none beside it.
+    # A model with process noise of its own needs no disturbance.
     if experiment.config.disturbance is None and experiment.model.noise_intensity is None:
         raise InputError(
             f"{experiment.path}: {place}: filter-error needs a disturbance, expected "
@@ -88,10 +88,10 @@ def _require_disturbance(experiment: Experiment, place: str) -> None:
 
 
 def by_other_methods(experiment: Experiment, fitted: Problem) -> dict[str, Problem | str]:
-    """By method of `fit.also` the same problem for it, or why the method refuses it.
+    """Return the same problem for each method of `fit.also`, or why the method refuses it.
 
     Raises:
-        InputError: filter error is asked for without a disturbance.
+        InputError: filter error is requested without a disturbance.
     """
     assert experiment.config.fit is not None
     also = map(objective_of, experiment.config.fit.also)
@@ -107,7 +107,7 @@ def by_other_methods(experiment: Experiment, fitted: Problem) -> dict[str, Probl
 
 
 def by_method(experiment: Experiment, fitted: Problem, method: str) -> Problem:
-    """The same problem for another method.
+    """Return the same problem for another method.
 
     Raises:
         ValueError: the method refuses it.
@@ -124,14 +124,14 @@ def _of_method(
     """Return the parts of a problem that depend on its method."""
     config = experiment.config
     assert config.fit is not None
-    # Output error gets the bare model, whatever `disturbance` says: that section is then for
-    # simulation and for the candidate models alone.
+    # Output error gets the bare model, whatever `disturbance` states. That section then serves only
+    # simulation and the candidate models.
     model, params, fixed = experiment.model, experiment.vehicle.params, ()
     if objective_of(method).noise_model == "disturbance":
         model, params = disturbed(experiment)
         free = {**free_noise(model, params, flights), **free}
         fixed = () if config.disturbance is None else tuple(config.disturbance.fixed)
-    # A fit that is asked for with windows says itself where its method has none.
+    # If windows are requested but the method has none, the fit itself reports it.
     asked = method == config.fit.method or objective_of(method).noise_model == "white"
     shooting = config.fit.shooting if asked else None
     return {
@@ -147,17 +147,17 @@ def _of_method(
 
 
 def _responses(experiment: Experiment) -> ResponseOptions:
-    """Return the frequency responses to fit, if the method fits any."""
+    """Return the options of frequency responses, if the method fits any."""
     config, method = experiment.config.frequency, experiment.config.fit
     if method is not None and not objective_of(method.method).fits_responses:
         for key in ("pairs", "coherence"):
-            # `heli-jax frf` shows all responses: where nothing is fitted to them it has no effect.
+            # `heli-jax frf` shows all responses; without a fit to them the key has no effect.
             if config is not None and getattr(config, key):
                 raise InputError(
                     f"{experiment.path}: frequency.{key}: is for fit.method: frequency-response, "
                     f"got {method.method}"
                 )
-        # Nothing is fitted within it, which the fit says.
+        # The band is not used by the fit, which reports it.
         return ResponseOptions(band=None if config is None else config.band)
     if config is None:
         return ResponseOptions()
@@ -166,19 +166,19 @@ def _responses(experiment: Experiment) -> ResponseOptions:
 
 
 def with_chosen_windows(problem: Problem) -> Problem:
-    """The problem with each flight of `window: auto` in its most telling windows.
+    """Return the problem with each flight of `window: auto` in its most informative windows.
 
     Raises:
-        ValueError: no window of such a flight may be used.
+        ValueError: no window of such a flight can be used.
     """
     chosen = tuple(f for f in problem.flights if f.choose_windows)
     if not chosen:
         return problem
-    # Not before it is needed: it imports the optimiser, which takes a second.
+    # Imported on demand: the optimiser takes a second to import.
     from heli_jax.identification.design.windows import window_flights
     from heli_jax.identification.fit import windows
 
-    # By what these flights say alone: the others are fitted whatever they say.
+    # Only these flights' information counts: the others are fitted in any case.
     asked = dataclasses.replace(problem, flights=chosen)
     parts = window_flights(asked, windows(asked))
     by_flight = {id(f): parts.get(i, ()) for i, f in enumerate(chosen)}
@@ -194,14 +194,14 @@ def _nuisance(config: FitConfig) -> Nuisance:
 
 
 def _check_intervals(config: FitConfig, path: Path) -> None:
-    """Refuse before the fit what could not be done after it."""
+    """Refuse before the fit what cannot be done after it."""
     for name in config.intervals.profile:
         if name not in config.free:
             raise InputError(
                 f"{path}: fit.intervals.profile: {name!r} is not free{nearest(name, config.free)}"
             )
-    # Asked of the installation, not by an import, which takes seconds.
-    for package in ("blackjax", "h5netcdf"):  # that samples, and that keeps the draws
+    # Without an import, which takes seconds.
+    for package in ("blackjax", "h5netcdf"):  # the sampler, and the format of its draws
         if config.intervals.nuts and importlib.util.find_spec(package) is None:
             raise InputError(
                 f"{path}: fit.intervals.nuts: {package} is not installed, expected the extra "
@@ -222,12 +222,12 @@ def _check_intervals(config: FitConfig, path: Path) -> None:
 
 
 def candidate_models(experiment: Experiment, fitted: Problem) -> "Alternatives":
-    """The models that a configuration's `compare` puts beside the fitted one.
+    """Return the models that `compare` fits besides the configured one.
 
     Raises:
         InputError: no axis of the model can be disturbed.
     """
-    # Not before it is needed: it imports the optimiser, which takes a second.
+    # Imported on demand: the optimiser takes a second to import.
     from heli_jax.identification.select import (
         alternatives,
         disturbed_sets,
@@ -242,8 +242,8 @@ def candidate_models(experiment: Experiment, fitted: Problem) -> "Alternatives":
             "one with roll, pitch or yaw, or disturbance: {on: [STATE]}"
         )
     stated = disturbance.names if disturbance is not None else ()
-    # A list names some of what may be disturbed, and the other axes are in question as well; the
-    # one of `axis: roll` is settled, and its poles are.
+    # With a list, the other axes are candidates as well. With `axis: roll` the axis is fixed and
+    # only its poles are compared.
     asked = (
         stated if disturbance is not None and disturbance.axis else undisturbed_too(model, stated)
     )
@@ -251,14 +251,14 @@ def candidate_models(experiment: Experiment, fitted: Problem) -> "Alternatives":
         with located(f"{experiment.path}: disturbance"):
             return disturbed_sets(fitted, model, asked, stated)
     axis = next(iter(asked))
-    # Whether there is a stand is in question only where its stiffness is.
+    # The stand is compared only if its stiffness is free.
     bare = model.without_stand if "kappa" in fitted.free else None
     return alternatives(fitted, model, axis, without_stand=bare)
 
 
 # Params are classes of each model, hence Any.
 def disturbed(experiment: Experiment) -> tuple[Model, Any]:
-    """The model with the configuration's disturbance, and its parameters.
+    """Return the model with the configuration's disturbance, and its parameters.
 
     Raises:
         InputError: the model has no such axis or state.
@@ -269,14 +269,14 @@ def disturbed(experiment: Experiment) -> tuple[Model, Any]:
         return model, params
     with located(f"{experiment.path}: disturbance"):
         model = with_disturbance(model, disturbance.names, disturbance.poles)
-    # Left out, sigma_w stays 0 and tau_w 1 s: filter error then makes an initial guess of its own.
+    # By default sigma_w stays 0 and tau_w 1 s; filter error then makes its own initial guess.
     extra = {n: jnp.asarray(v) for n, v in disturbance.parameters.items() if v is not None}
     return model, model.Params(**{**naming.asdict(params), **extra})
 
 
 def _gain_units(experiment: Experiment) -> dict[str, str]:
-    """The unit that each input's gain carries: 1 where the log's unit is of the right kind."""
-    # Of the first flight, since a gain is shared by all.
+    """Return the unit of each input's gain: 1 if the log's unit is of the right kind."""
+    # Of the first flight, because all flights share the gains.
     out = {}
     for name, signal in first_signals(experiment).inputs.items():
         si = naming.unit(experiment.model.Inputs, name)
@@ -288,21 +288,23 @@ def _gain_units(experiment: Experiment) -> dict[str, str]:
 def _first_guesses(
     experiment: Experiment, flights: Sequence[Flight], free: Mapping[str, Free]
 ) -> "tuple[dict[str, Free], EquationErrorStart | None]":
-    """The free parameters with their starts, and how these were found; None where they are given.
+    """Return the free parameters with their starts, and their search; None if they are given.
 
     Args:
-        free: as the configuration has them; NaN where a start is left out.
+        experiment: the configuration.
+        flights: its flights.
+        free: free parameters of the configuration; NaN where a start is left out.
     """
     config, path = experiment.config.fit, experiment.path
     assert config is not None
-    # Before its start is asked for: of what the model does not have there is none.
+    # Before the search: a parameter that the model lacks has no start.
     known = naming.names(experiment.model.Params)
     found = config.start.method == "equation-error"
     asked = [n for n, f in free.items() if found or math.isnan(f.start)]
     words = f"model {experiment.model.name} has no parameter"
     require_known(asked, known, f"{path}: fit.free", words)
-    # NaN stands for a start that was left out, and no optimiser gets anywhere from it.
-    # In frequency a fit begins where it is told to; what it finds takes the place of that later.
+    # NaN means that a start was left out; no optimiser can use it. A fit in frequency begins at the
+    # given starts, and its result replaces them later.
     if config.start.method != "equation-error":
         free = _from_vehicle(experiment, free)
         missing = [n for n, f in free.items() if math.isnan(f.start)]
@@ -313,23 +315,22 @@ def _first_guesses(
                 "model's own, or fit.start: equation-error, which finds one for linear models"
             )
         return dict(free), None
-    # Not before it is needed: it takes a second to import.
+    # Imported on demand: it takes a second.
     from heli_jax.identification.equation_error.start import equation_error_start
 
-    # Without stepwise selection every term stays in: to leave one out is a change of the model,
-    # which has to be asked for.
+    # Without stepwise selection every term stays in the model; removing one has to be requested.
     limits = (config.start.f_enter, config.start.f_remove) if config.start.stepwise else None
     with experiment.located("fit"):
         guess = equation_error_start(
             experiment.model, experiment.vehicle.params, flights, free, stepwise=limits
         )
-    # A start and nothing more: noise and gusts bias a regression, so that bounds and priors stay as
-    # they were stated.
+    # Only the start is used: noise and gusts bias a regression, so bounds and priors stay as
+    # stated.
     return {n: f._replace(start=guess.values[n].value) for n, f in free.items()}, guess
 
 
 def _shipped_value(experiment: Experiment, name: str) -> str:
-    """Return a parameter's value in a shipped linear model, in SI; None of other models."""
+    """Return a parameter's value in a shipped linear model, in SI; empty for other models."""
     model = experiment.config.model
     if not (isinstance(model, LinearConfig) and is_shipped(model.linear)):
         return ""
@@ -338,8 +339,8 @@ def _shipped_value(experiment: Experiment, name: str) -> str:
 
 
 def _from_vehicle(experiment: Experiment, free: Mapping[str, Free]) -> Mapping[str, Free]:
-    """Starts that are left out, from the vehicle file."""
-    # The numbers of a linear model that ships are those of some other vehicle.
+    """Fill in missing starts from the vehicle file."""
+    # The values of a shipped linear model belong to another vehicle.
     model = experiment.config.model
     if isinstance(model, LinearConfig) and is_shipped(model.linear):
         return free
@@ -351,10 +352,11 @@ def _from_vehicle(experiment: Experiment, free: Mapping[str, Free]) -> Mapping[s
 
 
 def _instrument_for(config: FitConfig, method: str) -> tuple[str, ...] | None:
-    """The inputs that a method takes by their instrument, as `Problem.instrument` has them.
+    """Return the inputs that a method uses by their instrument, as in `Problem.instrument`.
 
     Args:
-        config: whose `instrument` may be meant for the start, or for a method of `also`.
+        config: section whose `instrument` may apply to the start, or to a method of `also`.
+        method: the method.
     """
     others = [m for m in (config.start.method, *config.also) if m in METHODS]
     if objective_of(method).noise_model == "spectrum" or not any(
@@ -365,11 +367,11 @@ def _instrument_for(config: FitConfig, method: str) -> tuple[str, ...] | None:
 
 
 def _started_in_frequency(experiment: Experiment, problem: Problem) -> Problem:
-    """The problem with the starts that `fit.start: frequency-error` finds; else as it is."""
+    """Return the problem with the starts of `fit.start: frequency-error`, else unchanged."""
     config = experiment.config.fit
     if config is None or config.start.method != "frequency-error":
         return problem
-    # Not before it is needed: it imports the optimiser, which takes a second.
+    # Imported on demand: the optimiser takes a second to import.
     from heli_jax.identification.frequency_start import frequency_error_start, started
 
     known = naming.names(experiment.model.Params)

@@ -1,4 +1,4 @@
-"""Sections of runs that the project makes itself: `simulate`, and the design of a sweep."""
+"""Sections of simulated runs: `simulate`, and the design of a sweep."""
 
 import warnings
 from typing import Annotated, Any, Literal
@@ -20,13 +20,13 @@ class StickConfig(Section):
     amplitude: Positive
     """largest deflection, in `unit`"""
     unit: str | None = None
-    """the model's SI unit unless given"""
+    """unit; default the model's SI unit"""
     hold: tuple[Positive, Positive] = (0.3, 2.0)
     """shortest and longest step of random-steps [s]"""
     step: Positive = 0.3
     """unit length of 3-2-1-1 [s]"""
     pause: Positive = 2.0
-    """neutral between two 3-2-1-1 [s]"""
+    """pause between two 3-2-1-1 [s]"""
     band: tuple[Positive, Positive] = (0.05, 5.0)
     """first and last frequency of a chirp [Hz]"""
 
@@ -41,25 +41,25 @@ class NoiseConfig(Section):
     sd: Positive
     """standard deviation, in `unit`"""
     unit: str | None = None
-    """the output's SI unit unless given"""
+    """unit; default the output's SI unit"""
 
 
 class StartConfig(Section):
-    """The steady flight in which a run of the whole helicopter begins."""
+    """Steady flight in which a run of the full helicopter begins."""
 
     forward_speed: Finite = 0.0
     """speed over the ground along the heading [m/s]"""
     lateral_speed: Finite = 0.0
-    """to the right of it [m/s]"""
+    """speed to the right of the heading [m/s]"""
     climb: Finite = 0.0
-    """[m/s]"""
+    """climb rate [m/s]"""
     heading: Finite = 0.0
-    """psi [rad]"""
+    """heading psi [rad]"""
 
     @model_validator(mode="before")
     @classmethod
     def _renamed(cls, content: Any) -> Any:
-        """The keys under which the speeds stood before, accepted with a warning."""
+        """Accept the former names of the speeds, with a warning."""
         if not isinstance(content, dict):
             return content
         content = dict(content)
@@ -74,14 +74,14 @@ class StartConfig(Section):
 
 
 class SimulateConfig(Section):
-    """A run that the project makes itself.
+    """A simulated run.
 
-    The whole helicopter begins in a trimmed flight, and `inputs` are added to the trim's sticks;
-    start, wind, hold_attitude and ground are for it alone.
+    The full helicopter begins in a trimmed flight, and `inputs` are added to the trim's sticks;
+    start, wind, hold_attitude and ground are only for this model.
     """
 
     duration: Positive
-    """[s]"""
+    """duration [s]"""
     rate: Positive
     """samples a second [Hz]"""
     inputs: dict[str, StickConfig] = {}
@@ -91,7 +91,7 @@ class SimulateConfig(Section):
     seed: Annotated[int, Field(ge=0)] = 0
     """seed of inputs, noise and disturbance"""
     start: StartConfig | None = None
-    """hover unless given"""
+    """trimmed flight at the start; default hover"""
     wind: tuple[Finite, Finite, Finite] | None = None
     """velocity of the air along x, y and z (up) [m/s]"""
     hold_attitude: bool = False
@@ -111,7 +111,7 @@ class SimulateConfig(Section):
 
 
 class AxisConfig(Section):
-    """The values of one axis: from lower to upper, a list, or a column of the table."""
+    """Values of one axis: from lower to upper, a list, or a column of the table."""
 
     lower: Finite | None = None
     """end of the range"""
@@ -130,21 +130,20 @@ class AxisConfig(Section):
 
 
 class DesignConfig(Section):
-    """A design of experiments: which values the axes take, one design point after the other."""
+    """Design of experiments: the values of the axes at each design point."""
 
-    # Which of the other keys a kind may have is refused where the design is made, with a sentence
-    # that says why.
+    # The design itself refuses keys that its kind cannot have, with a reason.
     design: Literal["grid", "list", "lhs", "sobol", "table", "product", "zip"]
-    """combination of the axes"""
+    """kind of design"""
     n: int | None = None
     """design points, for lhs and sobol"""
     axes: dict[str, AxisConfig] = {}
     """axes by name: a parameter, initial.STATE, gain.INPUT, offset.INPUT, delay, seed"""
-    # A section within itself: designs nest to any depth.
+    # Recursive: designs nest to any depth.
     of: list["DesignConfig"] = []
     """the designs of a product or a zip"""
     file: str | None = None
-    """a table: .csv, .txt, .tsv or .parquet"""
+    """file of a table: .csv, .txt, .tsv or .parquet"""
     seed: Annotated[int, Field(ge=0)] | None = None
     """seed of lhs and sobol; default from the sweep's"""
 
@@ -152,13 +151,13 @@ class DesignConfig(Section):
 class ReduceConfig(Section):
     """A result of each run."""
 
-    # Checked against the reducers where the sweep is put together: a path may lead to any function.
+    # Checked against the reducers where the sweep is assembled: a path may name any function.
     how: str
-    """a name, or package.module:function of one's own"""
+    """name of a reducer, or package.module:function of your own"""
     signal: str | None = None
-    """the output it is taken of"""
+    """output that is reduced"""
     input: str | None = None
-    """for margins: the input that the loop moves"""
+    """for margins: the input of the loop"""
     gain: Finite = 1.0
     """for margins: the feedback, input = -gain signal"""
 
@@ -169,31 +168,31 @@ class TrajectoriesConfig(Section):
     signals: list[str]
     """outputs to keep over time"""
     every: int = 1
-    """samples from one kept to the next"""
+    """samples between two kept ones"""
 
 
 class SweepConfig(DesignConfig):
-    """Many runs: a design, what is kept of each run, and how it is computed."""
+    """Many runs: a design, the results of each run, and options of the computation."""
 
     reduce: dict[str, ReduceConfig] = Field(default_factory=dict)
     """results of each run, by a name of your own"""
     trajectories: TrajectoriesConfig | None = None
-    """runs to keep whole"""
+    """runs to keep in full"""
     inputs: Literal["flights", "simulate"] | None = None
     """source of the inputs; default the flights, if there are any"""
     start: StartConfig | None = None
-    """the steady flight in which each run of a whole helicopter begins, the flights' sticks as
-    they are; what `simulate` makes begins as it says there"""
+    """steady flight in which each run of a full helicopter begins, with the flights' sticks
+    unchanged; runs of `simulate` begin as stated there"""
     solver: str | None = None
-    """exact, rk4 or one of diffrax's; exact for linear models"""
+    """exact, rk4 or a solver of diffrax; default exact for linear models"""
     substeps: int | None = None
-    """steps of the solver in a sample"""
+    """steps of the solver per sample"""
     precision: Literal["float64", "float32"] = "float64"
     """precision of the computation"""
     chunk: int | None = None
     """design points written at a time"""
     lanes: int | None = None
-    """batch size: design points computed side by side on a device"""
+    """batch size: design points computed in parallel on a device"""
     backend: Literal["auto", "xla", "fused"] = "auto"
-    """backend of the simulation: xla, sample by sample for a batch; fused, one program of
-    machine code for a run; auto, fused on CPUs if possible"""
+    """backend of the simulation: xla, sample by sample for a batch; fused, one program of machine
+    code for a run; auto, fused on CPUs if possible"""

@@ -20,15 +20,15 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
-# The records that a script fills (`Free`, `Prior`, `Nuisance`) have sections of their own, with
-# the same fields (a test holds that). Two, not one: pydantic would read a NamedTuple from a list as
-# well, call a misspelt key an unexpected argument, and write a list into the run's config.yaml; and
-# made of pydantic's classes they would bring it into the identification.
+# The records for scripts (`Free`, `Prior`, `Nuisance`) have separate sections with the same fields,
+# as a test checks. One class for both would not work. For a NamedTuple, pydantic accepts lists,
+# reports a misspelt key as an unexpected argument, and writes lists into the run's config.yaml.
+# Records as pydantic classes would bring pydantic into the identification.
 class LinearConfig(Section):
     """A model from a file (docs/linear-models.md)."""
 
     linear: str
-    """its path, or the name of a shipped one"""
+    """path of the file, or the name of a shipped model"""
 
 
 class TimeConfig(Section):
@@ -37,9 +37,9 @@ class TimeConfig(Section):
     unit: str = "s"
     """unit of the time stamps: s, ms, us or ns"""
     rate: Positive | None = None
-    """samples a second [Hz] of a file without times: of its rows, or of what `signal` counts"""
+    """samples a second [Hz] of a file without times: of its rows, or of the counts in `signal`"""
     runs: str | None = None
-    """the column that numbers the runs of a file that holds several: each becomes a flight"""
+    """column that numbers the runs of a file with several; each run becomes a flight"""
 
     @model_validator(mode="after")
     def _one_clock(self) -> "TimeConfig":
@@ -56,8 +56,8 @@ class InputConfig(LoggedInputConfig):
     hold: Literal["auto", "zero-order", "linear", "mixed"] = "auto"
     """motion between samples (docs/inputs.md); auto: decided from the log"""
     missing: Numbers | None = None
-    """numbers in the log, before scale and offset, that stand for no value, one or a list: the
-    input is taken as it was before"""
+    """numbers in the log, before scale and offset, that mean no value, one or a list; the input
+    then keeps its previous value"""
 
 
 class OutputConfig(ScaledConfig):
@@ -66,7 +66,7 @@ class OutputConfig(ScaledConfig):
     unit: str | None = None
     """unit after scale and offset"""
     sd: Positive | None = None
-    """standard deviation of its noise, in `unit`, as far as it is known"""
+    """standard deviation of its noise, in `unit`, if known"""
     filter: Filters | None = None
     """the autopilot's filters: from log, or one or several of {kind, hz, ...} (docs/onboard.md);
     [] for none"""
@@ -75,28 +75,27 @@ class OutputConfig(ScaledConfig):
     repeats: Literal["auto", "keep", "missing"] = "auto"
     """values that a logger repeats until the next sample (docs/logs.md)"""
     missing: Numbers | None = None
-    """numbers in the log, before scale and offset, that stand for no value: 0 of a sensor's
-    dropouts, or several as a list"""
+    """numbers in the log, before scale and offset, that mean no value, one or a list, such as 0 in
+    a sensor's dropouts"""
 
 
 class SignalsConfig(PresetConfig):
     time: TimeConfig | None = None
     """clock of a table; the topics of an autopilot's log have their own"""
-    # Names are checked where the model is known: what it has for inputs and outputs is not known
-    # here.
+    # Names are checked later, when the model's inputs and outputs are known.
     inputs: dict[str, InputConfig] = Field(default={})
     """the model's inputs, by its names"""
     outputs: dict[str, OutputConfig] = Field(default={})
     """the model's outputs, by its names"""
     instruments: dict[str, InputConfig] = Field(default={})
-    """by input, an excitation that was added to it and that no feedback reaches
+    """excitations by input that were added to it and that no feedback reaches
     (docs/frequency-fits.md)"""
 
 
 class AlignConfig(Section):
-    """A motion that both logs hold, from which the lag between their clocks is found."""
+    """A motion in both logs, from which the lag between their clocks is found."""
 
-    # A word of Python's own, so that the field has another name.
+    # `with` is a keyword of Python, so the field has another name.
     same: Annotated[str, Field(alias="with")]
     """a signal of the first log, by the model's name"""
     to: str
@@ -119,7 +118,7 @@ class AlsoConfig(Section):
     """A further log of the same flight (docs/logs.md)."""
 
     log: str
-    """the file; its path begins at the configuration"""
+    """path of the file, relative to the configuration's folder"""
     align: AlignConfig | None = None
     """search for the lag of its clock; without it both logs share one clock"""
     signals: AlsoSignalsConfig
@@ -129,7 +128,7 @@ class AlsoConfig(Section):
 
 
 def _one_log(value: Any) -> Any:
-    # A study takes the list away before: what still has one is read by another command.
+    # A study removes the list beforehand; a list here comes from another command.
     if isinstance(value, list):
         raise ValueError(
             "expected one log, got a list, which makes a study of fits (heli-jax fit, "
@@ -140,35 +139,35 @@ def _one_log(value: Any) -> Any:
 
 class FlightConfig(Section):
     log: Annotated[str, BeforeValidator(_one_log, json_schema_input_type=str | list[str])]
-    """the file; its path begins at the configuration. A list is a study with a fit for each
-    (docs/studies.md)"""
+    """path of the file, relative to the configuration's folder; a list makes a study with a fit for
+    each (docs/studies.md)"""
     signals: SignalsConfig
     """channels of the inputs and outputs"""
     flight: Annotated[int, Field(ge=1)] | None = None
     """number of the flight in a log of several, from 1"""
     name: str | None = None
-    """in tables and figures; 'flight 1' and so on unless given"""
+    """name in tables and figures; default 'flight 1' and so on"""
     rate: Positive | None = None
-    """samples a second [Hz] to resample to; the log's own unless given"""
-    # Increasing is checked where logs are read, for configurations and scripts alike.
+    """rate to resample to [Hz]; default the log's own"""
+    # The order is checked where logs are read, for configurations and scripts alike.
     window: tuple[Finite, Finite] | Literal["auto"] | None = None
-    """[s] from the log's beginning; auto: the windows that say most of what is free"""
+    """first and last time [s] from the log's beginning; auto: the most informative windows"""
     gaps: Literal["fail", "split"] = "fail"
-    """gaps too long to be bridged: refuse them, or make flights of the parts"""
+    """treatment of gaps too long to be bridged: fail, or split into flights"""
     also: list[AlsoConfig] = []
     """further logs of the same flight"""
-    # Such a run is predicted and never fitted: agreement with it is the only one that no free
-    # parameter was bent to.
+    # Such a run is predicted and never fitted, so agreement with it is independent of the free
+    # parameters.
     hold_out: bool = False
-    """true: predict it, do not fit it"""
+    """true: predict this flight, do not fit it"""
     known: dict[str, Finite] = {}
-    """parameters of the model that are known of this flight alone, in SI: {Ixx_added: 0.01}"""
+    """model parameters known for this flight only, in SI: {Ixx_added: 0.01}"""
     notch: Notches | None = None
-    """frequencies [Hz] that are taken out of inputs and outputs alike"""
+    """frequencies [Hz] to remove from inputs and outputs alike"""
     vibration: VibrationConfig | None = None
-    """the rotor's speed, by which lines of vibration are named"""
+    """rotor speed, which identifies vibration lines"""
     corrections: str | None = None
-    """a file of `heli-jax compatibility`: errors of the sensors, taken off the signals"""
+    """file of `heli-jax compatibility` with sensor errors, which are removed from the signals"""
 
 
 class PriorConfig(Section):
@@ -179,9 +178,9 @@ class PriorConfig(Section):
 
 
 class FreeConfig(Section):
-    # NaN and not None, as `Free` has it; a default is not validated, what a file says is.
+    # NaN and not None, as in `Free`; defaults are not validated, values in the file are.
     start: Finite = math.nan
-    """may be left out where the vehicle file has a value, or `fit.start` finds it"""
+    """start value; not needed if the vehicle file has a value or `fit.start` finds one"""
     lower: Finite | None = None
     """bound, in SI"""
     upper: Finite | None = None
@@ -189,8 +188,8 @@ class FreeConfig(Section):
     prior: PriorConfig | None = None
     """prior knowledge"""
     sign: Sign | None = None
-    """keep the sign of the start value, or any sign; default keep for a helicopter's parameters,
-    any for your own models"""
+    """keep the sign of the start value, or allow any sign; default keep for a helicopter's
+    parameters, any for your own models"""
 
 
 class NuisanceConfig(Section):
@@ -203,15 +202,15 @@ class NuisanceConfig(Section):
     input_gain: bool = False
     """true: estimate a factor of each input"""
     input_offset: bool | list[str] | None = None
-    """a constant added to the logged inputs, each flight its own: all, or those named; null: on for
-    the sticks of a vehicle in free flight"""
+    """estimate a constant added to the logged inputs, per flight: of all, or of those named; null:
+    on for the sticks of a vehicle in free flight"""
 
 
 class IntervalsConfig(Section):
-    """Intervals beside the Gaussian one."""
+    """Intervals besides the Gaussian ones."""
 
     profile: list[str] = []
-    """free parameters of which to compute the profile likelihood"""
+    """free parameters for profile-likelihood intervals"""
     bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 0
     """simulated records to refit; 0 for none"""
     nuts: Annotated[int, Field(ge=0, le=1_000_000)] = 0
@@ -219,12 +218,12 @@ class IntervalsConfig(Section):
 
 
 class ShootingConfig(Section):
-    """Multiple shooting: windows with initial states of their own."""
+    """Multiple shooting: windows with their own initial states."""
 
     window: Positive
     """length [s]"""
     continuity: Positive | None = None
-    """sd of each state's defect between windows (matching condition), as a part of the state's
+    """sd of each state's defect between windows (matching condition), relative to the state's
     range; null: free"""
 
 
@@ -235,16 +234,15 @@ class StartMethodConfig(Section):
     """Source of the free parameters' start values."""
 
     method: StartMethod = "given"
-    """equation-error: by regression of the records themselves, for linear models; frequency-error:
-    by a fit in frequency, from the starts that are given"""
+    """equation-error: by regression of the records, for linear models; frequency-error: by a fit in
+    frequency from the given starts"""
     stepwise: bool = False
-    """true: leave terms at zero that hardly help to predict"""
-    # Entry and removal have one limit unless stated; where its number comes from stands with
-    # `F_ENTER`.
+    """true: leave out terms that hardly improve the prediction"""
+    # By default entry and removal have one limit; `F_ENTER` documents its origin.
     f_enter: Positive = F_ENTER
-    """partial F-ratio from which on a term enters"""
+    """partial F-ratio above which a term enters"""
     f_remove: Positive = F_ENTER
-    """below which it is removed again"""
+    """partial F-ratio below which a term is removed again"""
 
     @model_validator(mode="after")
     def _consistent(self) -> "StartMethodConfig":
@@ -252,8 +250,7 @@ class StartMethodConfig(Section):
             raise ValueError(
                 f"stepwise: expected method: equation-error with it, got {self.method}"
             )
-        # A term that enters and at once falls below the limit of removal would be taken in and out
-        # for ever.
+        # A term below the limit of removal at its entry would enter and leave forever.
         if self.f_remove > self.f_enter:
             raise ValueError(
                 f"f_remove: expected at most f_enter ({self.f_enter:g}), got {self.f_remove:g}"
@@ -266,11 +263,11 @@ def _start_method(value: Any) -> Any:
 
 
 class FitConfig(Section):
-    # Of the table of estimators, so that a new one can be asked for without an entry here.
+    # From the table of estimators, so that a new one needs no entry here.
     method: Literal[tuple(METHODS)] = "output-error"  # pyright: ignore[reportInvalidTypeForm]
     """estimation method (docs/methods.md)"""
     also: list[Literal[tuple(METHODS)]] = []  # pyright: ignore[reportInvalidTypeForm]
-    """further methods by which the same is fitted, their estimates laid beside those of `method`"""
+    """further methods that fit the same problem, for comparison with `method`"""
     free: dict[str, FreeConfig]
     """parameters to estimate, by the model's names"""
     start: Annotated[
@@ -279,27 +276,27 @@ class FitConfig(Section):
     ] = StartMethodConfig()
     """given, equation-error, frequency-error, or {method: equation-error, stepwise: true}"""
     instrument: str | Annotated[list[str], Field(min_length=1)] | None = None
-    """in frequency: inputs that are taken by their instrument, or none; unless given, all of
-    which every flight holds one (docs/frequency-fits.md)"""
+    """in frequency: inputs used by their instrument, or none; default all inputs with an instrument
+    in every flight (docs/frequency-fits.md)"""
     nuisance: NuisanceConfig = NuisanceConfig()
     """nuisance parameters"""
     shooting: ShootingConfig | None = None
-    """windows with initial states of their own"""
+    """multiple shooting: windows with their own initial states"""
     starts: Annotated[int, Field(ge=1, le=10_000)] | None = None
-    """points to start from; default one, and restarts where a fit explains little"""
+    """number of start points; default one, and restarts if a fit explains little"""
     seed: Annotated[int, Field(ge=0)] = 0
     """seed of random starts, bootstrap and NUTS"""
     max_steps: Annotated[int, Field(ge=1)] = 200
     """most steps of the optimiser from each start"""
     compare: bool = False
-    """true: fit candidate models too: no disturbance, one pole, two poles; no stand; with
-    several disturbances all, and each left out"""
+    """true: also fit candidate models: no disturbance, one pole, two poles; no stand; with several
+    disturbances all, and each left out"""
     intervals: IntervalsConfig = IntervalsConfig()
-    """further intervals beside the Gaussian ones"""
+    """intervals besides the Gaussian ones"""
 
     @property
     def by_instrument(self) -> tuple[str, ...] | None:
-        """`instrument` as a `Problem` has it: () for none, None where nothing is stated."""
+        """`instrument` as in `Problem`: () for none, None if not stated."""
         if self.instrument == "none":
             return ()
         if self.instrument is None:
@@ -321,17 +318,16 @@ class FitConfig(Section):
 
 
 class RLSConfig(Section):
-    # Four is the order of the paper.
+    # Four is the order in the paper.
     order: Annotated[int, Field(ge=1, le=20)] = 4
     """order of the discrete transfer function"""
-    # One forgets nothing: all samples count alike, as for a vehicle that does not change in a
-    # record.
+    # With one, all samples count equally, as for a vehicle that does not change in a record.
     forgetting: Annotated[float, Field(gt=0, le=1)] = 1.0
     """factor by which each sample counts less than the next"""
 
 
 class ReportConfig(Section):
-    # Half a second of each fit, and a page shows none of them.
+    # A PNG takes half a second of each fit, and no page shows it.
     png: bool = False
     """true: write figures as PNG too, beside SVG"""
 
@@ -341,36 +337,37 @@ class Config(Section):
 
     model: str | LinearConfig
     """a model's name, package.module:name, or {linear: FILE}"""
-    # A file, or constants as in one: checked by the readers of vehicle files, with their messages.
+    # A file, or its constants; the readers of vehicle files check both.
     vehicle: str | dict[str, Any] | None = None
-    """may be left out where the model is a file: its own values are a vehicle"""
+    """vehicle file, or its constants; optional if the model is a file, which has values of its own
+    """
     corrections: dict[str, bool] | None = None
     """corrections of the paper's equations by name, on or off
     (`heli_jax.dynamics.helicopter.Corrections`); full helicopter only"""
     onboard: OnboardConfig | None = None
     """servos, rate loops, gyro, sensors and delays around the model (docs/onboard.md)"""
-    # Any: a number in SI or {value, unit}, as in a vehicle file and checked as there, where the
-    # model's units are known.
+    # Any: a number in SI or {value, unit}, as in a vehicle file. It is checked where the model's
+    # units are known.
     initial_state: dict[str, Any] = {}
-    """values of states at the first sample, in place of the model's own: for models that cannot
+    """values of states at the first sample, in place of the model's own; for models that cannot
     begin at zero"""
-    # May be missing: a simulation needs none.
+    # Optional: a simulation needs none.
     flights: list[FlightConfig] = []
     """the logged runs"""
     fit: FitConfig | None = None
     """estimation"""
-    # On unless switched off by `rls: null`: the baseline of the paper costs little.
+    # On by default: the paper's baseline takes little time.
     rls: RLSConfig | None = RLSConfig()
-    """the recursive least squares of the paper, beside the fit; null for none"""
+    """recursive least squares of the paper, besides the fit; null for none"""
     disturbance: DisturbanceConfig | None = None
-    """random pushes: drawn by simulate, estimated by filter error"""
+    """random disturbances: drawn by simulate, estimated by filter error"""
     frequency: FrequencyConfig | None = None
     """settings of `heli-jax frf` and of fit.method: frequency-response (docs/frequency-fits.md)"""
     report: ReportConfig = ReportConfig()
-    """files beside the page of `fit` and `frf`"""
+    """files besides the page of `fit` and `frf`"""
     simulate: SimulateConfig | None = None
     """a run that `heli-jax simulate` makes"""
     sweep: SweepConfig | None = None
     """many runs, for `heli-jax sweep`"""
     study: dict[str, list[Any]] | None = None
-    """by key the values that it takes in a study of fits: every combination (docs/studies.md)"""
+    """lists of values by key in a study of fits: every combination (docs/studies.md)"""

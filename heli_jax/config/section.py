@@ -1,4 +1,4 @@
-"""Base of every section of a configuration: frozen, without unknown keys, and of finite numbers."""
+"""Base of all configuration sections: frozen, without unknown keys, and with finite numbers."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -7,23 +7,23 @@ from pydantic import BaseModel, ConfigDict, ValidatorFunctionWrapHandler, field_
 
 
 class Section(BaseModel):
-    """The base of all sections."""
+    """Base of all sections."""
 
-    # An unknown key is an error: a misspelt `lower` would leave a parameter without a bound, a
-    # misspelt device its lag to the vehicle.
-    # What stands below a field is its meaning, in the JSON schema and for `heli-jax keys`.
+    # An unknown key is an error: a misspelt `lower` would leave a parameter without a bound, and
+    # the lag of a misspelt device would be attributed to the vehicle. The string below a field is
+    # its meaning in the JSON schema and for `heli-jax keys`.
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
     @field_validator("*", mode="wrap")
     @classmethod
     def _a_number_is_written_as_one(cls, value: Any, handler: ValidatorFunctionWrapHandler) -> Any:
-        # Python counts with True as with 1, and pydantic makes 1.0 of it and of "1": the JSON
-        # schema, by which an editor checks the file, takes neither.
+        # In Python True equals 1, and pydantic converts it and "1" to 1.0. The JSON schema, by
+        # which an editor checks the file, accepts neither.
         made = handler(value)
         for written, number in _numbers(value, made):
             if isinstance(written, bool) and number is not written:
                 raise ValueError(f"expected a number, got {str(written).lower()}")
-            # And a 1 is no true there.
+            # Nor is 1 accepted as true.
             if isinstance(number, bool) and not isinstance(written, bool | str):
                 raise ValueError(f"expected true or false, got {written}")
             if isinstance(written, str):
@@ -32,9 +32,9 @@ class Section(BaseModel):
         return made
 
 
-# Any: whatever stands in the file.
+# Any: the content of the file.
 def _numbers(written: Any, made: Any) -> Iterator[tuple[Any, int | float]]:
-    """Return the numbers of a field, each beside its text in the file."""
+    """Yield the numbers of a field, each with its text in the file."""
     if isinstance(made, int | float):
         yield written, made
     elif isinstance(made, Mapping) and isinstance(written, Mapping):

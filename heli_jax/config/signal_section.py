@@ -1,4 +1,4 @@
-"""The parts of the section `signals` that say what a channel's numbers mean."""
+"""Parts of the section `signals` that define the meaning of a channel's numbers."""
 
 from typing import Annotated, Any
 
@@ -18,7 +18,7 @@ class ScaledConfig(Section):
     scale: _Finite = 1.0
     """factor of the number in the log, after offset"""
     offset: _Finite = 0.0
-    """in the log's own numbers"""
+    """offset in the log's own numbers"""
     invert: bool = False
     """true: change the sign"""
 
@@ -31,17 +31,17 @@ class ScaledConfig(Section):
 
     @property
     def conversion(self) -> dict[str, Any]:
-        """The keywords of a `Signal` that say it."""
+        """Keywords of an equivalent `Signal`."""
         return {"scale": self.scale, "offset": self.offset, "invert": self.invert}
 
 
 class LoggedInputConfig(ScaledConfig):
-    """An input's channel, or its value where the log lacks it."""
+    """An input's channel, or its value if the log lacks it."""
 
     signal: str | None = None
     """a channel's or column's name in the log"""
     constant: _Finite | None = None
-    """in the stated unit"""
+    """value in the stated unit"""
 
     @model_validator(mode="after")
     def _one_of_two(self) -> "LoggedInputConfig":
@@ -58,22 +58,22 @@ Numbers = float | list[float]
 
 
 class CcpmConfig(Section):
-    """The servos of a swashplate and where they lift it (`heli_jax.flights.derived.Swashplate`)."""
+    """Servos of a swashplate and their geometry (`heli_jax.flights.derived.Swashplate`)."""
 
     servos: list[str]
     """the channels of the servos"""
     angles: list[_Finite]
-    """[deg] of each, clockwise from the nose, seen from above"""
+    """angle of each servo [deg], clockwise from the nose, seen from above"""
     radius: Numbers = 1.0
     """distance of each servo from the mast, in any one unit"""
     offset: Numbers = 0.0
     """position of each servo at rest, in the log's numbers"""
     scale: Numbers = 1.0
-    """lift for a unit of the log"""
+    """lift per unit of the log"""
     invert: bool | list[bool] = False
     """true for a servo that moves the other way"""
     phase: _Finite = 0.0
-    """[deg] by which the plate leads the blades"""
+    """angle by which the plate leads the blades [deg]"""
 
     @model_validator(mode="after")
     def _regular(self) -> "CcpmConfig":
@@ -81,10 +81,10 @@ class CcpmConfig(Section):
         return self
 
     def swashplate(self) -> Swashplate:
-        """The geometry.
+        """Return the geometry.
 
         Raises:
-            ValueError: it does not tell collective from cyclic, or a list is of the wrong length.
+            ValueError: it does not separate collective from cyclic, or a list has the wrong length.
         """
         count = len(self.servos)
 
@@ -103,18 +103,18 @@ class CcpmConfig(Section):
 
 
 def _of_those_that_ship(schema: dict[str, Any]) -> None:
-    """Names the presets in the JSON schema, for editors to offer."""
+    """List the presets in the JSON schema, as suggestions for editors."""
     text = next(option for option in schema["anyOf"] if option["type"] == "string")
     text["enum"] = list(presets())
 
 
 class PresetConfig(Section):
-    """Signals that come from a table or from a geometry (docs/logs.md)."""
+    """Signals from a table or from a geometry (docs/logs.md)."""
 
     preset: Annotated[str | None, Field(json_schema_extra=_of_those_that_ship)] = None
-    """the table of an autopilot; what `inputs` and `outputs` name goes before it"""
+    """table of an autopilot; `inputs` and `outputs` override it"""
     preset_outputs: list[str] | None = None
-    """the outputs to take from it; all that it can supply unless given"""
+    """outputs to take from it; default all that it can supply"""
     ccpm: CcpmConfig | None = None
     """swashplate servos from which `ccpm.collective`, `ccpm.roll` and `ccpm.pitch` are computed"""
 

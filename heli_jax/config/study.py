@@ -1,4 +1,4 @@
-"""The study of fits that a configuration describes: which keys take which values."""
+"""Study of fits of a configuration: keys that take several values."""
 
 import copy
 import glob
@@ -21,24 +21,24 @@ from heli_jax.errors import InputError
 from heli_jax.yaml_file import parse_value
 
 _MOST = 100_000
-"""fits: each has a directory of its own"""
+"""Most fits; each has a directory of its own."""
 
 _LONGEST_PATTERN = 4096
-"""letters, as many as a path has"""
+"""Longest pattern [characters], the length of a path."""
 
-# What YAML holds is Any below: a number, a text, a list or a section.
+# YAML content is Any below: a number, a text, a list or a section.
 Axes = dict[str, tuple[Any, ...]]
 
 
 class Study(NamedTuple):
-    """A configuration of which some keys take several values."""
+    """A configuration in which some keys take several values."""
 
     path: Path
-    """of the configuration; relative paths begin at its folder"""
+    """The configuration file; relative paths begin at its folder."""
     content: dict[str, Any]
-    """as YAML holds it, without the study"""
+    """Content of the YAML file without the study."""
     axes: Axes
-    """by key its values, in the order of the Dataset's dimensions"""
+    """Values by key, in the order of the Dataset's dimensions."""
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -51,24 +51,24 @@ class Study(NamedTuple):
         return math.prod(self.shape)
 
     def points(self) -> list[dict[str, Any]]:
-        """By fit the value of each key, the last axis fastest."""
+        """Return the value of each key by fit, the last axis fastest."""
         rows = itertools.product(*self.axes.values())
         return [dict(zip(self.axes, row, strict=True)) for row in rows]
 
     def content_at(self, point: Mapping[str, Any]) -> dict[str, Any]:
-        """The configuration of one fit.
+        """Return the configuration of one fit.
 
         Args:
-            point: of `points`.
+            point: one of `points`.
         """
         content = copy.deepcopy(self.content)
         for key, value in point.items():
-            # A value may be a section, which the next key is set in.
+            # A value may be a section in which the next key sets a value.
             set_value(content, key, copy.deepcopy(value), f"{self.path}: study.{key}")
         return content
 
     def described(self) -> dict[str, Any]:
-        """All that fixes the fits, as plain data; logs by their paths.
+        """Return all settings of the fits as plain data; logs by their paths.
 
         Raises:
             InputError: the first fit's configuration is wrong.
@@ -83,20 +83,21 @@ def read_study(
     overrides: Sequence[str] | Mapping[str, Any] = (),
     over: Sequence[str] | Mapping[str, Sequence[Any]] = (),
 ) -> Study | None:
-    """The study that a configuration or its overrides ask for; None where they ask for one fit.
+    """Return the study of a configuration or its overrides; None for a single fit.
 
     Args:
-        overrides: as of `load`; a key that is set several times by texts takes each value.
-        over: values by key, or as on the command line, `fit.free.a.start=4,5,6`: what stands behind
-            = is a list of YAML without its brackets.
+        path: the configuration file.
+        overrides: as in `load`; a key that several texts set takes each value.
+        over: values by key, or as on the command line, `fit.free.a.start=4,5,6`: a YAML list
+            without its brackets after =.
 
     Raises:
-        InputError: something of the file or of an option is wrong.
+        InputError: something in the file or an option is wrong.
     """
     path = Path(path)
     single, repeated = _told_apart(overrides)
     content = read_overridden(path, single)
-    # A value in place of an axis of the file is that of all fits, as for any other key.
+    # A single override replaces an axis of the file, as for any other key.
     named = single if isinstance(single, Mapping) else [parse_override(t)[0] for t in single]
     stated = {k: v for k, v in _section(content, path).items() if k not in named}
     axes = {**_listed_logs(content, path), **stated, **repeated, **_over(over)}
@@ -115,7 +116,7 @@ def read_study(
 def _told_apart(
     overrides: Sequence[str] | Mapping[str, Any],
 ) -> tuple[Sequence[str] | Mapping[str, Any], Axes]:
-    """The overrides of one value, and by key the values of those that are given several times."""
+    """Return the overrides with one value, and the values by key of those given several times."""
     if isinstance(overrides, Mapping):
         return overrides, {}
     parsed = [parse_override(text) for text in overrides]
@@ -137,7 +138,7 @@ def _over(over: Sequence[str] | Mapping[str, Sequence[Any]]) -> Axes:
         if key in axes:
             raise InputError(f"{where}: {key} is given twice, expected all its values in one")
         listed = parse_value(f"[{values}]", where)
-        # One in brackets is one value that is a list: of windows, say.
+        # One value in brackets is a list as a value, for example of windows.
         if not isinstance(listed, list) or len(listed) < 2:
             raise InputError(
                 f"{where}: expected two values at least, with commas between them and no brackets "
@@ -148,7 +149,7 @@ def _over(over: Sequence[str] | Mapping[str, Sequence[Any]]) -> Axes:
 
 
 def _listed_logs(content: dict[str, Any], path: Path) -> Axes:
-    """The flights that have a list of logs."""
+    """Return the flights that have a list of logs."""
     axes: Axes = {}
     flights = content.get("flights")
     for i, flight in enumerate(flights if isinstance(flights, list) else ()):
@@ -158,7 +159,7 @@ def _listed_logs(content: dict[str, Any], path: Path) -> Axes:
 
 
 def _section(content: dict[str, Any], path: Path) -> Axes:
-    """The section `study`, which is taken out of the configuration."""
+    """Remove the section `study` from the configuration and return it."""
     stated = content.pop("study", None)
     if stated is None:
         return {}
@@ -168,7 +169,7 @@ def _section(content: dict[str, Any], path: Path) -> Axes:
 
 
 def _values(values: Any, where: str) -> tuple[Any, ...]:
-    # Of a script, which counts with NumPy.
+    # Values from a script may be NumPy arrays.
     values = values.tolist() if hasattr(values, "tolist") else values
     if isinstance(values, str | Mapping) or not isinstance(values, Sequence) or not values:
         raise InputError(f"{where}: expected a list of values, got {values!r:.60}")
@@ -176,7 +177,7 @@ def _values(values: Any, where: str) -> tuple[Any, ...]:
 
 
 def _logs(key: str, values: tuple[Any, ...], path: Path) -> tuple[Any, ...]:
-    """The values, patterns of logs' names in them replaced by the files of such names."""
+    """Replace patterns of log names in the values by the matching files."""
     if not key.endswith(".log"):
         return values
     folder = path.absolute().parent
@@ -185,7 +186,7 @@ def _logs(key: str, values: tuple[Any, ...], path: Path) -> tuple[Any, ...]:
         if isinstance(value, str) and len(value) > _LONGEST_PATTERN:
             problem = f"expected a name of at most {_LONGEST_PATTERN} letters, got {len(value)}"
             raise InputError(f"{path}: {key}: {problem}")
-        # A file may be called so all the same.
+        # A file may have a name that looks like a pattern.
         if not isinstance(value, str) or not glob.has_magic(value) or (folder / value).exists():
             named.append(value)
             continue

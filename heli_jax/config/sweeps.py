@@ -1,4 +1,4 @@
-"""The sweep that a configuration describes."""
+"""Sweep of a configuration."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -28,12 +28,12 @@ def simulates(experiment: Experiment) -> bool:
     """True if `simulate` makes the sweep's inputs.
 
     Raises:
-        InputError: there is no sweep, or nothing to take the inputs from.
+        InputError: there is no sweep, or no source of inputs.
     """
     config, path = experiment.config, experiment.path
     if config.sweep is None:
         raise InputError(f"{path}: sweep: missing, expected a design with axes and results")
-    # Logs come first: a configuration with both was written for a fit, and `simulate` made its log.
+    # Logs have priority: a configuration with both was written for a fit of a simulated log.
     source = config.sweep.inputs or ("flights" if config.flights else "simulate")
     if source == "flights" and not config.flights:
         raise InputError(f"{path}: sweep.inputs: there are no flights, expected at least one log")
@@ -50,32 +50,34 @@ def sweep_job(
     trimmed: Trimmed | None = None,
     pilot: Pilot | None = None,
 ) -> Job:
-    """The sweep of a configuration, checked; its logs and tables are read.
+    """Return the sweep of a configuration, checked, with its logs and tables read.
 
     Args:
-        made: the flight that `simulate` makes; the logs are read unless given.
-        trimmed: the steady flight in which each run of `made` begins.
+        experiment: the configuration.
+        made: flight made by `simulate`; by default the logs are read.
+        trimmed: steady flight in which each run of `made` begins.
+        pilot: attitude feedback of the simulated pilot, if any.
 
     Raises:
-        InputError: something of it cannot be; the sentence says what and where.
+        InputError: a part is invalid; the sentence states which and where.
     """
     sweep, path = experiment.config.sweep, experiment.path
-    # `simulates` has refused a configuration without one, and has to be asked first, for where
-    # inputs come from.
+    # `simulates` has refused a configuration without a sweep; it must be called first to find the
+    # source of inputs.
     assert sweep is not None
     where = f"{path}: sweep"
     model, params = _model(experiment, sweep)
     reduce = {n: _reduce(r, f"{where}.reduce.{n}", path) for n, r in sweep.reduce.items()}
     kept = sweep.trajectories
-    # Inputs that never move say nothing of parameters, but a sweep may want just that run.
+    # Constant inputs do not identify parameters, but are valid in a sweep.
     flights = (made,) if made is not None else read_flights(experiment)
     if sweep.start is not None:
-        # Two beginnings would contradict each other.
+        # Two starts would contradict each other.
         if made is not None:
             raise InputError(f"{where}.start: expected simulate.start, which makes the inputs")
-        # A logged stick is the whole stick and has the trim in it: it would be added twice.
+        # A logged stick already includes the trim, which must not be added twice.
         trimmed = Trimmed(Condition(**sweep.start.model_dump()), sticks=False, of=experiment.model)
-    # An initial state would be overwritten by the trim without a word.
+    # The trim would silently overwrite an initial state.
     if trimmed is not None and experiment.config.initial_state:
         raise InputError(
             f"{path}: initial_state: each element of this sweep begins in a trim of its own, "
@@ -100,16 +102,16 @@ def sweep_job(
 
 
 def _model(experiment: Experiment, sweep: SweepConfig) -> tuple[Model, Any]:
-    """The model, with the disturbance where an axis is one of its."""
+    """Return the model, with the disturbance if an axis belongs to it."""
     plain, disturbance = naming.names(experiment.model.Params), experiment.config.disturbance
     values = {} if disturbance is None else disturbance.parameters
-    # A model of one's own may have a parameter called sigma_w, which is then no disturbance's.
+    # A user's model may have a parameter named sigma_w, which is not the disturbance's.
     drawn = [n for n in _axes(sweep) if n in ("seed", *values) and n not in plain]
-    # Without such an axis nothing is drawn, and the states of a disturbance would only cost time.
+    # Without such an axis nothing is drawn, and a disturbance's states would only cost time.
     if not drawn or disturbance is None:
         return experiment.model, experiment.vehicle.params
     for name, value in values.items():
-        # Filter error guesses what is left out from a record; a sweep has no record to guess from.
+        # Filter error guesses missing values from a record; a sweep has no record.
         if value is None and name not in drawn:
             raise InputError(
                 f"{experiment.path}: disturbance.{name}: missing, expected a number to draw it with"
@@ -127,7 +129,11 @@ def _axes(section: DesignConfig) -> list[str]:
 
 
 def _design(section: DesignConfig, model: Model, path: Path, seed: int) -> Design:
-    """The design of experiments that a section describes; ValueError where it cannot be."""
+    """Return the design of experiments of a section.
+
+    Raises:
+        ValueError: the section is invalid.
+    """
     kind = section.design
     seed = seed if section.seed is None else section.seed
     if kind in ("product", "zip"):
@@ -148,18 +154,18 @@ def _design(section: DesignConfig, model: Model, path: Path, seed: int) -> Desig
 
 
 def _of_designs(section: DesignConfig, model: Model, path: Path, seed: int) -> Design:
-    """A product or a zip of the designs below `of`."""
+    """Return a product or a zip of the designs below `of`."""
     _refuse(section, ("axes", "n", "file"), f"a {section.design} has designs in 'of'")
     parts = []
     for i, part in enumerate(section.of):
         try:
-            # No two parts, however deep, draw the same; not seed + i: the second part of one seed
-            # would be the first of the next.
+            # No two parts, at any depth, draw the same values. Not seed + i: the second part of one
+            # seed would equal the first of the next.
             own = np.random.SeedSequence(seed, spawn_key=(i,)).generate_state(1)[0]
             parts.append(_design(part, model, path, int(own)))
         except InputError:
             raise
-        except ValueError as e:  # the place grows from the inside out: of[0].of[1].axes.a
+        except ValueError as e:  # the place grows outward: of[0].of[1].axes.a
             raise ValueError(f"of[{i}].{e}") from e
     combine: Callable[..., Design] = {"product": designs.product, "zip": designs.zipped}[
         section.design
@@ -167,7 +173,7 @@ def _of_designs(section: DesignConfig, model: Model, path: Path, seed: int) -> D
     return combine(*parts)
 
 
-# Said, not ignored: who gives a key that is not used believes that it acts.
+# Refused, not ignored: a user expects every stated key to act.
 def _refuse(section: DesignConfig, keys: tuple[str, ...], why: str) -> None:
     for key in keys:
         if getattr(section, key):
@@ -178,10 +184,10 @@ def _range(name: str, axis: AxisConfig, model: Model, path: Path) -> Range:
     for key in ("values", "column", "n"):
         if getattr(axis, key) is not None:
             raise ValueError(f"axes.{name}.{key}: expected lower and upper here")
-    # Neither has a default: what is a wide range of one parameter is a narrow one of another.
+    # No default: a range may be wide for one parameter and narrow for another.
     if axis.lower is None or axis.upper is None:
         raise ValueError(f"axes.{name}: expected lower and upper")
-    # A logarithmic axis stays one in SI, since units of parameters have no offset.
+    # A logarithmic axis stays one in SI, because units of parameters have no offset.
     scale = _scale(name, axis, model, path)
     return Range(axis.lower * scale, axis.upper * scale, axis.scale)
 
@@ -190,7 +196,7 @@ def _points(name: str, axis: AxisConfig, model: Model, path: Path) -> Any:
     if axis.column is not None:
         raise ValueError(f"axes.{name}.column: only a table has columns")
     if axis.values is None:
-        # n is the grid's own: a range with it is refused where a design draws its points.
+        # Only a grid has n: a design that draws its points refuses a range with it.
         points = axis.model_copy(update={"n": None})
         return _range(name, points, model, path)._replace(n=axis.n)
     for key in ("lower", "upper", "n"):
@@ -205,15 +211,14 @@ def _table(section: DesignConfig, model: Model, path: Path) -> Design:
         raise ValueError("file: missing, expected a table in CSV or Parquet")
     if not section.axes:
         raise ValueError("axes: expected at least one, as Ixx: {} for a column Ixx, got none")
-    # By the readers of logs: a table of values has the same formats, and the same sentences on what
-    # is wrong in it.
+    # Read like a log, with the same formats and messages.
     source = open_table(path.parent / section.file)
     for name, axis in section.axes.items():
         for key in ("lower", "upper", "values", "n"):
             if getattr(axis, key) is not None:
                 raise ValueError(f"axes.{name}.{key}: the table has the values")
     columns = {name: axis.column or name for name, axis in section.axes.items()}
-    # Each column once, though two axes may share one.
+    # Each column once, because two axes may share one.
     numbers = source.numbers(list(dict.fromkeys(columns.values())))
     scaled: dict[str, np.ndarray] = {
         name: numbers[columns[name]] * _scale(name, axis, model, path)
@@ -229,15 +234,15 @@ def _scale(name: str, axis: AxisConfig, model: Model, path: Path) -> float:
     if axis.unit is None:
         return 1.0
     try:
-        # A seed and a model's own parameter may have no unit, and then take a plain number alone.
+        # A seed and a user's parameter may have no unit; they take only plain numbers.
         return units.factor(axis.unit, axis_unit(model, name) or "1")
     except ValueError as e:
         raise ValueError(f"axes.{name}.unit: {e}") from e
 
 
 def _reduce(section: ReduceConfig, where: str, path: Path) -> Reduce:
-    reducer: Any = section.how  # a name, or what a path leads to: anything at all
-    # Our own names first, so that no module of the user's changes what rms means.
+    reducer: Any = section.how  # Any: a name, or any object at a path
+    # Our own names first, so that no user module changes the meaning of rms.
     if reducer not in REDUCERS and reducer not in LINEAR and is_path(reducer):
         reducer = by_path(reducer, f"{where}.how", path.absolute().parent)
         if not callable(reducer) and not isinstance(reducer, Streaming):

@@ -1,4 +1,4 @@
-"""Lines of vibration in the flights of a configuration: named, and taken out where it says so."""
+"""Vibration lines in a configuration's flights: identified, and removed on request."""
 
 import dataclasses
 import math
@@ -26,29 +26,31 @@ from heli_jax.flights.vibration import (
 )
 
 _Q = 10.0
-"""of the notches: a rotor whose speed wanders by two percent stays within"""
+"""Q of the notches: a rotor speed that varies by two percent stays within."""
 _LEFT = 0.5
-"""part of an output's samples that notches have to leave"""
+"""Smallest share of an output's samples that notches must leave."""
 _NAMED = 3
-"""lines that are told of an output"""
+"""Most lines in the note of an output."""
 _FASTEST_ROTOR = 500.0
-"""rad/s, or 4800 rpm: the smallest vehicles stay below"""
+"""Fastest rotor [rad/s], or 4800 rpm; the smallest vehicles stay below."""
 
 
 def with_notches(flight: Flight, frequencies: Sequence[float], where: str) -> Flight:
-    """The flight without some frequencies, in its inputs and outputs alike.
+    """Return the flight with notches at some frequencies in its inputs and outputs alike.
 
-    A linear vehicle answers notched sticks with notched motion, so nothing is biased; notched on
-    one side alone, the notch's lag would be taken for the vehicle's. An output that was sampled too
-    slowly to have a frequency stays as it is there: of what it does have the notch takes nothing,
-    and each lag is at most 3 % of its own step.
+    A linear vehicle responds to notched sticks with notched motion, so the estimates are not
+    biased. With notches on one side only, their lag would be attributed to the vehicle. An output
+    sampled too slowly for a frequency is not notched there; the lag that is missing is at most 3 %
+    of its step.
 
     Args:
-        frequencies: [Hz]; none leaves it as it is.
+        flight: the flight.
+        frequencies: [Hz]; none leaves the flight unchanged.
+        where: place in the configuration, for messages.
 
     Raises:
-        InputError: a frequency that the samples do not have, or an output with so many gaps that
-            the notches hardly ever settle.
+        InputError: a frequency above the Nyquist frequency, or an output with so many gaps that the
+            notches hardly ever settle.
     """
     if not frequencies:
         return flight
@@ -75,7 +77,7 @@ def with_notches(flight: Flight, frequencies: Sequence[float], where: str) -> Fl
 
 
 def _too_slow(flight: Flight, frequencies: Sequence[float]) -> tuple[Finding, ...]:
-    """A note for each output without samples enough to have some frequencies."""
+    """Return a note for each output that is sampled too slowly for some frequencies."""
     notes = []
     for name, y in flight.outputs.items():
         rate = 1.0 / (slow_step(y) * flight.dt)
@@ -94,7 +96,7 @@ def _too_slow(flight: Flight, frequencies: Sequence[float]) -> tuple[Finding, ..
 def _lost(
     flight: Flight, outputs: Mapping[str, np.ndarray], settled: float, where: str
 ) -> tuple[Finding, ...]:
-    """A note for each output on the samples lost by notches that restart after a gap."""
+    """Return a note for each output on the samples lost by notches that restart after a gap."""
     notes = []
     for name, y in flight.outputs.items():
         there, left = int(np.isfinite(y).sum()), int(np.isfinite(outputs[name]).sum())
@@ -115,7 +117,7 @@ def _lost(
 def vibration_notes(
     experiment: Experiment, flight: Flight, config: FlightConfig, where: str
 ) -> tuple[Finding, ...]:
-    """A note for each output with strong lines in its spectrum.
+    """Return a note for each output with strong lines in its spectrum.
 
     Raises:
         InputError: the stated speed has a unit that is none of a rotor.
@@ -136,7 +138,7 @@ def vibration_notes(
 def _rotor_hz(
     experiment: Experiment, flight: Flight, config: FlightConfig, where: str
 ) -> float | None:
-    """Turns per second, as stated, recorded, or known of the vehicle."""
+    """Return turns per second, as stated, recorded, or known for the vehicle."""
     if config.vibration is not None:
         unit = config.vibration.unit
         with located(f"{where}.vibration.unit"):
@@ -152,10 +154,11 @@ def _rotor_hz(
 
 
 def _rotor_doubt(vibration: VibrationConfig, speed: float) -> tuple[Finding, ...]:
-    """A finding where a rotor's stated speed is none, or its unit is not stated.
+    """Return a finding if a rotor's stated speed is implausible, or its unit is not stated.
 
     Args:
-        speed: what it states [rad/s].
+        vibration: the section.
+        speed: stated speed [rad/s].
     """
     if speed > _FASTEST_ROTOR:
         words = (

@@ -1,7 +1,7 @@
-"""Logged runs: the one place where log files are read, units converted and clocks checked.
+"""Logged runs: the only place where log files are read, units converted and clocks checked.
 
-Any function here raises `heli_jax.errors.InputError` for a wrong file or request: one sentence that
-names the place, what was expected and what was found.
+Any function here raises `heli_jax.errors.InputError` for a wrong file or request: one sentence with
+the place, the expected and the actual content.
 """
 
 from heli_jax.flights.describe import ColumnInfo, Gap, LogInfo, TimeInfo, describe_log

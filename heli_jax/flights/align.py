@@ -1,14 +1,14 @@
-"""By how much one log's clock is behind another's, from a signal that both hold.
+"""Delay of one log's clock behind another's, from a signal in both logs.
 
-The lag where the correlation coefficient of the two is largest, over all lags that leave enough of
-both; then to a part of a sample by least squares,
+First, the lag with the largest correlation coefficient is found, over all lags with enough overlap.
+Then least squares refines it to a part of a sample,
 
     a(t) = g b(t - lag) + c + d t + e(t),
 
 where g, c and d allow for a scale, a bias and its drift. The standard deviation of the lag is that
-of least squares with autocorrelated errors: the curvature of the sum of squares, which the shape of
-the signal gives, and the spectrum of what is left (L. Ljung, System Identification, 1999, section
-9.4; with white errors it is the Cramer-Rao bound of a delay).
+of least squares with autocorrelated errors. It follows from the curvature of the sum of squares and
+the spectrum of the residual (L. Ljung, System Identification, 1999, section 9.4). With white errors
+it is the Cramer-Rao bound of a delay.
 """
 
 from typing import Any, NamedTuple
@@ -18,29 +18,30 @@ import numpy as np
 from heli_jax.flights.resample import Timed, in_gaps, own_clock, resampled, usual_step
 
 BAND = 0.2
-"""of the slower signal's rate: what is faster is taken away, and cubics pass what is left"""
+"""Cutoff of the low-pass filter, relative to the slower signal's rate; cubic splines follow slower
+motion."""
 LEAST = 0.8
-"""correlation below which two signals are not taken for the same motion"""
+"""Smallest correlation of two signals of the same motion."""
 _RIVAL = 2.0
-"""times the unexplained variance of the best lag, up to which another explains nearly as well"""
+"""Ratio of unexplained variances below which another lag is nearly as good as the best."""
 _SHARE = 0.3
-"""of the shorter signal that the two overlap by, at least"""
+"""Smallest overlap, relative to the shorter signal."""
 _FEWEST = 40
-"""common samples at least"""
+"""Fewest common samples."""
 _REACH = 3.0
-"""steps from the best shift, within which the lag is"""
+"""Largest distance of the lag from the best shift [steps]."""
 
 
 class Lag(NamedTuple):
     """Correction of the second clock, with its standard deviation."""
 
     lag: float
-    """[s]"""
+    """Correction [s]."""
     sd: float
-    """[s]"""
+    """Standard deviation [s]."""
     correlation: float
     overlap: float
-    """[s]"""
+    """Overlap [s]."""
 
 
 class NotAligned(ValueError):
@@ -51,19 +52,20 @@ def lag_between(a: Timed, b: Timed) -> Lag:
     """Return the correction of the stamps of `b` that aligns its motion with that of `a`.
 
     Args:
-        a: a signal on its clock; the unit may be another than that of `b`.
+        a: a signal on its clock.
+        b: the other signal; its unit may differ.
 
     Raises:
-        NotAligned: too short, too weakly correlated, against one another, or ambiguous.
+        NotAligned: too short, too weakly correlated, opposite in sign, or ambiguous.
     """
     a, b = own_clock(a), own_clock(b)
-    # Each from its own beginning: an epoch's digits would cost those of the lag.
+    # Each counts from its own beginning: an epoch's digits would cost precision of the lag.
     first_a, first_b = float(a.seconds[0]), float(b.seconds[0])
     a, b = Timed(a.seconds - first_a, a.values), Timed(b.seconds - first_b, b.values)
     step = max(usual_step(a.seconds), usual_step(b.seconds))
     (at_a, even_a), (at_b, even_b) = _even(a, step), _even(b, step)
     shift, correlation = _coarse(even_a, even_b)
-    # Sample k of a is beside sample k - shift of b.
+    # Sample k of a matches sample k - shift of b.
     lag = at_a - at_b + shift * step
     first, last = max(0, shift), min(even_a.size, even_b.size + shift)
     x, t = even_a[first:last], at_a + step * np.arange(first, last)
@@ -72,7 +74,7 @@ def lag_between(a: Timed, b: Timed) -> Lag:
 
 
 def _even(signal: Timed, step: float) -> tuple[float, np.ndarray]:
-    """First time and samples (N,) at even steps [s] of what is slow in a signal, NaN in gaps."""
+    """Return first time and low-passed samples (N,) at even steps [s], NaN in gaps."""
     seconds, values = signal
     seen = np.isfinite(values)
     if seen.sum() < _FEWEST:
@@ -95,20 +97,20 @@ def _low_passed(x: np.ndarray) -> np.ndarray:
     taps = np.asarray(firwin(31, 2.0 * BAND, window="hamming"))
     seen = np.isfinite(x)
     middle = float(np.mean(x[seen]))
-    # Weights of missing samples go to their neighbours, so that a gap's edge is not drawn to zero.
+    # Weights of missing samples go to their neighbours, so that a gap's edge is not pulled to zero.
     known = np.convolve(seen.astype(float), taps, "same")
     sums = np.convolve(np.where(seen, x - middle, 0.0), taps, "same")
     return np.where(seen & (known > 0.5), middle + sums / np.where(known > 0.5, known, 1.0), np.nan)
 
 
 def _coarse(a: np.ndarray, b: np.ndarray) -> tuple[int, float]:
-    """The shift [steps] of b (M,) that correlates best with a (N,), and the coefficient.
+    """Return the shift [steps] of b (M,) that correlates best with a (N,), and the coefficient.
 
     Raises:
         NotAligned: no shift does, or several do.
     """
     r = correlations(a, b)
-    # As where sample k of a stands beside sample k - shift of b.
+    # Sample k of a matches sample k - shift of b.
     shifts = np.arange(-(b.size - 1), a.size)
     best = int(np.argmax(r))
     if r[best] < LEAST:
@@ -119,22 +121,21 @@ def _coarse(a: np.ndarray, b: np.ndarray) -> tuple[int, float]:
                 "sign, or `reverse: true`"
             )
         raise NotAligned(
-            f"they are hardly correlated ( {r[best]:.2f} at the best lag), expected at least "
-            f"{LEAST}"
+            f"they are hardly correlated ({r[best]:.2f} at the best lag), expected at least {LEAST}"
         )
     rival = other_peak(r, best)
     if rival is not None and 1.0 - r[rival] ** 2 < _RIVAL * (1.0 - r[best] ** 2):
         raise NotAligned(
-            f"{abs(int(shifts[best] - shifts[rival]))} samples apart two lags explain nearly the "
-            f"same (correlations {r[best]:.4f} and {r[rival]:.4f}); expected a signal that does "
+            f"{abs(int(shifts[best] - shifts[rival]))} samples apart two lags fit nearly equally "
+            f"well (correlations {r[best]:.4f} and {r[rival]:.4f}); expected a signal that does "
             "not repeat itself"
         )
     return int(shifts[best]), float(r[best])
 
 
 def other_peak(r: np.ndarray, best: int) -> int | None:
-    """The highest maximum outside the hill of the best."""
-    # Down both sides to where it turns: what is on the hill is the same solution.
+    """Return the highest maximum outside the peak of the best."""
+    # Down both sides to the minima: everything on this peak is the same solution.
     left, right = best, best
     while left > 0 and r[left - 1] < r[left]:
         left -= 1
@@ -146,12 +147,15 @@ def other_peak(r: np.ndarray, best: int) -> int | None:
 
 
 def correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Correlation coefficient (N + M - 1,) of a (N,) and b (M,) over what overlaps at each shift,
-    -1 < 0 < 1; zero where that is too short."""
+    """Return the correlation coefficient (N + M - 1,) of a (N,) and b (M,) at each shift.
+
+    It is between -1 and 1, computed over the overlap, and zero if the overlap is too short.
+    """
     from scipy.signal import correlate
 
     seen_a, seen_b = np.isfinite(a).astype(float), np.isfinite(b).astype(float)
-    # By the means of the whole: sums of squares of large numbers would lose the small motion.
+    # The overall means are subtracted first: sums of squares of large numbers would lose a small
+    # motion.
     x, y = np.nan_to_num(a - np.nanmean(a)), np.nan_to_num(b - np.nanmean(b))
 
     def sums(u: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -164,7 +168,7 @@ def correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     var_b = sums(seen_a, y**2) / n - mean_b**2
     size = np.sqrt(np.maximum(var_a, 0.0) * np.maximum(var_b, 0.0))
     shortest = max(_FEWEST, _SHARE * min(seen_a.sum(), seen_b.sum()))
-    # Where one of the two hardly moves within the overlap anything correlates by chance.
+    # If one of the two hardly moves within the overlap, correlation is by chance.
     enough = (n >= shortest) & (var_a > 0.05 * np.var(x)) & (var_b > 0.05 * np.var(y))
     if not enough.any():
         raise NotAligned("they are too short or too still to be compared")
@@ -174,13 +178,15 @@ def correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _refined(
     t: np.ndarray, x: np.ndarray, first: float, samples: np.ndarray, near: float, step: float
 ) -> tuple[float, float]:
-    """The lag of least squares, and its standard deviation, both [s].
+    """Return the least-squares lag and its standard deviation, both [s].
 
     Args:
         t: times of x [s].
-        x: the first signal (n,), NaN where it is missing, and so are others.
-        first: time [s] of the first of the second signal's `samples` (M,), a `step` [s] apart.
-        near: a lag within a step or two of it.
+        x: the first signal (n,), NaN if missing.
+        first: time [s] of the first of `samples`.
+        samples: the second signal (M,), a `step` [s] apart, NaN if missing.
+        near: a lag within a step or two of the solution.
+        step: step of `samples` [s].
     """
     from scipy.interpolate import CubicSpline
     from scipy.optimize import least_squares
@@ -189,8 +195,11 @@ def _refined(
     smooth = CubicSpline((first + step * np.arange(samples.size))[there], samples[there])
 
     def linearised(lag: float) -> np.ndarray:
-        """Return what the model leaves of x, and its derivative by the lag (2, n); zero where one
-        of the two signals is missing. Scale, bias and drift are taken out of both."""
+        """Return the residual of x and its derivative by the lag (2, n).
+
+        They are zero where one of the two signals is missing. Scale, bias and drift are removed
+        from both.
+        """
         i = np.floor((t - lag - first) / step + 1e-9).astype(np.int64)
         inside = (i >= 0) & (i < there.size - 1)
         i = np.clip(i, 0, there.size - 2)
@@ -203,12 +212,12 @@ def _refined(
         gains = np.linalg.lstsq(others, both, rcond=None)[0]
         left, slope = (both - others @ gains).T
         whole = np.zeros((2, t.size))
-        # The model falls as the lag grows.
+        # Positive, because b(t - lag) has the derivative -b'(t - lag) by the lag.
         whole[:, seen] = left, gains[0, 0] * slope
         return whole
 
-    # Counted in steps from the near one: an epoch's digits would cost those of the lag. Any: the
-    # stubs know no function here.
+    # The unknown is in steps from the near lag, because an epoch's digits would cost precision.
+    # Any: the stubs know no function here.
     jacobian: Any = lambda z: step * linearised(near + z[0] * step)[1][:, None]  # noqa: E731
     found = least_squares(
         lambda z: linearised(near + z[0] * step)[0],
@@ -225,8 +234,10 @@ def _refined(
 
 
 def _long_run(v: np.ndarray) -> float:
-    """Variance of the sum of v (n,) over n: the sum of its autocovariances under Parzen's window,
-    whose length its correlation time asks for (Andrews, 1991)."""
+    """Return the variance of the sum of v (n,) over n: the sum of its autocovariances.
+
+    Parzen's window weights them; its length follows from the correlation time (Andrews, 1991).
+    """
     n = v.size
     size = 1 << (2 * n - 1).bit_length()
     c = np.fft.irfft(np.abs(np.fft.rfft(v, size)) ** 2, size)[:n] / n
@@ -237,5 +248,5 @@ def _long_run(v: np.ndarray) -> float:
     length = min(max(6.0 * time * (n / time) ** 0.2, 2.0), 0.5 * n)
     lags = np.minimum(np.arange(n) / length, 1.0)
     window = np.where(lags < 0.5, 1 - 6 * lags**2 * (1 - lags), 2 * (1 - lags) ** 3)
-    # Few windows fit into a short record, and what least squares fits is missing in the rest.
+    # Few windows fit into a short record, and the least-squares fit removes part of the residual.
     return max(float(c[0] + 2.0 * np.sum(window[1:] * c[1:])), 0.1 * float(c[0]))

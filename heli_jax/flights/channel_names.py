@@ -1,4 +1,4 @@
-"""Quantities that a channel's name and unit imply, and inputs that it therefore cannot be."""
+"""Quantities that a channel's name and unit imply, and therefore excluded inputs."""
 
 import re
 
@@ -14,14 +14,14 @@ _PLAIN = {
     **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), "m"),
     **dict.fromkeys(("ft", "feet"), "ft"),
 }
-"""what may be had per second, as names spell it"""
+"""Units that names may combine with 'per second', in their spellings."""
 _TAIL = re.compile(
     rf"(.*?)[-_ .,]+({'|'.join(_PLAIN)})(?:[_ .]*per[_ .]*|[_ ]?p[_ .]?|[/_ .])"
     r"(?:s|sec|second|seconds)(?:\^?-?([12]))?",
     re.IGNORECASE,
 )
 _BRACKETS = re.compile(r".*[\[(]([^\[\]()]*[^\[\]()\d\s][^\[\]()]*)[\])]\s*")
-"""gyroADC[1] has a number in them, and no unit"""
+"""Unit in brackets; gyroADC[1] has a number in brackets and no unit."""
 _MEANINGS = {
     "rad/s": "an angular rate",
     "rad/s^2": "an angular acceleration",
@@ -36,7 +36,7 @@ _MEANINGS = {
     "V": "a voltage",
 }
 _OF_STICKS = ("rad", "m", "V")
-"""units that a stick may have, or the blades that it moves, if its name says that it is one"""
+"""Units of a stick or of the blades it moves, if the name is that of a stick."""
 _PULSES = ("us", "µs", "usec", "microseconds")
 _WORDS = {
     word: meaning
@@ -56,7 +56,7 @@ _WORDS = {
     for word in words.split()
 }
 _AXIS = {"p", "q", "r"}
-"""rates, where nothing else is said"""
+"""Names of rates, unless other words contradict."""
 _STICKS = {
     *("stick", "sticks", "servo", "servos", "channel", "chan", "ch", "rc", "cmd", "command"),
     *("commanded", "input", "pwm", "pulse", "cyclic", "swash", "swashplate", "delta", "actuator"),
@@ -77,12 +77,14 @@ _STICKS = {
     *("desired", "target", "excitation", "sweep"),
 }
 _UNSURE = {"current", "bank", "heading", "mag", "climb", "clock", "stamp", "height", "omega"}
-"""words that mean such a thing in a list of channels, but not surely"""
+"""Words that usually, but not certainly, mean this in a list of channels."""
 
 
 def rate_at_end(name: str) -> tuple[str, str] | None:
-    """A name without the unit of a rate or a speed at its end, and this unit: `roll_rate_deg_s`,
-    `p degrees per second`; None where none stands there."""
+    """Return a name without the unit of a rate or a speed at its end, and the unit; else None.
+
+    Examples are `roll_rate_deg_s` and `p degrees per second`.
+    """
     match = _TAIL.fullmatch(name)
     if match is None:
         return None
@@ -90,7 +92,7 @@ def rate_at_end(name: str) -> tuple[str, str] | None:
 
 
 def unit_in_name(name: str) -> str:
-    """The unit in brackets or of a rate at the end of a name, empty where there is none."""
+    """Return the unit in brackets, or of a rate at the end of a name; empty if there is none."""
     match = _BRACKETS.fullmatch(name)
     if match is not None and units.is_unit(match[1].strip()):
         return match[1].strip()
@@ -98,26 +100,30 @@ def unit_in_name(name: str) -> str:
 
 
 def kind_of_unit(unit: str) -> str:
-    """The SI unit of the same kind where it is none of a stick's by itself, else empty."""
+    """Return the SI unit of the same kind; empty if it may be a stick's."""
     if not unit or unit in _PULSES or not units.is_unit(unit):
         return ""
     return next((si for si in _MEANINGS if _is_of(unit, si)), "")
 
 
 def no_stick(name: str, unit: str, si: str, *, sure: bool = False) -> str:
-    """Return the quantity that a channel measures, such as `an angular rate`, if it cannot be an
-    input; else an empty text.
+    """Return the measured quantity, such as `an angular rate`, of a channel that is no input.
+
+    It is empty if the channel can be an input.
 
     Args:
-        unit: that the log or the name states, empty without one.
-        sure: whether to take only what can hardly be a stick, instead of what is likely none.
+        name: name of the channel.
+        unit: unit that the log or the name states, or empty.
+        si: SI unit of the model's input.
+        sure: True to exclude only what can hardly be a stick, instead of what is unlikely to be
+            one.
     """
     words = words_in(name)
     called = names_a_stick(name)
     kind = kind_of_unit(unit)
     if kind and not _is_of(unit, si) and (kind not in _OF_STICKS or not (called or sure)):
         return _MEANINGS[kind]
-    # A speed for an input that is one, as of a rotor, needs no excuse.
+    # A speed is valid for an input that is a speed, such as a rotor's.
     if called or si in ("rad/s", "m/s", "rad/s^2", "m/s^2"):
         return ""
     if len(words) == 1 and words[0] in _AXIS and not sure:
@@ -127,20 +133,20 @@ def no_stick(name: str, unit: str, si: str, *, sure: bool = False) -> str:
 
 
 def names_a_stick(name: str) -> bool:
-    """True if a word of a name stands for a stick, a servo or a command."""
+    """True if a word of a name means a stick, a servo or a command."""
     words = set(words_in(name))
     return bool(_STICKS & words) and "gps" not in words
 
 
 def words_in(name: str) -> tuple[str, ...]:
-    """The words of a name in lower case: of rollRate, roll_rate and `Roll Rate`; ROut is R Out."""
+    """Return the words of a name in lower case, as of rollRate, roll_rate and `Roll Rate`."""
     apart = re.sub(r"([a-z0-9])([A-Z])|([A-Z])(?=[A-Z][a-z])", r"\1\3 \2", name)
     # ch1, rc2in: a number is no part of a word.
     return tuple(w for w in re.split(r"[^a-z]+", apart.lower()) if w)
 
 
 def _is_of(unit: str, si: str) -> bool:
-    """True if a unit is of the kind of an SI unit; angles are a kind of their own."""
+    """True if a unit has the kind of an SI unit; angles are a separate kind."""
     try:
         return units.base_of(unit) == units.base_of(si)
     except ValueError:

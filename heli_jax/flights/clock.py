@@ -1,8 +1,8 @@
-"""The clock of a table: the column that a user names, a rate of its rows, or as the file shows it.
+"""Clock of a table: the column that a user names, a rate of the rows, or a guess from the file.
 
-Rows, or counts of a column, are samples at a rate that is known. Where the time begins anew with
-each run, or a column numbers them, the runs are joined with some seconds between, as
-a gap, at which they become flights.
+Rows, or counts in a column, may be samples at a known rate. Several runs in a table are put one
+after another with some seconds between. They are found by a time that begins anew or by a column
+that numbers them. The gaps then split them into flights.
 """
 
 import datetime
@@ -29,13 +29,13 @@ from heli_jax.flights.log import (
 )
 
 ROWS = "row number"
-"""what the numbers of rows are called, from 0, as a column"""
+"""Name of the column of row numbers, from 0."""
 _BETWEEN = 10.0
-"""s between two runs, which no gap that is bridged is long"""
+"""Time between two runs [s], longer than any gap that is bridged."""
 _SHORTEST = 20
-"""rows of a run"""
+"""Fewest rows of a run."""
 _BEGINNING = 0.1
-"""part of the run before, in which the next begins: a stamp that goes back is no new run"""
+"""First part of the previous run in which the next must begin. A later step back is no new run."""
 
 
 # Units of time, in words or at the end of a name.
@@ -43,9 +43,9 @@ _BEGINNING = 0.1
 TIME_NAMES = {
     *("t", "time", "timestamp", "timestamps", "seconds", "sec", "elapsed", "clock", "zeit", "temps")
 }
-"""words in the names of clocks"""
+"""Words in the names of clocks."""
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "day": 86400.0}
-"""of the units that clocks have: pint, which knows all, takes a quarter of a second to load"""
+"""Size of the units of clocks [s]; pint knows all units but takes 0.25 s to load."""
 _WORDS = {
     "s": ("s", "sec", "secs", "second", "seconds"),
     "ms": ("ms", "msec", "msecs", "millis", "millisec", "millisecond", "milliseconds"),
@@ -56,26 +56,26 @@ _WORDS = {
     "day": ("d", "day", "days"),
 }
 _UNITS = {word: unit for unit, words in _WORDS.items() for word in words}
-# A unit stands behind a name as time_ms, 'time ms', time[ms] or time(ms); the group tells whether a
-# bracket was opened that has to be closed.
+# A unit follows a name as time_ms, 'time ms', time[ms] or time(ms). The group records an opened
+# bracket, which must be closed.
 _AT_END = re.compile(r"^(.*?)\s*(?:_|\s|(?P<open>[\[(]))([^\W\d_]+)(?(open)[\])])$")
 # TimeUS, timestampMs: joined by a capital alone.
 _JOINED = re.compile(r"^(.*(?:[Tt]ime|[Ss]tamp|TIME))(US|Us|MS|Ms|NS|Ns|Sec|Secs|S)$")
 _SINCE = re.compile(r"\s+since\s+\S", re.IGNORECASE)
-"""of 'days since 2024-03-01', as the CF conventions write the unit of a clock"""
+"""Reference time in 'days since 2024-03-01', the CF conventions' unit of a clock."""
 LETTERS = ("h", "d")
-"""units that mean other things too, as pos_d a position down: with brackets around them alone"""
+"""Ambiguous units, accepted only in brackets: pos_d is a position down."""
 _SLOWEST_STEP = 5.0
-"""s: no flight is logged once in more"""
+"""Longest usual step of a flight [s]."""
 _LONGEST_FLIGHT, _LONGEST_SLOW = 6 * 3600.0, 2 * 3600.0
-"""s: ticks that would make a longer one are more likely of the next smaller unit, and those of a
-slow log sooner: 20 s at 1 kHz in ms would be hours at 1 Hz in s"""
+"""Longest flight, and longest flight of a slow log [s]. A longer one indicates the next smaller
+unit: 20 s at 1 kHz in ms would be hours at 1 Hz in s."""
 
 
 def time_unit(text: str) -> str | None:
-    """The unit of time that a text means: `ms` of Milliseconds, msec and Ms; None for others.
+    """Return the unit of time in a text: `ms` for Milliseconds, msec and Ms; None for others.
 
-    Capitals in a clock's unit are a way of writing: nobody logs megaseconds.
+    Capitals are ignored: nobody logs megaseconds.
     """
     # The epoch does not matter: times count from the first sample.
     text = _SINCE.split(text, maxsplit=1)[0]
@@ -85,8 +85,7 @@ def time_unit(text: str) -> str | None:
 
 
 def split_unit(name: str) -> tuple[str, str]:
-    """A column's name without the unit of time at its end, and this unit, empty where there is
-    none."""
+    """Return a column's name without the unit of time at its end, and the unit, empty if none."""
     match = _AT_END.fullmatch(name)
     if match is None and (joined := _JOINED.fullmatch(name)):
         return joined[1], time_unit(joined[2]) or ""
@@ -97,14 +96,16 @@ def split_unit(name: str) -> tuple[str, str]:
 
 
 def likely_unit(stamps: np.ndarray | None) -> str:
-    """The unit of stamps (N,) by their usual step and their length: no flight is logged once in
-    5 s, or lasts a day."""
+    """Return the likely unit of stamps (N,) from their usual step and their length.
+
+    No flight has a step of 5 s or lasts a day.
+    """
     if stamps is None or stamps.size < 2:
         return "s"
     with np.errstate(all="ignore"):
         step = float(np.median(np.diff(stamps)))
         length = float(stamps[-1] - stamps[0])
-    # From the coarsest unit on: the first in which the usual step is that of a log is taken.
+    # From the coarsest unit on, take the first whose usual step is plausible for a log.
     for unit, most, slow in (("s", _SLOWEST_STEP, 0.5), ("ms", 1e3, 100.0), ("us", 1e6, np.inf)):
         longest = _LONGEST_SLOW if step >= slow else _LONGEST_FLIGHT
         # No common clock counts finer parts of a second.
@@ -120,7 +121,7 @@ _ISO = re.compile(r"\d{4}[-/]\d\d[-/]\d\d[T ,]+\d\d:\d\d(?::\d\d.*)?")
 _GERMAN = re.compile(r"(\d\d?)\.(\d\d?)\.(\d{4}),? (\d{1,2}:\d\d:\d\d(?:[.,]\d{1,6})?)")
 _TIME_OF_DAY = re.compile(r"(\d{1,3}):(\d\d):(\d\d(?:[.,]\d{1,12})?)")
 _LONGEST_TIME = 60
-"""characters of a time; of a damaged file a cell may be as long as itself"""
+"""Longest text of a time; a damaged file may have one cell as long as the file."""
 
 
 def is_date(cell: str) -> bool:
@@ -129,13 +130,13 @@ def is_date(cell: str) -> bool:
 
 
 def seconds_of_dates(cells: Sequence[str | None]) -> np.ndarray | int:
-    """Seconds (N,) from the first midnight, NaN where a cell is empty.
+    """Return seconds (N,) from the first midnight, NaN where a cell is empty.
 
-    Times of day go on behind midnight. All cells have to be of one kind, and dates with an offset
-    from UTC or without.
+    Times of day continue after midnight. All cells must have one form, and all dates or none an
+    offset from UTC.
 
     Returns:
-        The row of the first cell that is none, in place of the seconds.
+        The seconds, or the row of the first cell that is no such date.
     """
     filled = [i for i, cell in enumerate(cells) if cell is not None]
     values = np.full(len(cells), np.nan)
@@ -155,7 +156,7 @@ def seconds_of_dates(cells: Sequence[str | None]) -> np.ndarray | int:
             date = _date(cell, form)
             begin = begin or date.replace(hour=0, minute=0, second=0, microsecond=0)
             values[i] = (date - begin).total_seconds()
-        # TypeError: dates with an offset from UTC and without cannot be compared.
+        # TypeError: dates with an offset from UTC cannot be compared with dates without.
         except (ValueError, TypeError, OverflowError):
             return i
     if form is _TIME_OF_DAY:
@@ -178,7 +179,7 @@ def _date(cell: str, form: re.Pattern[str]) -> datetime.datetime:
     return datetime.datetime.fromisoformat(re.sub("[ ,]+", "T", text, count=1))
 
 
-# Which column it is.
+# Choice of the column.
 
 
 def table_clock(
@@ -188,11 +189,14 @@ def table_clock(
     unit: str | None,
     rate: float | None,
 ) -> tuple[Signal | None, bool]:
-    """The clock, None without one, and True if its unit is a guess.
+    """Return the clock, None without one, and True if its unit is a guess.
 
     Args:
-        time: the column of time stamps, where it is stated.
-        rate: samples a second [Hz], of rows or of what `time` counts.
+        table: the table.
+        surveys: surveys of its columns.
+        time: column of time stamps, if stated.
+        unit: unit of the time stamps, if stated.
+        rate: samples a second [Hz], of rows or of the counts in `time`.
     """
     if rate is not None:
         if not (rate > 0 and np.isfinite(rate)):
@@ -202,18 +206,18 @@ def table_clock(
     signal, guessed = guess_clock(table, surveys)
     if time is not None:
         signal, guessed = _asked(table, surveys, time), False
-    # A stated unit goes with whatever column is the clock, the guessed one too.
+    # A stated unit also applies to a guessed column.
     if signal is not None and unit is not None:
         signal, guessed = _asked(table, surveys, Signal(signal.name, unit, "s")), False
     return signal, guessed
 
 
 def guess_clock(table: Table, surveys: Sequence[Survey]) -> tuple[Signal | None, bool]:
-    """The clock by the names of columns, and True if its unit is a guess."""
+    """Return the clock by the names of columns, and True if its unit is a guess."""
     values = {s.name: s.values for s in reversed(surveys) if s.values is not None}
     numeric = [s.name for s in surveys if s.values is not None]
     found = [n for n in numeric if is_called_time(n) or table.time_unit(n)]
-    # Those whose last word is one of time: flight_time could be a parameter, but for its steps.
+    # Names whose last word means time must also increase: flight_time could be a parameter.
     found += [
         n
         for n in numeric
@@ -225,21 +229,22 @@ def guess_clock(table: Table, surveys: Sequence[Survey]) -> tuple[Signal | None,
         return None, False
     name = found[0]
     unit = table.time_unit(name) or split_unit(name)[1]
-    # `ms` and `minutes` alone are names too; seconds are what clocks of any unit are called.
+    # `ms` and `minutes` are also names of columns; clocks of any unit are called seconds.
     alone = time_unit(name) or ""
     unit = unit or ("" if alone == "s" else alone)
     return Signal(name, unit or likely_unit(values[name]), "s"), not unit
 
 
 def is_called_time(name: str) -> bool:
-    """True for a column's name that is one of a clock, or a unit of time."""
-    # Of a path, log.roll.time, the last part is the name; %time and __time are names of tools.
+    """True if a column's name is that of a clock or a unit of time."""
+    # In a path such as log.roll.time, the last part is the name. %time and __time are names of
+    # tools.
     leaf = re.split(r"[./]", split_unit(name)[0])[-1].strip("%_ ").casefold()
     return leaf in TIME_NAMES or (len(leaf) > 1 and time_unit(leaf) is not None)
 
 
 def _asked(table: Table, surveys: Sequence[Survey], time: str | Signal) -> Signal:
-    """A column of times as a user names it."""
+    """Return a column of times as the user names it."""
     signal = Signal(time, "s", "s") if isinstance(time, str) else time
     require_columns(table.path, table.names, [signal.name])
     if all(s.values is None for s in surveys if s.name == signal.name):
@@ -248,7 +253,7 @@ def _asked(table: Table, surveys: Sequence[Survey], time: str | Signal) -> Signa
         try:
             units.factor(signal.unit, "s")
         except ValueError as e:
-            # Of the units of time alone: the nearest of all units may be one of capacity.
+            # Suggest units of time only: the nearest of all units may be one of capacity.
             hint = nearest(signal.unit, SECONDS)
             known = units.is_unit(signal.unit)
             problem = str(e) if known else f"unknown unit of time {shown(signal.unit)}{hint}"
@@ -256,19 +261,19 @@ def _asked(table: Table, surveys: Sequence[Survey], time: str | Signal) -> Signa
     return signal
 
 
-# What its stamps are.
+# Stamps.
 
 
 def clock_scale(table: Table, time: Signal) -> float:
     """Return the size of a clock's unit or count [s]."""
     if time.scale != 1.0:
         return time.scale
-    # A column of time stamps says by its type what its ticks are, whatever the user thinks.
+    # The type of a time-stamp column defines its ticks and overrides a stated unit.
     return units.factor(table.time_unit(time.name) or time.unit, "s")
 
 
 def unit_notes(time: Signal, stated: str | None) -> tuple[Finding, ...]:
-    """A note where the file, or the name of its clock, says another unit than the configuration."""
+    """Return a note if the file or the clock's name contradicts the configured unit."""
     named, factor = split_unit(time.name)[1], units.factor(time.unit, "s")
     other = stated or named
     if not other or math.isclose(units.factor(other, "s"), factor):
@@ -282,14 +287,14 @@ def unit_notes(time: Signal, stated: str | None) -> tuple[Finding, ...]:
 
 
 def require_increasing(table: Table, name: str, stamps: np.ndarray) -> None:
-    """Refuse a clock of which a stamp is not later than the one before it."""
+    """Refuse a clock with a stamp that is not later than the one before."""
     back = not_increasing(stamps)
     if back is None:
         return
     row, fault = back
     after, now = table.cell_text(name, row - 1), table.cell_text(name, row)
     problem = f"the time {fault}, got {now} after {after}, expected increasing times"
-    # Where the one before is left out the times go on: it is the wrong one.
+    # The times increase without the previous row, so that row is the wrong one.
     if row > 1 and stamps[row - 2] < stamps[row] < stamps[row - 1]:
         remedy = f"{table.place(row - 1)} is out of order: delete it"
     elif (starts := restarts(stamps)).size:
@@ -301,8 +306,10 @@ def require_increasing(table: Table, name: str, stamps: np.ndarray) -> None:
 
 
 def require_likely(path: str, time: Signal, stamps: np.ndarray) -> None:
-    """Refuse stamps (N,) in seconds that are a flight's in another unit alone, where their name
-    says that one or nobody stated seconds."""
+    """Refuse stamps (N,) in seconds that are plausible only in another unit.
+
+    Their name must state that unit, or nobody stated seconds.
+    """
     named, likely = split_unit(time.name)[1], likely_unit(stamps)
     if time.unit != "s" or likely == "s" or not (named == likely or time.assumed):
         return
@@ -319,12 +326,12 @@ def require_likely(path: str, time: Signal, stamps: np.ndarray) -> None:
 
 
 def by_rate(rate: float, counter: str | None = None) -> Signal:
-    """The clock of rows that were sampled at a rate [Hz], or of a column that counts samples."""
+    """Return the clock of rows sampled at a rate [Hz], or of a column that counts samples."""
     return Signal(counter or ROWS, "s", "s", scale=1.0 / rate)
 
 
 def columns_of(table: Table, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """The columns of a table as float64 (N,), `ROWS` as the numbers of its rows, from 0."""
+    """Return columns of a table as float64 (N,), `ROWS` as its row numbers from 0."""
     own = [name for name in names if name != ROWS] or [table.names[0]]
     columns = table.numbers(list(dict.fromkeys(own)))
     columns[ROWS] = np.arange(columns[own[0]].size, dtype=np.float64)
@@ -335,20 +342,20 @@ def columns_of(table: Table, names: Sequence[str]) -> dict[str, np.ndarray]:
 
 
 def restarts(stamps: np.ndarray) -> np.ndarray:
-    """The rows (n,) in which the time begins anew; none where it only goes back here or there."""
+    """Return the rows (n,) at which the time begins anew; none if it only steps back at times."""
     none = np.zeros(0, int)
     if stamps.size < 2 * _SHORTEST or not np.isfinite(stamps).all():
         return none
     stamps = without_overflow(stamps)
     steps = np.diff(stamps)
-    # A stick that steps stands still in between.
+    # A stick that steps also has equal values.
     if np.any(steps == 0):
         return none
     falls = np.flatnonzero(steps < 0) + 1
     bounds = np.concatenate([[0], falls, [stamps.size]])
     if not falls.size or np.diff(bounds).min() < _SHORTEST:
         return none
-    # Without one row the clock goes on: that stamp is wrong, and nothing begins.
+    # If the clock continues without one row, that stamp is wrong and no run begins.
     if np.any((stamps[falls] > stamps[falls - 2]) | (stamps[falls + 1] > stamps[falls - 1])):
         return none
     first, last = stamps[bounds[:-2]], stamps[falls - 1]
@@ -359,13 +366,16 @@ def restarts(stamps: np.ndarray) -> np.ndarray:
 def with_runs(
     table: Table, clock: str, columns: Mapping[str, np.ndarray], scale: float, runs: str = ""
 ) -> tuple[dict[str, np.ndarray], tuple[Finding, ...]]:
-    """Return the columns (N,) with a clock in which runs follow one another, and a note; as they
-    are where the table holds one run.
+    """Return the columns (N,) with runs one after another on the clock, and a note.
+
+    The columns are unchanged if the table has only one run.
 
     Args:
-        columns: of the table, the clock among them.
-        scale: [s] of a unit of the stamps.
-        runs: the column that numbers runs; without one they begin where the time does.
+        table: the table.
+        clock: name of the clock.
+        columns: columns of the table, with the clock.
+        scale: unit of the stamps [s].
+        runs: column that numbers runs; without one they begin where the time does.
     """
     stamps = columns[clock]
     starts = np.flatnonzero(np.diff(columns[runs])) + 1 if runs else restarts(stamps)

@@ -1,4 +1,4 @@
-"""From a log of any format to one table of a uniform clock: CSV, Parquet or NetCDF."""
+"""Conversion of a log of any format to one table with a uniform clock: CSV, Parquet or NetCDF."""
 
 import fnmatch
 import os
@@ -29,31 +29,30 @@ from heli_jax.flights.resample import hold, in_gaps, rate_notes, resampled
 
 ENDINGS = (".csv", ".parquet", ".nc")
 TIME = "time"
-"""the name of the first column, in seconds from the log's beginning"""
+"""Name of the first column, in seconds from the log's beginning."""
 _SHARE = 0.5
-"""of the longest topic's time: where nothing is asked for, topics of less are left out"""
+"""Smallest duration of a topic, relative to the longest, in a conversion of all topics."""
 _INTERPOLATED = 2.0
-"""times a topic's rate, from which on it is said that most values are none that were measured"""
+"""Ratio to a topic's rate above which a note says that most values are interpolated."""
 _LONGEST = 3 * 10**8
-"""cells: 2.4 GB"""
+"""Most cells: 2.4 GB."""
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Signals, rate and window that are converted.
+    """Signals, rate and window to convert.
 
     Attributes:
-        signals: names of channels, in which * stands for anything, and of derived ones; all
-            channels where there are none.
-        rate: to resample to [Hz]; without it the samples stay as they are.
+        signals: names of channels and of derived ones; * matches anything. All channels if empty.
+        rate: rate to resample to [Hz]; without it the samples stay as they are.
         window: first and last time [s] from the log's beginning.
-        flight: which flight of a file that holds several, from 1.
-        time: of a table the column of time stamps; guessed where it is not given.
-        time_unit: of these stamps; guessed likewise.
-        time_rate: samples a second [Hz] of a table without times: of its rows, or of what `time`
-            counts.
-        named: what names the columns in place of `signals`, which are then in SI.
-        swashplate: of the channels `ccpm.collective`, `ccpm.roll` and `ccpm.pitch`.
+        flight: number of the flight in a file that holds several, from 1.
+        time: column of time stamps of a table; guessed if not given.
+        time_unit: unit of these stamps; guessed if not given.
+        time_rate: samples a second [Hz] of a table without times: of its rows, or of the counts in
+            `time`.
+        named: names of the columns from a preset, in place of `signals`; the values are then in SI.
+        swashplate: geometry of the channels `ccpm.collective`, `ccpm.roll` and `ccpm.pitch`.
     """
 
     signals: Sequence[str] = ()
@@ -69,8 +68,10 @@ class Selection:
 
 @dataclass(frozen=True, eq=False)
 class Converted:
-    """Columns (M,) float64 by name, `time` [s] first, NaN where a sample is missing; `units` where
-    the log states them; `notes` on what was assumed, resampled or is missing."""
+    """Columns (M,) float64 by name, `time` [s] first, NaN if a sample is missing.
+
+    `units` are those the log states. `notes` list what was assumed, resampled or is missing.
+    """
 
     columns: Mapping[str, np.ndarray]
     units: Mapping[str, str]
@@ -78,20 +79,19 @@ class Converted:
 
 
 def convert_log(path: str | Path, selection: Selection) -> Converted:
-    """The selected signals of a log on one clock.
+    """Convert the selected signals of a log to one clock.
 
-    A signal that jumps and stays is held between samples, as a stick or a mode is; the others are
-    interpolated, or low-pass filtered where the rate goes down. What lies in a gap that nothing
-    should bridge is missing.
+    A signal that jumps and stays, such as a stick or a mode, is held between samples. Others are
+    interpolated, or low-pass filtered if the rate decreases. Samples in a long gap are missing.
 
     Raises:
-        InputError: the log cannot be read, a signal or a clock is missing, the signals have several
-            clocks and no rate is given, or rate and window make no sense.
+        InputError: the log cannot be read; a signal or a clock is missing; the signals have several
+            clocks and no rate is given; or rate or window is invalid.
     """
-    # Before the log is opened, which may take minutes.
+    # Checked before the log is opened, which may take minutes.
     require_rate_and_window(str(path), selection.rate, selection.window)
     opened = open_log(path, selection.flight)
-    # Asked before a table has lost the form of one, by which a preset may know it.
+    # Done before the table changes its form, by which a preset may recognise it.
     named = None if selection.named is None else selection.named(opened)
     notes = [] if named is None else list(named.notes)
     stated = (selection.time, selection.time_unit, selection.time_rate)
@@ -99,7 +99,7 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
         opened = by_clocks(opened) or opened
     if not isinstance(opened, ChannelLog):
         opened = guessed_log(opened, *stated)
-        # Without a rate the rows are copied as they are, empty cells and all.
+        # Without a rate, rows are copied as they are, with their empty cells.
         opened = opened if selection.rate is None else without_joins(opened)
     elif any(stated):
         raise wrong(
@@ -114,14 +114,14 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
     required = bool(selection.signals) if named is None else named.required
     clocks = _clocks(log, names, selection.window, required, notes)
     names = [name for name in names if log.topic_of(name).name in clocks]
-    # Nothing is resampled that was not asked to be: a copy at the log's own samples loses nothing.
+    # Without a rate nothing is resampled: a copy at the log's own samples loses nothing.
     if selection.rate is None:
         columns = _as_logged(log, names, clocks, named is not None, notes)
     else:
         columns = _resampled(log, names, clocks, selection.rate, notes)
         for clock in clocks.values():
             notes += [n.of(clock.words) for n in rate_notes(clock.seconds, selection.rate)]
-            # A table has a value in every row; a fit takes slow outputs as missing in between.
+            # A table has a value in every row, but a fit treats slow outputs as missing in between.
             if selection.rate * clock.usual > _INTERPOLATED:
                 words = f"{clock.words}: interpolated, so its noise is no longer white"
                 notes.append(note("resampling.interpolated", words))
@@ -135,15 +135,14 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
 
 
 def _names(log: DerivedLog, patterns: Sequence[str]) -> list[str]:
-    """The channels that are asked for, in the order of the patterns; without any, all but the
-    clocks themselves."""
+    """Return the requested channels in the order of the patterns, or else all but the clocks."""
     if not patterns:
         names = [
             name
             for topic in log.topics
             for name in topic.columns
-            # ULog and DataFlash name a channel by topic and field, the others by field alone. The
-            # clock is left out under either name, since it is written as the column `time`.
+            # ULog and DataFlash name a channel by topic and field, other formats by field alone.
+            # The clock is left out under either name, because it becomes the column `time`.
             if topic.clock and name not in (topic.clock, f"{topic.name}.{topic.clock}")
         ]
         if not names:
@@ -153,7 +152,7 @@ def _names(log: DerivedLog, patterns: Sequence[str]) -> list[str]:
     else:
         names = []
         for pattern in patterns:
-            # The brackets of gyroADC[0] are meant as they stand.
+            # The brackets of gyroADC[0] are literal.
             matches = fnmatch.filter(log.names, pattern.replace("[", "[[]"))
             if not matches and log.is_derived(pattern):
                 matches = [pattern]
@@ -163,7 +162,7 @@ def _names(log: DerivedLog, patterns: Sequence[str]) -> list[str]:
                 raise wrong(log.path, problem)
             names += matches
     names = list(dict.fromkeys(names))
-    # Behind the patterns, of which several may name the same channel.
+    # After the patterns, several of which may match the same channel.
     require_few_columns(log.path, len(names))
     if TIME in names:
         problem = f"{TIME!r} is the name of the written clock, expected other signals"
@@ -178,9 +177,9 @@ def _clocks(
     required: bool,
     notes: list[Finding],
 ) -> dict[str, TopicClock]:
-    """The clocks of the topics that hold the channels, by the topics' names.
+    """Return the clocks of the topics that hold the channels, by the topics' names.
 
-    A topic that has none is an error where its channels are required, otherwise a note.
+    A topic without a clock is an error if its channels are required, otherwise a note.
     """
     clocks, problems = {}, []
     for topic in dict.fromkeys(log.topic_of(name) for name in names):
@@ -188,8 +187,8 @@ def _clocks(
         try:
             clocks[topic.name] = topic_clock(log, topic, window)
         except InputError as e:
-            # Who asks for a signal has to hear that it cannot be had. Who asks for all wants what
-            # there is.
+            # A requested signal that is not available is an error. A request for all signals takes
+            # those available.
             if required:
                 raise
             problems.append(e)
@@ -198,10 +197,10 @@ def _clocks(
         raise problems[0]
     taken = [clock.topic.times for clock in clocks.values()]
     notes += window_note(window, [max(taken, key=lambda times: times[-1])], log.first_time)
-    # Events that came in a moment would leave no time that all topics share.
+    # Events within a moment would leave no time that all topics share.
     spans = {name: float(clock.seconds[-1] - clock.seconds[0]) for name, clock in clocks.items()}
     for name, span in spans.items():
-        # Only where nothing is asked for: who names a short topic wants just that.
+        # A topic requested by name may be short.
         if not required and span < _SHARE * max(spans.values()):
             del clocks[name]
             words = f"left out: topic {shown(name)}, which covers {span:.3g} s"
@@ -210,7 +209,7 @@ def _clocks(
 
 
 def _missing(columns: Mapping[str, np.ndarray]) -> list[Finding]:
-    """Notes on missing samples, one for all signals that miss as many."""
+    """Return notes on missing samples, one for all signals with the same count."""
     by_count: dict[int, list[str]] = {}
     for name, values in columns.items():
         by_count.setdefault(int(np.isnan(values).sum()), []).append(name)
@@ -235,8 +234,11 @@ def _as_logged(
     converted: bool,
     notes: list[Finding],
 ) -> dict[str, np.ndarray]:
-    """The samples as they are, which needs one clock for all; marks are missing where the numbers
-    are `converted` to another unit, in which nobody would know them again."""
+    """Return the samples as they are, which requires a single clock.
+
+    Marks become missing if the numbers are `converted` to another unit, in which they would not be
+    recognised.
+    """
     if len(clocks) > 1:
         few = ", ".join(clock.words for clock in list(clocks.values())[:4])
         more = ", ..." if len(clocks) > 4 else ""
@@ -260,8 +262,8 @@ def _resampled(
     rate: float,
     notes: list[Finding],
 ) -> dict[str, np.ndarray]:
-    # Counted before any signal is resampled, so that a slip in the rate is refused before it fills
-    # the memory.
+    # Counted before any signal is resampled, so that a wrong rate is refused before it fills the
+    # memory.
     times = common_times(log.path, list(clocks.values()), rate)
     if times.size * len(names) > _LONGEST:
         problem = f"{len(names)} signals at {rate:g} Hz are {times.size * len(names)} numbers"
@@ -274,35 +276,34 @@ def _resampled(
         logged = _finite(log.channel(name).values[clock.rows])
         values, said = without_marks_and_turns(shown(name), logged)
         notes += said
-        # How a signal moves is asked of the samples that there are: a move to or from NaN is none.
+        # The hold is decided from valid samples only, because a move to or from NaN is none.
         known = values[~np.isnan(values)]
         stays = not known.size or decide(known).hold == "zero-order"
         new = (hold if stays else resampled)(clock.seconds, values, times)
-        # A hold and a straight line go on through any gap, so what they say there is taken out
-        # again.
+        # A hold and a straight line continue through any gap, so their values there are removed.
         columns[name] = np.where(gaps[topic], np.nan, new)
     return columns
 
 
 def _finite(values: np.ndarray) -> np.ndarray:
-    """Values with infinite ones as missing: no filter has an answer to them."""
+    """Return the values with infinite ones as missing; no filter can process them."""
     return np.where(np.isfinite(values), values, np.nan)
 
 
 def require_output(out: Path, log: str | Path) -> None:
-    """Refuse a name that no format that is written ends with, and a file that is there already."""
+    """Refuse a name with an unknown ending, and a file that exists."""
     if out.suffix.lower() not in ENDINGS:
         raise InputError(f"{out}: expected a name ending in {', '.join(ENDINGS)}")
-    # By the file and not by the name: a link to the log, or another spelling of its path, would
-    # overwrite it just as well.
+    # Compared by file, not by name: a link or another spelling of the path would also overwrite the
+    # log.
     if out.exists() and Path(log).exists() and os.path.samefile(out, log):
         raise InputError(f"{out}: is the log itself, expected another name")
-    if os.path.lexists(out):  # a link to nothing is in the way too
+    if os.path.lexists(out):  # a broken link is in the way too
         raise InputError(f"{out}: exists already, expected a new name")
 
 
 def write_converted(out: Path, converted: Converted) -> None:
-    """Write the columns; what is missing is an empty cell, or NaN in NetCDF.
+    """Write the columns; a missing sample is an empty cell, or NaN in NetCDF.
 
     Raises:
         InputError: a signal has a name that NetCDF does not allow.
@@ -317,7 +318,7 @@ def write_converted(out: Path, converted: Converted) -> None:
 def _write_table(out: Path, converted: Converted) -> None:
     import pyarrow as pa
 
-    # Missing cells are nulls: a NaN would stand in CSV as the word nan.
+    # Missing cells are nulls: CSV would show a NaN as the word nan.
     arrays = {name: pa.array(x, mask=np.isnan(x)) for name, x in converted.columns.items()}
     units = {name: {"unit": unit} for name, unit in converted.units.items() if unit}
     fields = [pa.field(n, pa.float64(), metadata=units.get(n)) for n in arrays]
@@ -342,8 +343,8 @@ def _write_netcdf(out: Path, converted: Converted) -> None:
         }
     )
     try:
-        # SciPy's writer needs no library of HDF5. Its format with 64 bits for positions has no end
-        # at 2 GB.
+        # SciPy's writer needs no HDF5 library. Its format with 64-bit positions has no limit of 2
+        # GB.
         data.to_netcdf(out, engine="scipy", format="NETCDF3_64BIT")
     except (ValueError, UnicodeError) as e:
         names = ", ".join(shown(n) for n in converted.columns if "/" in n or not n.isascii())

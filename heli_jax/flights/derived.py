@@ -1,7 +1,7 @@
-"""Channels that are computed from those of a log: `euler(vehicle_attitude.q).roll` and its like.
+"""Channels computed from those of a log: `euler(vehicle_attitude.q).roll` and similar.
 
-A short list of named functions and no expressions: what a configuration can ask for is what is
-written here.
+There is a short list of named functions and no expressions, so a configuration can use only what is
+defined here.
 """
 
 import dataclasses
@@ -20,7 +20,8 @@ from heli_jax.flights.resample import longest_gap
 # Servo outputs of a swashplate, unmixed to collective and cyclic (CCPM).
 
 _MOST_CONDITION = 100.0
-"""of the mixing matrix: beyond it servos are so near to one line that noise is all there is"""
+"""Largest condition number of the mixing matrix. Beyond it, the servos are nearly on one line and
+the result is noise."""
 
 
 @dataclass(frozen=True)
@@ -28,27 +29,26 @@ class Swashplate:
     r"""Geometry of a swashplate's servos, and the scale of their channels.
 
     Servo i, seen from above at the angle $\psi_i$ clockwise from the nose and at the radius $r_i$,
-    lifts the plate by $s_i = (\text{channel}_i - \text{offset}_i)\,\text{scale}_i$, with the other
-    sign where it is inverted. The plate being a plane,
+    lifts the plate by $s_i = (\text{channel}_i - \text{offset}_i)\,\text{scale}_i$, with the
+    opposite sign if inverted. Because the plate is a plane,
 
     $$ s_i = c + r_i (\theta \cos(\psi_i - \gamma) - \phi \sin(\psi_i - \gamma)), $$
 
     with the collective c, the tilt $\phi$ (down to the right, which rolls right) and $\theta$ (up
-    at the nose, which pitches up) and the phase $\gamma$. With more than three servos the three
-    are the least-squares solution. Source: signs and angles are those of ArduPilot's
-    AP_MotorsHeli_Swash.
+    at the nose, which pitches up) and the phase $\gamma$. More than three servos give a
+    least-squares solution. Source: signs and angles are those of ArduPilot's AP_MotorsHeli_Swash.
 
     Attributes:
         servos: channels, at least three.
         angles: psi by servo [deg].
-        radius: r by servo, at 1 unless given: in m with a lift in m the tilt is in rad.
-        offset: by servo, in the channel's unit.
-        scale: by servo, lift in the channel's unit.
-        invert: by servo, whether a larger number lowers it.
+        radius: r by servo, 1 by default: with r and lift in m, the tilt is in rad.
+        offset: offset by servo, in the channel's unit.
+        scale: lift per channel unit, by servo.
+        invert: True by servo if a larger number lowers it.
         phase: gamma [deg].
 
     Raises:
-        ValueError: lengths differ, a number makes no sense, or the angles and radii do not tell
+        ValueError: lengths differ, a number is invalid, or the angles and radii do not separate
             collective from cyclic.
     """
 
@@ -74,38 +74,39 @@ class Swashplate:
             raise ValueError("radius: expected positive numbers")
         if not all(k != 0 for k in self.scale):
             raise ValueError("scale: expected numbers other than 0")
-        # At a mean radius of 1: in metres it is small beside a collective that counts as 1.
+        # At a mean radius of 1, because in metres it is small beside the collective's coefficient
+        # of 1.
         scaled = mixing_matrix(self) / np.array([1.0, *(np.mean(self.radius),) * 2])
         if np.linalg.cond(scaled) > _MOST_CONDITION:
             raise ValueError(
-                f"angles: {list(self.angles)} deg do not tell collective from cyclic, expected "
+                f"angles: {list(self.angles)} deg do not separate collective and cyclic, expected "
                 "three servos that are not on one line"
             )
 
 
 def mixing_matrix(swashplate: Swashplate) -> np.ndarray:
-    """(n, 3), what collective, roll and pitch lift each of n servos by."""
+    """Return the mixing matrix (n, 3): lift of each of n servos per collective, roll and pitch."""
     psi = np.deg2rad(np.asarray(swashplate.angles) - swashplate.phase)
     radius = np.asarray(swashplate.radius)
     return np.stack([np.ones_like(psi), -radius * np.sin(psi), radius * np.cos(psi)], axis=1)
 
 
 def unmix(swashplate: Swashplate, channels: np.ndarray) -> np.ndarray:
-    """Collective, roll and pitch (3, N) from the servos' channels (n, N); NaN where one is."""
+    """Return collective, roll and pitch (3, N) from the servos' channels (n, N); NaN stays NaN."""
 
     def column(values: tuple[float, ...]) -> np.ndarray:
         return np.asarray(values, np.float64)[:, None]
 
     signs = np.where(np.asarray(swashplate.invert), -1.0, 1.0)[:, None]
     lifts = (channels - column(swashplate.offset)) * column(swashplate.scale) * signs
-    # By the pseudo-inverse: one small matrix for all samples, and a NaN stays in its own sample.
+    # The pseudo-inverse is one small matrix for all samples, and a NaN stays in its own sample.
     return np.linalg.pinv(mixing_matrix(swashplate)) @ lifts
 
 
 EULER = ("roll", "pitch", "yaw")
 BODY = ("u", "v", "w")
 CCPM = ("ccpm.collective", "ccpm.roll", "ccpm.pitch")
-"""channels that there are where a configuration states the geometry of the swashplate"""
+"""Channels available if a configuration states the geometry of the swashplate."""
 FORMS = (
     "euler(Q).roll, .pitch or .yaw",
     "body_velocity(Q, NORTH, EAST, DOWN).u, .v or .w",
@@ -120,10 +121,11 @@ class Derivation:
     """Computation of a derived channel.
 
     Attributes:
-        groups: the channels it is computed from. The last group has the clock of the result, and
-            all of a group have one clock.
-        compute: the samples (N,) from those of the groups, (k, N) each, all on one clock.
-        unit: of the result; that of the last group's channels where it is empty.
+        groups: channels it is computed from. The last group has the clock of the result; a group
+            shares one clock.
+        compute: function of the groups' samples, (k, N) each on one clock, that returns samples
+            (N,).
+        unit: unit of the result; empty if it is that of the last group's channels.
     """
 
     groups: tuple[tuple[str, ...], ...]
@@ -137,9 +139,9 @@ def derivation(
     """Return the computation of a channel of this name; None for a plain channel.
 
     Raises:
-        ValueError: it looks like a derived channel and is none.
+        ValueError: it looks like a derived channel but is none.
     """
-    # A column may have any name, one with parentheses too: what the file says goes first.
+    # A column may have any name, also with parentheses, so the file's names have priority.
     if name in known or len(name) > _LONGEST_NAME:
         return None
     if name in CCPM:
@@ -178,7 +180,7 @@ def derivation(
 
 
 def sources(name: str, known: Collection[str], swashplate: Swashplate | None = None) -> list[str]:
-    """The log's own channels that a channel needs: itself, unless it is derived.
+    """Return the log's own channels that a channel needs: itself, unless it is derived.
 
     Raises:
         ValueError: as `derivation`.
@@ -188,7 +190,7 @@ def sources(name: str, known: Collection[str], swashplate: Swashplate | None = N
 
 
 def _quaternion(arguments: Sequence[str], known: Collection[str]) -> tuple[str, ...]:
-    """The four parts w, x, y, z by name: q[0] to q[3], or Q1 to Q4."""
+    """Return the names of the four parts w, x, y, z: q[0] to q[3], or Q1 to Q4."""
     if len(arguments) == 4:
         return tuple(arguments)
     indexed = tuple(f"{arguments[0]}[{i}]" for i in range(4))
@@ -201,10 +203,10 @@ def _row(of: Callable[..., np.ndarray], row: int) -> Callable[..., np.ndarray]:
 
 
 def euler_angles(q: np.ndarray) -> np.ndarray:
-    """Roll, pitch and yaw (3, N) [rad] of quaternions (4, N), w first, of any length but zero.
+    """Return roll, pitch and yaw (3, N) [rad] of quaternions (4, N), w first, of any nonzero norm.
 
-    From the earth's axes to the body's by yaw, pitch, roll (3-2-1). Roll and yaw do not jump by a
-    turn. Source: J. Diebel, Representing attitude, Stanford, 2006, eqs 290 and 284.
+    The rotation is from earth to body axes by yaw, pitch, roll (3-2-1). Roll and yaw are unwrapped.
+    Source: J. Diebel, Representing attitude, Stanford, 2006, eqs 290 and 284.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         w, x, y, z = q / np.linalg.norm(q, axis=0)
@@ -215,10 +217,11 @@ def euler_angles(q: np.ndarray) -> np.ndarray:
 
 
 def body_velocity(q: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """Velocities (3, N) along the body's axes from those along the earth's (3, N).
+    """Return velocities (3, N) in body axes from those in earth axes (3, N).
 
     Args:
-        q: attitude (4, N), w first, from the earth's axes to the body's.
+        q: attitude (4, N), w first, from earth to body axes.
+        velocity: velocities in earth axes (3, N).
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         q = q / np.linalg.norm(q, axis=0)
@@ -229,7 +232,7 @@ def body_velocity(q: np.ndarray, velocity: np.ndarray) -> np.ndarray:
 
 
 def _unwrapped(values: np.ndarray, period: float) -> np.ndarray:
-    # The finite ones alone: behind a NaN np.unwrap would give nothing else.
+    # Only finite values, because np.unwrap returns NaN after the first NaN.
     good = np.isfinite(values)
     out = np.array(values, np.float64)
     out[good] = np.unwrap(out[good], period=period)
@@ -238,7 +241,7 @@ def _unwrapped(values: np.ndarray, period: float) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class DerivedLog(ChannelLog):
-    """A log whose derived channels can be asked for as its own."""
+    """Log whose derived channels are available by name."""
 
     swashplate: Swashplate | None = None
 
@@ -250,8 +253,8 @@ class DerivedLog(ChannelLog):
             return True
 
     def topic_of(self, name: str) -> Topic:
-        """The topic that holds a channel; of a derived one that whose clock it has."""
-        # Of all topics, as `names` would have it, but without a tuple of thousands at every call.
+        """Return the topic that holds a channel; for a derived one, the topic with its clock."""
+        # Searches all topics as `names` would, but without a tuple of thousands at every call.
         if any(name in topic.columns for topic in self.topics):
             return super().topic_of(name)
         place = f"channel {shown(name)}"
@@ -273,26 +276,26 @@ class DerivedLog(ChannelLog):
         return dataclasses.replace(last[0], columns={name: values}, units=units)
 
     def _group(self, names: Sequence[str], place: str) -> tuple[Topic, np.ndarray]:
-        """The topic of channels that were written together, and their samples (k, N)."""
+        """Return the topic of channels that were written together, and their samples (k, N)."""
         topics = [super(DerivedLog, self).topic_of(name) for name in names]
         for name, topic in zip(names, topics, strict=True):
             if topic.name != topics[0].name:
                 problem = f"{shown(names[0])} and {shown(name)} are of different topics, expected"
                 raise wrong(self.path, f"{problem} channels of one", place)
         values = [as_floats(t.columns[n]) for n, t in zip(names, topics, strict=True)]
-        # Before anything is computed: what comes of a -9999 looks like an angle or a speed.
+        # Before anything is computed, because the result of a -9999 looks like an angle or a speed.
         return topics[0], np.stack([without_marks(x) for x in values])
 
 
 def _on_clock(times: np.ndarray, clock: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Quaternions (4, M) of a clock (M,) at other times (N,): between two on a straight line."""
+    """Interpolate quaternions (4, M) of a clock (M,) linearly to other times (N,)."""
     if clock.size < 2 or np.any(np.diff(clock) <= 0):
         return np.full((len(q), times.size), np.nan)
-    # q and -q are one attitude, and the line between them leads through no attitude at all.
+    # q and -q are the same attitude, but the line between them passes through zero.
     flips = np.where(np.sum(q[:, 1:] * q[:, :-1], axis=0) < 0, -1.0, 1.0)
     q = q * np.concatenate([[1.0], np.cumprod(flips)])
     between = np.stack([np.interp(times, clock, row, np.nan, np.nan) for row in q])
-    # In a gap the attitude is not known, and the velocity then counts as missing.
+    # In a gap the attitude is unknown, so the velocity is missing.
     right = np.clip(np.searchsorted(clock, times), 1, clock.size - 1)
     inside = (clock[right - 1] < times) & (times < clock[right])
     between[:, inside & (clock[right] - clock[right - 1] > longest_gap(clock))] = np.nan
@@ -300,6 +303,6 @@ def _on_clock(times: np.ndarray, clock: np.ndarray, q: np.ndarray) -> np.ndarray
 
 
 def with_derived(log: ChannelLog, swashplate: Swashplate | None = None) -> DerivedLog:
-    """Return a log whose derived channels can be asked for by name."""
+    """Return a log whose derived channels are available by name."""
     fields = {field.name: getattr(log, field.name) for field in dataclasses.fields(ChannelLog)}
     return DerivedLog(**fields, swashplate=swashplate)

@@ -45,19 +45,19 @@ from heli_jax.flights.marks import mark_notes
 from heli_jax.flights.open_log import chosen_flights, open_flights
 
 _GAP_STEPS = 1.5
-"""usual steps: a lost sample makes a step of two, and jitter one of a tenth more"""
+"""Shortest gap [usual steps]: a lost sample makes a step of two, jitter one of 1.1."""
 _FILTER = re.compile(
     r"lpf|low_?pass|notch|hntch|hntc2|cutoff|_flt[tde]?$|filt|_nf\d|decimation|looptime|pid_process_denom",
     re.IGNORECASE,
 )
-"""names of settings that say what the firmware did to the signals before it logged them"""
+"""Names of settings of the firmware's filters, which change signals before they are logged."""
 
 
 @dataclass(frozen=True)
 class ColumnInfo:
-    """One column: `count` cells are filled; the numbers are NaN for text or where none is finite.
+    """One column: `count` filled cells; statistics of the finite values, in the log's unit.
 
-    The numbers are over the finite values, in the log's unit.
+    The statistics are NaN for text or without finite values.
     """
 
     name: str
@@ -69,16 +69,16 @@ class ColumnInfo:
     mean: float
     sd: float
     unit: str = ""
-    """as the log states it; empty where it does not"""
+    """Unit that the log states, or empty."""
     strays: str = ""
-    """of text that is numbers but for some cells, which these are"""
+    """Cells of a text column that are no numbers, if most are."""
     rows: int = 0
-    """of numbers, with those that are missing"""
+    """Rows of a column of numbers, with missing ones."""
 
 
 @dataclass(frozen=True)
 class Gap:
-    """A step of more than one and a half usual ones: when it starts, from the first sample [s]."""
+    """A step of more than 1.5 usual ones; `start` counts from the first sample [s]."""
 
     start: float
     length: float
@@ -86,14 +86,14 @@ class Gap:
 
 @dataclass(frozen=True)
 class TimeInfo:
-    """The clock of a log or of one of its topics.
+    """Clock of a log or of one of its topics.
 
-    `rate` [Hz] is that of the usual step; `jitter` the largest error of a step in steps, or where
-    the stamps are no uniform grid what 95 % of the steps keep to, gaps apart; `problem` says why
-    they are no clock at all, otherwise empty; `guessed` says that nothing states the unit.
-    `counted` [Hz] is how many samples a second has, where `column` counts them, or no column is a
-    clock and the rows do (`heli_jax.flights.clock.ROWS`).
-    Where the time begins anew the table holds several `runs`, put one after another.
+    `rate` [Hz] is that of the usual step. `jitter` is the largest error of a step in steps, or its
+    95 % quantile without gaps if the stamps are no uniform grid. `problem` is the reason why the
+    stamps are no clock, otherwise empty. `guessed` is True if nothing states the unit. `counted`
+    [Hz] is the number of samples a second if `column` counts samples, or if the rows do
+    (`heli_jax.flights.clock.ROWS`). If the time begins anew, the table holds several `runs`, put
+    one after another.
     """
 
     column: str
@@ -116,7 +116,7 @@ class TimeInfo:
 
 @dataclass(frozen=True)
 class TopicInfo:
-    """Channels of one clock; `time` is None where their rows have only an order."""
+    """Channels of one clock; `time` is None if their rows have only an order."""
 
     name: str
     n_rows: int
@@ -128,9 +128,9 @@ class TopicInfo:
 class LogInfo:
     """Content of a log, or of one of its flights.
 
-    `time` is None where no column looks like a clock; an autopilot's log has `topics` with clocks
-    of their own, whose channels are `columns` too, and `duration` [s] from the first sample to the
-    last. `filters` are those of the `parameters` that say how the firmware filtered its signals.
+    `time` is None if no column looks like a clock. An autopilot's log has `topics` with separate
+    clocks, whose channels are also `columns`. `duration` [s] is from the first sample to the last.
+    `filters` are those `parameters` that describe the firmware's filters.
     """
 
     path: str
@@ -155,7 +155,7 @@ def describe_log(
     unit: str | None = None,
     rate: float | None = None,
 ) -> LogInfo:
-    """As `describe_flights`, of the first flight of a log alone."""
+    """Describe the first flight of a log only, as `describe_flights`."""
     return next(describe_flights(path, time, unit, rate=rate))
 
 
@@ -166,22 +166,22 @@ def describe_flights(
     number: int | None = None,
     rate: float | None = None,
 ) -> Iterator[LogInfo]:
-    """Signals, rates, duration and gaps of the flights of a log, one by one.
+    """Describe signals, rates, duration and gaps of the flights of a log, one by one.
 
     Args:
         path: the log, in a format that `read_flight` reads.
-        time: the column of time stamps, in seconds where only its name is given; by default a
-            column with a usual name (its unit from an ending such as `_ms`, or guessed from the
-            steps).
-        number: of the one flight to describe, from 1.
+        time: column of time stamps, in seconds if only its name is given; by default a column with
+            a usual name. Its unit then comes from an ending such as `_ms`, or is guessed from the
+            steps.
+        unit: unit of the time stamps, if stated.
+        number: number of the one flight to describe, from 1.
         rate: samples a second [Hz] of a table without times: of its rows, or of a column that
             counts them.
 
     Raises:
         InputError: the log cannot be read, has no such column, or needs no column of times.
     """
-    # All flights of a file are read by one pass of its reader, so `number` chooses among them and
-    # spares no time.
+    # The reader reads all flights of a file in one pass, so `number` saves no time.
     log = chosen_flights(path, open_flights(path), number)
     if not isinstance(log, tuple):
         yield describe_table(log, time, unit, rate)
@@ -196,8 +196,7 @@ def describe_flights(
 
 def _describe_channels(log: ChannelLog) -> LogInfo:
     topics = tuple(_describe_topic(topic) for topic in log.topics)
-    # A topic with a single sample, published when the firmware began, says nothing of how long the
-    # flight lasted.
+    # A single sample, published when the firmware began, does not show the duration.
     last = [float(t.times[-1]) for t in log.topics if t.clock and t.times.size > 1]
     return LogInfo(
         path=log.path,
@@ -229,11 +228,11 @@ def _describe_topic(topic: Topic) -> TopicInfo:
 def describe_table(
     table: Table, time: str | Signal | None, unit: str | None, rate: float | None = None
 ) -> LogInfo:
-    """As `describe_flights`, of a table that is open.
+    """Describe a table that is open, as `describe_flights`.
 
     Args:
-        rate: samples a second [Hz], of rows or of what `time` counts; with one the rows are the
-            clock, or a column that counts them, unless `time` names one.
+        rate: samples a second [Hz], of rows or of the counts in `time`; with it the clock is the
+            rows or the column of counts, unless `time` names one.
     """
     surveys = table.survey()
     signal, guessed = table_clock(table, surveys, time, unit, rate)
@@ -246,7 +245,7 @@ def describe_table(
             scale = clock_scale(table, signal)
             stamps = with_runs(table, signal.name, {signal.name: stamps}, scale)[0][signal.name]
         clock = replace(_describe_time(table, signal, stamps, guessed), runs=runs)
-    # A stamp is never taken as missing: a wrong one is refused with its row.
+    # Stamps have no marks: a wrong one is refused with its row.
     measured = [s for s in surveys if signal is None or s.name != signal.name]
     marks = mark_notes((s.name, s.values) for s in measured if s.values is not None)
     return LogInfo(
@@ -268,7 +267,7 @@ def describe_table(
 
 
 def _other_lengths(surveys: list[Survey]) -> tuple[Finding, ...]:
-    """A note for each number of samples that is not the log's: arrays may have their own."""
+    """Return a note for each length that is not the log's; arrays may have their own."""
     by_size: dict[int, list[str]] = {}
     for each in surveys:
         if each.values is not None:
@@ -287,7 +286,7 @@ def _other_lengths(surveys: list[Survey]) -> tuple[Finding, ...]:
 
 
 def _n_rows(surveys: list[Survey]) -> int:
-    # Of a column of text only the filled cells are known, so the longest column is asked.
+    # For a column of text only the filled cells are known, so the longest column decides.
     sizes = (each.n_filled if each.values is None else each.values.size for each in surveys)
     return max(sizes, default=0)
 
@@ -297,8 +296,8 @@ def _describe_column(survey: Survey, unit: str = "") -> ColumnInfo:
     if survey.values is None:
         empty = (nan, nan, nan, nan)
         return ColumnInfo(survey.name, "text", survey.n_filled, 0, *empty, unit, survey.strays)
-    # Infinite cells are not counted as missing, but the numbers are over finite ones, or a single
-    # one would make mean and spread infinite.
+    # Infinite cells are not counted as missing, but the statistics use only finite ones; a single
+    # infinite one would make mean and sd infinite.
     n_nan = int(np.count_nonzero(np.isnan(survey.values)))
     x = survey.values[np.isfinite(survey.values)]
     numbers = (nan, nan, nan, nan)
@@ -311,7 +310,7 @@ def _describe_column(survey: Survey, unit: str = "") -> ColumnInfo:
 
 def _values(surveys: list[Survey], name: str) -> np.ndarray:
     values = next(survey.values for survey in surveys if survey.name == name)
-    assert values is not None  # only a column of numbers is guessed or taken for a clock
+    assert values is not None  # only a column of numbers is used as a clock
     return values
 
 
@@ -333,20 +332,19 @@ def _describe_stamps(
         stamps = without_overflow(stamps)
         seconds = stamps * scale
         steps = np.diff(seconds)
-    # A column that was named as the clock may be anything, so what follows has to hold: finite
-    # stamps that increase, by steps that are no rounding.
+    # A column that the user named as the clock may be anything, so stamps and steps are checked
+    # first.
     problem = _clock_problem(seconds, steps)
     nan = float("nan")
     if problem:
         return TimeInfo(name, unit, nan, nan, False, nan, (), problem)
-    usual = float(np.median(steps))  # the mean would count the gaps
-    # The same question as where a flight is read, so that `info` and a fit agree on what a uniform
-    # clock is.
+    usual = float(np.median(steps))  # gaps would change the mean
+    # The same function as for reading a flight, so that `info` and a fit agree on uniformity.
     grid = uniform_grid(seconds - seconds[0], rounding_of(stamps) * scale)
     uneven = isinstance(grid, Uneven)
-    # Stamps that are a grid but for their rounding have no gaps, however coarse it is.
+    # Stamps that are a grid except for rounding have no gaps, however coarse it is.
     long = np.flatnonzero(steps > _GAP_STEPS * usual) if uneven else []
-    # Gaps are told one by one; they would else be the whole of the jitter.
+    # Gaps are listed separately; they would dominate the jitter.
     short = steps[steps <= _GAP_STEPS * usual]
     return TimeInfo(
         column=name,

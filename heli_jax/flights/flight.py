@@ -19,7 +19,7 @@ _BY_NAME = {
     **dict.fromkeys(("sd", "known"), "numbers by name, as {'p': 0.01}"),
     "hold": f"{' or '.join(HOLDS)} by input, as {{'lat': 'linear'}}",
 }
-"""What an input may do between samples: stay until the next, or follow a straight line to it."""
+"""Description of the expected values, for messages."""
 
 
 @dataclass(frozen=True)
@@ -27,23 +27,23 @@ class Signal:
     """One signal of a log: (number in the log - `offset`) `scale` in `unit`, inverted or not.
 
     Attributes:
-        name: the column's name in the log; empty for a constant.
-        unit: the unit, such as `deg`.
-        si: the SI unit of the model, such as `rad`.
-        sd: stated standard deviation of the measurement noise, in `unit`; for outputs alone.
-        hold: what an input does between samples: "zero-order", "linear", "mixed" (held
-            until it jumps, else linear), or "auto", by what the log shows of it.
-        repeats: what is made of an output's repeated values: "missing" (a slow sensor in a fast
-            table), "keep", or "auto", missing where that is unmistakable.
+        name: name of the column in the log; empty for a constant.
+        unit: unit, such as `deg`.
+        si: SI unit of the model, such as `rad`.
+        sd: stated standard deviation of the measurement noise, in `unit`; for outputs only.
+        hold: behaviour of an input between samples: "zero-order", "linear", "mixed" (held until it
+            jumps, else linear), or "auto" (decided from the log).
+        repeats: treatment of an output's repeated values: "missing" (a slow sensor in a fast
+            table), "keep", or "auto" (missing if unmistakable).
         scale: `unit` per number in the log.
-        offset: in the log's own numbers, as 1500 of a PWM.
-        invert: whether its sign is the other one.
+        offset: offset in the log's own numbers, such as 1500 for a PWM.
+        invert: True if the sign is reversed.
         constant: value in `unit` of an input that the log lacks.
-        missing: numbers of the log that stand for no value; an output is missing there, and an
-            input as it was before.
-        assumed: whether nobody stated the unit: that of the file goes before it, if it has one.
-        origin: where unit, axes and sign come from, in words, where a preset states them.
-        contradicted: the unit that the file states, where it is another than `unit`.
+        missing: numbers of the log that mean no value. An output is missing there; an input keeps
+            its previous value.
+        assumed: True if nobody stated the unit, so that the file's unit overrides it.
+        origin: source of unit, axes and sign, in words, if a preset states them.
+        contradicted: unit that the file states, if it differs from `unit`.
     """
 
     name: str
@@ -62,12 +62,12 @@ class Signal:
     contradicted: str = ""
 
     def to_si(self, numbers: np.ndarray) -> np.ndarray:
-        """Numbers of the log (N,) in SI.
+        """Return numbers of the log (N,) in SI.
 
         Raises:
             ValueError: the unit is unknown or of the wrong kind.
         """
-        # Untouched where nothing is stated: the log's numbers stay exactly what they are.
+        # Without an offset, the log's numbers stay bit-identical.
         if self.offset:
             numbers = numbers - self.offset
         return numbers * self._factor
@@ -83,13 +83,13 @@ class Signal:
 
 
 def scale_problem(signal: Signal) -> str:
-    """Reason why the scale or the offset of a signal is wrong; empty if neither is."""
-    # A scale of zero would make a constant of the signal, and one of 1e300 overflows.
+    """Return why the scale or the offset of a signal is wrong; empty if neither is."""
+    # A scale of zero would make the signal constant, and 1e300 would overflow.
     if not 1e-12 <= abs(signal.scale) <= 1e12:
         return f"scale is {signal.scale:g}, expected a number other than 0 from 1e-12 to 1e12"
     if not abs(signal.offset) <= 1e12:
         return f"offset is {signal.offset:g}, expected at most 1e12"
-    # Two minus signs are more likely a slip than an intention, and look like none.
+    # Two minus signs are more likely a slip than intended.
     if signal.invert and signal.scale < 0:
         return f"scale is {signal.scale:g} and invert is true, expected one of the two"
     return ""
@@ -115,7 +115,7 @@ def _unit(signal: Signal) -> str:
 
 
 def as_content(signal: Signal) -> dict[str, str | float | bool | None]:
-    """A signal as plain data, for `fit.json`."""
+    """Return a signal as plain data, for `fit.json`."""
     if signal.constant is not None:
         return {"constant": signal.constant, "unit": signal.unit, "origin": signal.origin}
     return {
@@ -130,20 +130,20 @@ def as_content(signal: Signal) -> dict[str, str | float | bool | None]:
 
 @dataclass(frozen=True)
 class Source:
-    """Origin of a flight: the file, its fingerprint, and the reader's assumptions and corrections.
+    """Origin of a flight: the file, its hash, and the reader's assumptions and corrections.
 
     Attributes:
-        path: of the file.
-        sha256: of the file.
-        notes: what the reader assumed or did.
-        firmware: of the autopilot that wrote the log.
-        parameters: of that autopilot, by name.
-        rates: the usual rates of outputs in an autopilot's log [Hz].
-        cautions: what biases a fit to the log as it is used, which every fit repeats.
-        inputs: by the model's name, what each is in the log.
-        outputs: likewise.
-        first_time: from which windows of the log count [s], in the log's own count.
-        facts: by the model's name and `input` or `output`, what each was before resampling.
+        path: path of the file.
+        sha256: SHA-256 of the file.
+        notes: the reader's assumptions and actions.
+        firmware: firmware of the autopilot that wrote the log.
+        parameters: parameters of that autopilot, by name.
+        rates: usual rates of outputs in an autopilot's log [Hz].
+        cautions: causes of bias in any fit to the log, repeated by every fit.
+        inputs: signals of the log by the model's name of the input.
+        outputs: likewise for outputs.
+        first_time: zero of the log's windows [s], in the log's own count.
+        facts: facts of each signal before resampling, by the model's name and `input` or `output`.
     """
 
     path: str
@@ -172,21 +172,23 @@ class Flight:
         inputs: samples (N,) by the model's name.
         outputs: samples (N,) by the model's name; NaN where one is missing.
         t0: time in the log of the first sample [s].
-        sd: standard deviation of the measurement noise by output, only where it was stated.
+        sd: standard deviation of the measurement noise by output, only if stated.
         known: parameters that differ in this run, SI.
-        hold_out: whether the run serves for validation alone.
-        hold: by input, what it does between samples: "zero-order" (it stays until the next
-            sample), as all do that are not named, "linear", or "mixed" (held in the intervals that
-            end in a jump, linear in others; see `heli_jax.numerics.jumps`).
-        hold_reason: by input, why the reader of a log took that hold, where the log decided.
-        choose_windows: whether its most telling windows are to be fitted in its place.
-        instruments: by input, samples (N,) of an excitation that was added to it and that no
-            feedback reaches, such as a sweep of the autopilot, SI.
+        hold_out: True if the run is for validation only.
+        name: name of the run.
+        source: origin of the run, if it was read from a log.
+        hold: behaviour of each input between samples: "zero-order" (holds until the next sample;
+            the default), "linear", or "mixed" (held in intervals that end in a jump, else linear;
+            see `heli_jax.numerics.jumps`).
+        hold_reason: reason for the hold by input, if it was decided from the log.
+        choose_windows: True to fit the run's most informative windows instead.
+        instruments: samples (N,) by input of an excitation that was added to it and that no
+            feedback reaches, such as the autopilot's chirp, SI.
 
     Raises:
-        ValueError: `dt` is not positive; there is no signal; a signal is not of shape (N,) or
-            not finite (outputs may be NaN); `sd` names no output or is not positive; `known` is
-            not finite; `hold` names no input or no hold.
+        ValueError: `dt` is not positive; there is no signal; a signal is not of shape (N,) or not
+            finite (outputs may be NaN); `sd` names no output or is not positive; `known` is not
+            finite; `hold` names no input or no hold.
     """
 
     dt: float
@@ -215,7 +217,7 @@ class Flight:
             raise ValueError(f"dt is {self.dt}, expected a positive number of seconds")
         if not math.isfinite(self.t0):
             raise ValueError(f"t0 is {self.t0}, expected a finite number of seconds")
-        # By object.__setattr__, since the class is frozen: what was fitted must not change later.
+        # By object.__setattr__, because the class is frozen: a fitted flight must not change later.
         for kind in ("inputs", "outputs", "instruments"):
             gaps = kind == "outputs"
             signals = {name: _samples(name, x, gaps) for name, x in getattr(self, kind).items()}
@@ -224,7 +226,7 @@ class Flight:
         lengths |= {f"instrument of {name}": x.size for name, x in self.instruments.items()}
         if not lengths:
             raise ValueError("a flight needs at least one input or output")
-        # One grid for all: the time of a sample is its number times dt, and stands nowhere else.
+        # One grid for all signals: the time of a sample is its index times dt.
         if len(set(lengths.values())) > 1:
             raise ValueError(f"the signals differ in length: {lengths}")
         object.__setattr__(self, "sd", dict(self.sd))
@@ -239,7 +241,7 @@ class Flight:
         for name, sd in self.sd.items():
             if name not in self.outputs:
                 raise ValueError(f"sd is stated for {name!r}, which is no output of this flight")
-            # Residuals are divided by it.
+            # Residuals are divided by sd.
             if not (math.isfinite(sd) and sd > 0):
                 raise ValueError(f"sd of {name!r} is {sd}, expected a positive number")
         for name, value in self.known.items():
@@ -254,8 +256,7 @@ class Flight:
                 raise ValueError(
                     f"hold of {name!r}: expected one of {', '.join(HOLDS)}, got {value!r:.60}"
                 )
-        # Every input has its hold written out, so that no reader of a flight has to know the
-        # default.
+        # Every input gets an explicit hold, so that no reader of a flight needs the default.
         object.__setattr__(self, "hold", {**dict.fromkeys(self.inputs, HOLDS[0]), **self.hold})
         object.__setattr__(self, "hold_reason", dict(self.hold_reason))
 
@@ -266,12 +267,12 @@ class Flight:
 
     @property
     def times(self) -> np.ndarray:
-        """Time of each sample from the first one on, shape (N,) [s]."""
+        """Time of each sample from the first one, shape (N,) [s]."""
         return self.dt * np.arange(self.n_samples)
 
     @property
     def window(self) -> tuple[float, float]:
-        """First and last time [s] from the log's beginning; from its own where it has no log."""
+        """First and last time [s] from the log's beginning, or else the flight's own."""
         start = self.t0 - (self.source.first_time if self.source else self.t0)
         return start, start + self.duration
 
@@ -281,13 +282,13 @@ class Flight:
         return self.dt * (self.n_samples - 1)
 
     def logged_step(self, name: str, kind: str) -> float:
-        """Usual time between a signal's samples as logged [s]; `dt` where none is known."""
+        """Return the usual time between a signal's samples as logged [s]; `dt` if unknown."""
         facts = self.source.facts.get((name, kind)) if self.source else None
         return facts.usual if facts is not None and facts.usual > 0 else self.dt
 
     @functools.cached_property
     def facts(self) -> dict[tuple[str, str], SignalFacts]:
-        """Facts of each signal by name and kind, as it was logged if that is known."""
+        """Facts of each signal by name and kind, as logged if that is known."""
         known = self.source.facts if self.source else {}
         signals = {(n, "input"): u for n, u in self.inputs.items()}
         signals |= {(n, "output"): y for n, y in self.outputs.items()}
@@ -297,7 +298,7 @@ class Flight:
         outputs = frozenset(key for key in signals if key[1] == "output")
         return {**facts_of_all(timed, outputs), **{k: known[k] for k in signals if k in known}}
 
-    # Imported within: `summaries` is for notebooks, and a flight is made without it.
+    # Imported inside: `summaries` is for notebooks, and flights do not need it.
     def __repr__(self) -> str:
         from heli_jax.summaries import as_text, of_flight
 
@@ -312,11 +313,11 @@ class Flight:
 def _samples(name: str, values: np.ndarray, gaps: bool) -> np.ndarray:
     if np.iscomplexobj(values):
         raise ValueError(f"{name!r} is complex, expected real numbers")
-    # A copy, made read-only: the caller's array may change after the flight has been checked.
+    # A read-only copy: the caller's array may change after the flight has been checked.
     samples = np.array(values, dtype=np.float64)
     if samples.ndim != 1 or samples.size == 0:
         raise ValueError(f"{name!r} has shape {samples.shape}, expected (N,) with N >= 1")
-    # NaN in an output is a sample that was not taken; an input acts all the time.
+    # NaN in an output is a missing sample; an input acts all the time.
     bad = np.flatnonzero(np.isinf(samples) if gaps else ~np.isfinite(samples))
     if bad.size:
         raise ValueError(f"{name!r} is {samples[bad[0]]} at sample {bad[0]}, expected numbers")
@@ -325,9 +326,9 @@ def _samples(name: str, values: np.ndarray, gaps: bool) -> np.ndarray:
 
 
 def labels(flights: Sequence[Flight]) -> list[str]:
-    """Return what to call each flight; the second and further of one name have a number."""
+    """Return a label for each flight; repeated names get a number."""
     names = [f.name or f"flight {i + 1}" for i, f in enumerate(flights)]
-    # Two logs may bear one file name; results are kept by label, so one would hide the other.
+    # Two logs may have the same name. Results are kept by label, so one would hide the other.
     before = [names[:i].count(name) for i, name in enumerate(names)]
     return [f"{name} ({k + 1})" if k else name for name, k in zip(names, before, strict=True)]
 
@@ -335,12 +336,13 @@ def labels(flights: Sequence[Flight]) -> list[str]:
 # Instruments of flights: excitations that were added to inputs and logged.
 
 _SAME = 1e-6
-"""part of an input's power that is not its instrument's, below which the two are one signal"""
+"""Largest share of an input's power outside its instrument, if the two count as one signal."""
 
 
 def own_instruments(flights: Sequence[Flight], names: Sequence[str]) -> tuple[str, ...]:
-    """The inputs whose instrument is the input itself in every flight in which it moves: the stick,
-    with all that feedback brings into it.
+    """Return the inputs whose instrument is the input itself in every flight in which it moves.
+
+    Such an instrument is the stick with all feedback in it.
     """
     held = [n for n in names if all(n in f.instruments and n in f.inputs for f in flights)]
     own = []
@@ -358,7 +360,7 @@ def own_instruments(flights: Sequence[Flight], names: Sequence[str]) -> tuple[st
 
 
 def own_said(names: Sequence[str]) -> str:
-    """Return the notes about signals with a clock of their own."""
+    """Return the note about instruments that are the input itself."""
     return (
         f"instrument of {', '.join(names)}: it is the input itself, into which feedback brings gusts; "
         "expected the excitation alone, before pilot or autopilot add to it"

@@ -7,15 +7,15 @@ import numpy as np
 
 from heli_jax.finding import Finding
 
-JITTER_ALLOWED = 0.1  # of a step, where rounding does not explain more
+JITTER_ALLOWED = 0.1  # largest error of a step, in steps, unless rounding explains more
 LATEST = 1e12  # s, beyond any calendar; keeps sums and differences of stamps finite
 SHORTEST_STEP = 1e-9  # s
 _JITTER_NOTED = 0.01
-_DRIFT_ALLOWED = 0.5  # of a step
+_DRIFT_ALLOWED = 0.5  # in steps
 _FEWEST_DIGITS = 5  # nobody logs fewer significant digits
 _FEWEST_STAMPS = 8  # fewer may be round numbers by accident
-_COARSEST = 0.9  # of a step; stamps rounded to a whole step cannot show a lost sample otherwise
-_ON = 100.0  # usual steps, within which a counter goes on after its end
+_COARSEST = 0.9  # in steps; coarser stamps, rounded to a whole step, cannot show a lost sample
+_ON = 100.0  # in usual steps; largest step across the overflow of a counter
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,10 @@ class Grid:
 
 @dataclass(frozen=True)
 class Uneven:
-    """Reason why stamps are no uniform grid: the sample after the worst step, and the sizes [s].
+    """Reason why stamps are no uniform grid: the sample after the worst step, and its sizes [s].
 
-    `drift` is how far the stamps leave a straight line, in steps, where that is the reason.
+    `drift` is the largest distance of the stamps from a straight line, in steps, if that is the
+    reason.
     """
 
     row: int
@@ -51,8 +52,10 @@ class Uneven:
 
 
 def not_increasing(stamps: np.ndarray) -> tuple[int, str] | None:
-    """The first of the stamps (N,) that is not later than the one before it: its row, and what the
-    time does there; None where all increase."""
+    """Return the first of the stamps (N,) not later than the previous one: its row and the fault.
+
+    None if all stamps increase.
+    """
     steps = np.diff(stamps)
     rows = np.flatnonzero(steps <= 0)
     if not rows.size:
@@ -62,11 +65,11 @@ def not_increasing(stamps: np.ndarray) -> tuple[int, str] | None:
 
 
 _MANY = 0.1
-"""part of the stamps"""
+"""Share of the stamps."""
 
 
 def shared_stamps(stamps: np.ndarray) -> str:
-    """Reason why many of the stamps (N,) stand still; empty if few do."""
+    """Return why many of the stamps (N,) repeat; empty if few do."""
     still = int(np.count_nonzero(stamps[1:] == stamps[:-1]))
     if still <= _MANY * stamps.size:
         return ""
@@ -77,14 +80,14 @@ def shared_stamps(stamps: np.ndarray) -> str:
 
 
 _COUNTER = 2.0**32
-"""ticks after which a counter of 32 bits begins anew: 71.6 minutes of microseconds"""
+"""Ticks after which a 32-bit counter overflows: 71.6 minutes of microseconds."""
 
 
 def without_overflow(stamps: np.ndarray) -> np.ndarray:
-    """Stamps (N,) of a counter of 32 bits that began anew, as going on."""
+    """Return the stamps (N,) of a 32-bit counter, unwrapped."""
     steps = np.diff(stamps)
     back = np.flatnonzero(steps < 0)
-    # Whole numbers below its end, that fall by nearly all of it and then go on as before.
+    # An overflow falls by nearly the whole range of the counter and then continues as before.
     if not back.size or not (stamps.min() >= 0 and stamps.max() < _COUNTER):
         return stamps
     on = steps[back] + _COUNTER
@@ -96,23 +99,23 @@ def without_overflow(stamps: np.ndarray) -> np.ndarray:
 
 
 def uniform_grid(elapsed: np.ndarray, rounding: float) -> Grid | Uneven:
-    """The uniform grid that stamps (N,) [s] stand for, N >= 2 and strictly increasing.
+    """Return the uniform grid of stamps (N,) [s], N >= 2 and strictly increasing.
 
-    Either no step errs by more than a tenth and no stamp leaves a straight line by half a step;
-    or all stamps lie as near to a line as the `rounding` [s] of stamps on it would leave them.
+    There is one in two cases. Either no step errs by more than a tenth and no stamp leaves a
+    straight line by half a step. Or all stamps are as near to a line as `rounding` [s] allows.
     """
     steps = np.diff(elapsed)
-    # Never the first step or the median one: stamps in milliseconds at 300 Hz are 3 or 4 ms apart.
+    # Neither the first step nor the median: stamps in milliseconds at 300 Hz are 3 or 4 ms apart.
     i = np.arange(elapsed.size) - 0.5 * (elapsed.size - 1)
-    slope = float(i @ (elapsed - elapsed.mean()) / (i @ i))  # of the line of least squares
+    slope = float(i @ (elapsed - elapsed.mean()) / (i @ i))  # of the least-squares line
     dt = _plain(slope, 2 * rounding / float(elapsed[-1] - elapsed[0]))
     jitter = float(np.abs(steps - dt).max() / dt)
-    # Half the band's width: the stamps leave the line in its middle by no more.
+    # Half the band's width is the distance from the line in its middle.
     drift = _spread(elapsed, dt) / dt / 2
     if jitter <= JITTER_ALLOWED and drift < _DRIFT_ALLOWED:
         return Grid(dt, jitter)
-    # Coarse stamps jitter by up to their rounding and may still be exact: those that are rounded
-    # lie in a band no wider than it around some line, though not the one of least squares.
+    # Coarse stamps jitter by up to their rounding and may still be exact. Rounded stamps are in a
+    # band no wider than the rounding around some line, but not the least-squares line.
     if rounding <= _COARSEST * dt:
         nearest = _step_of_least_spread(elapsed, slope)
         if _spread(elapsed, nearest) <= rounding * (1 + 1e-6):
@@ -125,15 +128,15 @@ def uniform_grid(elapsed: np.ndarray, rounding: float) -> Grid | Uneven:
 
 
 def _spread(elapsed: np.ndarray, dt: float) -> float:
-    """Width [s] of the band of slope `dt` that holds all stamps (N,)."""
+    """Return the width [s] of the band of slope `dt` that contains all stamps (N,)."""
     return float(np.ptp(elapsed - dt * np.arange(elapsed.size)))
 
 
 def _step_of_least_spread(elapsed: np.ndarray, dt: float) -> float:
-    """The slope for which the band is narrowest, by ternary search: the width is convex in it."""
+    """Return the slope of the narrowest band, by ternary search, because the width is convex."""
     reach = 2 * _spread(elapsed, dt) / elapsed.size
     low, high = dt - reach, dt + reach
-    for _ in range(60):  # (2/3)^60 of the range: below what float64 resolves
+    for _ in range(60):  # (2/3)^60 of the range: below the resolution of float64
         third = (high - low) / 3
         if _spread(elapsed, low + third) < _spread(elapsed, high - third):
             high -= third
@@ -143,7 +146,7 @@ def _step_of_least_spread(elapsed: np.ndarray, dt: float) -> float:
 
 
 def _plain(dt: float, tolerance: float) -> float:
-    """A whole rate, or few digits, where the stamps cannot tell it from `dt`: 0.01, not 0.0099999.
+    """Return a whole rate or few digits that agree with `dt`: 0.01, not 0.0099999.
 
     `tolerance` is relative.
     """
@@ -151,7 +154,7 @@ def _plain(dt: float, tolerance: float) -> float:
     # 49.6 Hz into 50.
     tolerance = min(max(tolerance, 1e-10), 1e-3)
     candidates = [float(f"{dt:.9g}")]
-    if dt < 1:  # a whole number of Hz, which few digits of dt need not be: 1/300 s
+    if dt < 1:  # a whole number of Hz, such as 1/300 s, may need many digits of dt
         candidates.insert(0, 1 / round(1 / dt))
     return next((c for c in candidates if abs(c / dt - 1) <= tolerance), dt)
 
@@ -159,23 +162,24 @@ def _plain(dt: float, tolerance: float) -> float:
 def rounding_of(stamps: np.ndarray) -> float:
     """Return the rounding of stamps (N,), N >= 2 and strictly increasing, in their unit.
 
-    Read from the stamps themselves: the largest power of ten, up to a step, that all are multiples
-    of; or what float32 resolves; where nothing is evident, what float64 does. Significant digits
-    round later stamps more coarsely, so those with the most digits before the point decide.
+    It is the largest power of ten, up to a step, of which all stamps are multiples. Otherwise it is
+    the resolution of float32 if that fits, else of float64. With a fixed number of significant
+    digits, later stamps are rounded more coarsely. Stamps with the most digits before the point
+    therefore decide.
     """
     size = np.abs(stamps)
     largest = float(size.max())
     top = math.floor(math.log10(largest))
     late = size[size >= 10.0**top]
     resolved = float(np.spacing(largest))
-    # 1e-9: the logarithm of 0.01 is -2 but for its last digit.
+    # 1e-9: the logarithm of 0.01 is -2 only up to rounding.
     coarse = math.floor(math.log10(float(np.median(np.diff(stamps)))) + 1e-9)
     for exponent in range(coarse, coarse - 6, -1):
         unit = 10.0**exponent
         by_digits = top - exponent + 1 >= _FEWEST_DIGITS and late.size >= _FEWEST_STAMPS
         multiples = (late if by_digits else size) / unit
         error = np.abs(multiples - np.rint(multiples)).max()
-        # Close to the resolution of float64 every number is a multiple of anything.
+        # Near the resolution of float64 every number is a multiple of anything.
         if unit > 100 * resolved and error <= max(1e-9, 4 * resolved / unit):
             return unit
     # A logger that counts seconds in float32 since boot steps by 1 ms after some hours.

@@ -1,8 +1,8 @@
-"""Motion of an input between the samples of a log, as the record itself shows it.
+"""Motion of an input between the samples of a log, decided from the record.
 
-An input that stays for several samples and jumps was commanded in steps, and each sample holds
-until the next. One that moves at nearly every sample was sampled on its way: a straight line from
-sample to sample is nearer to it. A record may have both: doublets, then a chirp.
+An input that is constant for several samples and then jumps was commanded in steps: each sample
+holds until the next. One that moves at nearly every sample was sampled during a motion, and
+straight lines fit better. A record may have both, such as doublets and then a chirp.
 """
 
 import dataclasses
@@ -16,31 +16,30 @@ from heli_jax.numerics.jumps import FEW, POWER, jumps, smallest_move, split, wei
 
 
 class Decision(NamedTuple):
-    """A hold and, in words, what speaks for it."""
+    """A hold and the reason for it."""
 
     hold: str
     reason: str
 
 
 LOW_PASSED = "resampling.input-low-passed"
-"""code of an input that was commanded in steps and was low-passed with outputs"""
+"""Code of the note on an input commanded in steps that was low-passed with outputs."""
 _SHARE = 0.05, 0.9
-"""share of the motion in jumps, from which on an input is held at them, and at all samples: white
-noise has 0.01, a random walk 0.02, steps under noise of half a percent 0.96"""
+"""Smallest shares of the motion in jumps for a mixed and for a held input. White noise has 0.01, a
+random walk 0.02, steps under 0.5 % of noise 0.96."""
 
 
 def decide(values: np.ndarray) -> Decision:
     """Decide what an input (N,), in any unit, does between samples, by how it moves.
 
-    An input that was commanded in steps moves in jumps, whether it stays for two samples (a stick
-    logged faster than it was sampled) or two hundred, and whatever noise of a few counts lies on
-    the steps. A smooth motion has hardly any, with or without pauses, and nor has a step that takes
-    several samples. An input that does both is mixed. Moves by one count of the log say nothing by
-    themselves: they are the resolution's, of a slow motion or of noise.
+    An input commanded in steps moves in jumps, also with noise of a few counts. It may hold for two
+    samples (logged faster than sampled) or two hundred. A smooth motion, with or without pauses,
+    has hardly any jumps, nor has a step over several samples. An input with both is mixed. Moves by
+    one count of the log decide nothing: they are the resolution of a slow motion or of noise.
     """
     largest = float(np.abs(values).max())
     if largest > 0:
-        values = values / largest  # what is left neither overflows nor vanishes
+        values = values / largest  # the rest neither overflows nor underflows
     quantum, span = smallest_move(values), float(np.ptp(values))
     if not np.isfinite(quantum):
         return Decision("zero-order", "never moves")
@@ -52,8 +51,8 @@ def decide(values: np.ndarray) -> Decision:
     if not weight.any():
         return Decision("linear", f"moves by one count of the log at a time, {_percent(share)}")
     held = jumps(values)
-    # No move counts for more than the range of nearly all samples: a single absurd number goes
-    # farther than all steps together.
+    # A move counts at most as much as the range of nearly all samples. Otherwise a single absurd
+    # number would outweigh all steps.
     low, high = np.quantile(values, [0.01, 0.99])
     weight = np.minimum(weight, ((high - low) / span or 1.0) ** POWER)
     in_jumps = weight[held].sum() / weight.sum()
@@ -66,10 +65,10 @@ def decide(values: np.ndarray) -> Decision:
 
 
 def without_jumps(flight: Flight) -> Flight:
-    """Return the flight with mixed inputs as linear ones that do nearly the same.
+    """Return the flight with mixed inputs replaced by nearly equivalent linear ones.
 
-    A held staircase does what a linear one does that is late by half a sample, but for terms of
-    second order in the sample time.
+    A held staircase acts like a linear one that is late by half a sample, up to second order in the
+    sample time.
     """
     inputs = {}
     for name, u in flight.inputs.items():
@@ -86,24 +85,25 @@ def without_jumps(flight: Flight) -> Flight:
 
 
 def low_passed(outputs: Iterable[str]) -> Decision:
-    """Return the decision for an input that was commanded in steps and went through these
-    outputs' filter."""
+    """Return the decision for an input commanded in steps that was filtered like these outputs."""
     return Decision("linear", f"was low-passed as {', '.join(outputs)}")
 
 
 def is_low_passed(flight: Flight, name: str) -> bool:
-    """True for an input that went through the filter of the outputs, after which it is linear."""
+    """True for an input that was filtered like the outputs, after which it is linear."""
     notes = flight.source.notes if flight.source else ()
     return any(n.code == LOW_PASSED and name in n.subjects for n in notes)
 
 
 def _of_few_values(moves: np.ndarray, moved: np.ndarray, share: float) -> Decision:
-    """Decide for an input with a handful of values, such as -1, 0 and 1, or noise of a few counts:
-    steps, unless it passes through the values between on its way."""
+    """Decide for an input with few values, such as -1, 0 and 1, or noise of a few counts.
+
+    It has steps, unless it passes through the values between.
+    """
     at = np.flatnonzero(moved)
-    # Two moves of the same sign at neighbouring samples are one motion, seen on its way.
-    # Of white noise of a few counts less than a third of neighbouring moves agree in sign, since a
-    # value above the mean tends to come back: hence 0.4.
+    # Two moves of the same sign at neighbouring samples are one motion. In white noise of a few
+    # counts, less than a third of neighbouring moves agree in sign, because values tend to return
+    # to the mean. Therefore the limit is 0.4.
     onward = (np.diff(at) == 1) & (np.sign(moves[at[1:]]) == np.sign(moves[at[:-1]]))
     if at.size > 1 and onward.mean() > 0.4:
         return Decision("linear", f"passes through the values between, moves at {_percent(share)}")

@@ -1,4 +1,4 @@
-"""A log whatever the file's format: a table of named columns, or channels on clocks of their own.
+"""Log of any file format: a table of named columns, or channels on separate clocks.
 
 A table of rows becomes a log of one topic (`heli_jax/flights/read_table.py`).
 """
@@ -18,8 +18,8 @@ from heli_jax.regular_file import size_words
 
 
 def wrong(path: str, problem: str, *place: str) -> InputError:
-    """The error for a file: `file, place, place: problem`, in one line whatever the names hold."""
-    # A name from a file may hold line breaks or escape sequences, which a terminal would obey.
+    """Return the error for a file: `file, place, place: problem`, in one line."""
+    # Names from a file may hold line breaks or escape sequences, which a terminal would obey.
     within = ": ".join((*([", ".join(place)] if place else []), problem))
     text = f"{path}{', ' if place else ': '}{within}"
     return InputError(
@@ -28,30 +28,30 @@ def wrong(path: str, problem: str, *place: str) -> InputError:
 
 
 def shown(text: str) -> str:
-    """Text from a file, quoted, cut to 40 characters."""
-    # Cut, since a damaged file may have a name as long as itself.
+    """Return text from a file, quoted, cut to 40 characters."""
+    # Cut, because a damaged file may have a name as long as the file.
     return repr(text) if len(text) <= 40 else repr(text[:40]) + "..."
 
 
 def listed(words: Iterable[str]) -> str:
-    """The first six, and how many more there are."""
+    """Return the first six words, and the number of the others."""
     each = list(words)
     more = f" and {len(each) - 6} more" if len(each) > 6 else ""
     return f"{', '.join(each[:6])}{more}"
 
 
 def column(name: str) -> str:
-    """`column 'phi'`, as a place."""
+    """Return `column 'phi'`, as a place."""
     return f"column {shown(name)}"
 
 
 def sample_count(count: int) -> str:
-    """`1 sample`, `2 samples`."""
+    """Return `1 sample`, `2 samples`."""
     return "1 sample" if count == 1 else f"{count} samples"
 
 
 MOST_COLUMNS = 10_000
-"""of a log: more are none that anybody named"""
+"""Most columns of a log."""
 
 
 def require_few_columns(path: str, count: int, *place: str) -> None:
@@ -61,34 +61,33 @@ def require_few_columns(path: str, count: int, *place: str) -> None:
 
 
 _MOST_BYTES = 24 * 10**8
-"""of all numbers of a file as float64: 3e8 of them"""
+"""Most bytes of all numbers of a file as float64: 3e8 numbers."""
 _MOST_SMALL = 250 * 10**6
 _DENSEST = 200
-"""bytes that one byte of a file may stand for, where they are more than `_MOST_SMALL`: a signal
-that stands still packs by a thousand, numbers of sensors by less than ten"""
+"""Largest memory per byte of a file, if it exceeds `_MOST_SMALL`. A constant signal packs by a
+thousand, sensor data by less than ten."""
 
 
 class Budget:
-    """Memory that a file may take, asked before it is taken: a few bytes can claim any number of
-    zeros."""
+    """Memory that a file may use, checked before allocation: a few bytes can claim many zeros."""
 
     def __init__(self, path: str, size: int) -> None:
-        """Nothing is taken yet."""
+        """Start with no memory used."""
         self._path, self._size, self._taken = path, size, 0
         self.most = min(_MOST_BYTES, max(_MOST_SMALL, _DENSEST * size))
-        """bytes"""
+        """Most bytes."""
 
     def take(self, count: int) -> None:
-        """Count bytes that are to be filled."""
+        """Count bytes that will be filled."""
         self._taken += count
         self.require(self._taken)
 
     def take_numbers(self, count: int, stored: int = 0) -> None:
-        """Count what numbers take as float64 beyond the bytes that were counted for them."""
+        """Count the memory of numbers as float64 beyond the bytes already counted for them."""
         self.take(max(8 * count, stored) - stored)
 
     def require(self, count: int) -> None:
-        """Refuse more bytes than the file may take at all."""
+        """Refuse more bytes than the file may use."""
         if count <= self.most:
             return
         problem = f"its content takes {size_words(count)} of memory or more, expected at most"
@@ -101,11 +100,11 @@ class Budget:
 
 
 _LONGEST_NAME = 1000
-"""letters of a column's name: patterns that look at names take their square"""
+"""Longest column name [characters]; the time of patterns on names grows with its square."""
 
 
 def require_short_names(path: str, names: Sequence[str]) -> None:
-    """Refuse a column's name that is no name."""
+    """Refuse a column name that is too long."""
     longest = max(map(len, names), default=0)
     if longest > _LONGEST_NAME:
         problem = f"expected names of columns of at most {_LONGEST_NAME} letters, got {longest}"
@@ -113,10 +112,10 @@ def require_short_names(path: str, names: Sequence[str]) -> None:
 
 
 def require_columns(path: str, have: Sequence[str], needed: Sequence[str]) -> None:
-    """Refuse a column that is missing or stands in the file twice."""
+    """Refuse a column that is missing or occurs twice."""
     for name in needed:
         count = have.count(name)
-        # Which of the two is meant cannot be known, and pyarrow would return either.
+        # Which of the two is meant is unknown, and pyarrow would return either.
         if count > 1:
             raise wrong(path, f"{count} columns have this name, expected one", column(name))
         if count == 0:
@@ -130,8 +129,10 @@ def require_columns(path: str, have: Sequence[str], needed: Sequence[str]) -> No
 
 @dataclass(frozen=True)
 class Survey:
-    """One column of a file: `values` (N,), NaN where empty, or None where it is text; `strays` says
-    which cells are no numbers where most are."""
+    """One column of a file: `values` (N,), NaN where empty, or None for text.
+
+    `strays` lists the cells that are no numbers, if most are.
+    """
 
     name: str
     values: np.ndarray | None
@@ -140,43 +141,43 @@ class Survey:
 
 
 class Table(Protocol):
-    """Interface of a reader of tables. Rows count from 0, places are for people."""
+    """Interface of table readers. Rows count from 0; places are for people."""
 
-    # A protocol and no base class: a reader is chosen by the file's ending in `open_log` alone, and
-    # the next format is one more module there.
+    # A protocol, not a base class: `open_log` chooses a reader by the file's ending, and a new
+    # format is one more module there.
 
     path: str
     format: str
     size: int
     names: tuple[str, ...]
     notes: tuple[Finding, ...]
-    """what was assumed or left out when it was opened"""
+    """Assumptions and omissions when the file was opened."""
     units: Mapping[str, str]
-    """by column, where the file states one"""
+    """Units by column, if the file states them."""
 
     @property
     def sha256(self) -> str:
-        """Fingerprint of the whole file; waits for that of a large one."""
+        """SHA-256 of the whole file; waits for that of a large one."""
         ...
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """The columns as float64 (N,), NaN where a cell is empty."""
+        """Return the columns as float64 (N,), NaN where a cell is empty."""
         ...
 
     def survey(self) -> list[Survey]:
-        """Every column, in the file's order."""
+        """Survey every column, in the file's order."""
         ...
 
     def place(self, row: int) -> str:
-        """Place of a row: `line 12` of a text file, `row 3` (from 1) of another."""
+        """Return the place of a row: `line 12` of a text file, `row 3` (from 1) of another."""
         ...
 
     def cell_text(self, name: str, row: int) -> str:
-        """Text of a cell."""
+        """Return the text of a cell."""
         ...
 
     def time_unit(self, name: str) -> str | None:
-        """The unit of a column that holds stamps of a clock by its type, otherwise None."""
+        """Return the unit of a column whose type is a time stamp, otherwise None."""
         ...
 
 
@@ -184,14 +185,14 @@ class Table(Protocol):
 
 
 class Channel(NamedTuple):
-    """One signal: `times` (N,) [s] and `values` (N,), both float64, NaN where one is missing."""
+    """One signal: `times` (N,) [s] and `values` (N,), both float64, NaN if missing."""
 
     times: np.ndarray
     values: np.ndarray
 
 
 class TableRows(NamedTuple):
-    """The rows of a table that are a topic, with their stamps (N,), `scale` seconds each."""
+    """Rows of a table that form a topic, with their stamps (N,), `scale` seconds each."""
 
     table: Table
     stamps: np.ndarray
@@ -203,12 +204,12 @@ class Topic:
     """Channels that were written together.
 
     Attributes:
-        name: what the autopilot calls them.
-        times: of the samples (N,) float64 [s], from the log's `origin`.
-        columns: the samples (N,) by the channel's full name, in the log's own type.
-        units: by the channel's full name, where the log states one.
-        clock: which field the times are, in words; empty where the rows have only an order.
-        rows: of a table, by which errors name their line.
+        name: the autopilot's name of the topic.
+        times: times of the samples (N,) float64 [s], from the log's `origin`.
+        columns: samples (N,) by the channel's full name, in the log's own type.
+        units: units by the channel's full name, if the log states them.
+        clock: field of the times, in words; empty if the rows have only an order.
+        rows: rows of a table, by which errors name their line.
     """
 
     name: str
@@ -224,13 +225,13 @@ class ChannelLog:
     """One flight of a file of `size` [bytes].
 
     Attributes:
-        topics: those that hold samples.
-        firmware: which wrote it, in its own words.
+        topics: topics with samples.
+        firmware: firmware that wrote the log, in its own words.
         parameters: the firmware's settings, by name.
-        notes: what was lost or assumed when it was read.
-        flight: which flight of the file it is, from 1, and of how many.
-        start: when the logger began [s], where the log says so.
-        origin: from which times count [s], in the log's own count.
+        notes: losses and assumptions on reading.
+        flight: number of the flight in the file, from 1, and the count of flights.
+        start: time when the logger began [s], if the log states it.
+        origin: zero of the times [s], in the log's own count.
     """
 
     path: str
@@ -247,7 +248,7 @@ class ChannelLog:
 
     @classmethod
     def of_table(cls, table: Table, topics: tuple[Topic, ...], **more: Any) -> "ChannelLog":
-        """Return the log of topics that were made of a table; `more` are other fields."""
+        """Return the log of topics made from a table; `more` are other fields."""
         return cls(table.path, table.format, table.size, table.sha256, topics, **more)
 
     @property
@@ -257,24 +258,25 @@ class ChannelLog:
 
     @property
     def first_time(self) -> float:
-        """The time [s] from which windows count: when the logger began, or the earliest sample."""
+        """Zero of windows [s]: when the logger began, or the earliest sample."""
         clocks = [t.times for t in self.topics if t.clock and t.times.size]
         earliest = min((float(times[0]) for times in clocks), default=0.0)
         latest = max((float(times[-1]) for times in clocks), default=0.0)
         if self.start is not None and self.start <= latest:
             return self.start
-        # What was published once, before the logger began, is older than the flight.
+        # A sample published once, before the logger began, is older than the flight.
         longest = [times for times in clocks if times.size > 1]
         return min((float(times[0]) for times in longest), default=earliest)
 
     @property
     def begin(self) -> float:
-        """The time from which windows count [s], in the log's own count."""
+        """Zero of windows [s], in the log's own count."""
         return self.origin + self.first_time
 
     def topic_of(self, name: str) -> Topic:
-        """The topic that holds a channel."""
-        # A search and no index: a log has some hundred topics, and names are asked for a few times.
+        """Return the topic that holds a channel."""
+        # A search needs no index: a log has some hundred topics, and names are looked up a few
+        # times.
         for topic in self.topics:
             if name in topic.columns:
                 return topic
@@ -283,9 +285,9 @@ class ChannelLog:
         raise wrong(self.path, f"no channel {shown(name)}{nearest(name[:60], known)}")
 
     def channel(self, name: str) -> Channel:
-        """Times and samples of one channel."""
+        """Return times and samples of one channel."""
         topic = self.topic_of(name)
-        # `info` shows such rows; only who asks for times has to be told that there are none.
+        # `info` shows such rows; only a request for times fails.
         if not topic.clock:
             problem = "its rows have no times, so nothing can be fitted"
             raise wrong(self.path, problem, f"channel {shown(name)}")
@@ -293,13 +295,13 @@ class ChannelLog:
 
 
 def as_floats(values: np.ndarray) -> np.ndarray:
-    """Samples (N,) of any type as float64."""
-    # Damage can make a NaN of a kind that a conversion warns of; it stays NaN.
+    """Return samples (N,) of any type as float64."""
+    # A damaged log may hold a NaN that warns on conversion; it stays NaN.
     with np.errstate(invalid="ignore"):
         return np.asarray(values, np.float64)
 
 
 def require_samples(path: str, topics: Sequence[Topic]) -> None:
-    """Refuse a log without any samples."""
+    """Refuse a log without samples."""
     if not any(topic.times.size for topic in topics):
         raise wrong(path, "holds no samples, expected a flight")

@@ -9,66 +9,71 @@ from heli_jax.finding import Finding, note
 from heli_jax.flights.log import shown
 
 _FEWEST = 8
-"""samples of a signal beside its marks, at least"""
+"""Fewest samples of a signal besides its marks."""
 _NINES = tuple(
     sign * nines
     for nines in (999.0, 9999.0, 99999.0, 999999.0, 999.9, 9999.9, 99999.9, 999.99, 9999.99)
     for sign in (1.0, -1.0)
 )
 _DECIMAL = np.sort([*_NINES, -7777.0, -8888.0, -88888.0])
-"""numbers that people choose for none: nines and eights"""
+"""Numbers that people choose for no value: nines and eights."""
 _BINARY = np.sort([*(2.0**b - 1 for b in (15, 16, 31, 32)), *(-(2.0**b) for b in (15, 31))])
-"""the ends of integers"""
+"""Limits of integer types."""
 _HUNDREDTHS = np.array([-327.68, 327.67, 655.35])
 _KNOWN = np.sort(np.concatenate([_DECIMAL, _BINARY, _HUNDREDTHS]))
 _SMALLEST = 300.0
-"""below which there are none: nearly all signals are done with by that"""
+"""Smallest magnitude of a mark; it excludes most signals quickly."""
 _SINGLE = 1e-6
-"""of a mark, by which its number may miss it: single precision, and units that are converted"""
+"""Relative tolerance of a mark, for single precision and converted units."""
 _ABSURD = 1e9
-"""in the log's own numbers: larger ones are no measurement, such as 1e10 and 3.4e38"""
+"""Magnitude in the log's own numbers above which nothing is a measurement, such as 1e10 and 3.4e38.
+"""
 _MOST, _FEW = 0.2, 2
-"""part of the samples that are absurd, at most, unless they are so few values: a counter may be as
-large for half of its time"""
+"""Largest share of absurd samples, unless they have at most `_FEW` values. A counter may be as
+large half of the time."""
 _APART = 1.0
-"""times the range of all other values, by which a mark lies outside of it"""
+"""Distance of a mark from all other values, in ranges of those values."""
 _LEVELS = 4
-"""distinct values that a signal has beside its marks, at least"""
+"""Fewest distinct values of a signal besides its marks."""
 
 
 def at_marks(numbers: np.ndarray) -> np.ndarray:
-    """Return a mask of the numbers (N,) of a log that surely stand for no value. These are known
-    marks far outside of all others or of a sign that no other number has, and numbers that
-    nothing measures."""
+    """Return a mask of the numbers (N,) of a log that certainly mean no value.
+
+    These are known marks far outside of all other numbers, or the only ones of their sign, and
+    numbers too large for any measurement.
+    """
     absurd, known = is_absurd(numbers), _is_one_of(_KNOWN, numbers)
     none = np.zeros(numbers.shape, bool)
     if not (absurd.any() or known.any()):
         return none
-    # Known marks at any share: of a slow sensor, most rows of a table hold nothing else.
+    # Known marks may have any share: with a slow sensor, they fill most rows of a table.
     others = numbers[absurd & ~known]
-    # Of these few are none, or nearly always the same.
+    # Absurd numbers must be few or nearly always the same.
     few = others.size <= _MOST * np.count_nonzero(np.isfinite(numbers) | (absurd & ~known))
     at = known | absurd if few or np.unique(others).size <= _FEW else known
     rest = numbers[np.isfinite(numbers) & ~at]
-    # Of a switch between a few values any of them may be one.
+    # A switch between a few values may use any of them.
     if rest.size < _FEWEST or np.unique(rest).size < _LEVELS:
         return none
     low, high = float(rest.min()), float(rest.max())
     away = _APART * (high - low)
     far = (numbers > high + away) | (numbers < low - away)
-    # Among rotor speeds -9999 is not far, but the only one below zero.
+    # Among rotor speeds -9999 is not far away, but it is the only negative number.
     other_sign = (numbers < 0) if low >= 0 else (numbers > 0) if high <= 0 else none
     return at & (far | (other_sign & _is_one_of(_DECIMAL, numbers)))
 
 
 def infinite(values: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-    """Return a mask of the values (N,) of an output that are infinite where the log's numbers
-    (N,) are no marks; `inf` is a mark as 1e10 is."""
+    """Return a mask of the values (N,) of an output that are infinite.
+
+    The log's numbers (N,) that are marks are excepted: `inf` is a mark like 1e10.
+    """
     return np.isinf(values) & ~at_marks(numbers)
 
 
 def is_absurd(numbers: np.ndarray) -> np.ndarray:
-    """Return a mask of the numbers (N,) of a log that nothing measures, in any unit."""
+    """Return a mask of the numbers (N,) of a log that no sensor measures, in any unit."""
     with np.errstate(invalid="ignore"):
         return np.abs(numbers) > _ABSURD
 
@@ -88,17 +93,17 @@ def _is_one_of(marks: np.ndarray, numbers: np.ndarray) -> np.ndarray:
 
 
 def without_marks(numbers: np.ndarray) -> np.ndarray:
-    """Numbers (N,) of a log, NaN where one stands for no value."""
+    """Return numbers (N,) of a log, NaN where one means no value."""
     at = at_marks(numbers)
     return np.where(at, np.nan, numbers) if at.any() else numbers
 
 
 def mark_notes(channels: Iterable[tuple[str, np.ndarray]]) -> list[Finding]:
-    """Notes on the marks that channels have, each of a name and numbers (N,) of any kind."""
+    """Return notes on the marks in channels, each with a name and numbers (N,) of any kind."""
     notes = []
     for name, numbers in channels:
-        # A signal that was never logged has marks alone, and a switch may have any value. A damaged
-        # log may hold NaNs that signal when they are converted.
+        # A signal that was never logged has only marks, and a switch may have any value. A damaged
+        # log may hold signalling NaNs, which warn on conversion.
         if (x := np.asarray(numbers)).dtype.kind in "biuf":
             with np.errstate(invalid="ignore"):
                 x = x.astype(np.float64)
@@ -111,20 +116,20 @@ def mark_notes(channels: Iterable[tuple[str, np.ndarray]]) -> list[Finding]:
 def marks_note(
     name: str, numbers: np.ndarray, at: np.ndarray, done: str, *subjects: str
 ) -> Finding:
-    """A note on the marks of a channel, a mask of its numbers (N,), and on what is done of them."""
+    """Return a note on the marks of a channel (a mask of its numbers (N,)) and their treatment."""
     words = f"{name} has {mark_words(numbers, at)}: {done}"
     return note("samples.marks", words, *subjects, value=int(np.count_nonzero(at)))
 
 
 def mark_words(numbers: np.ndarray, at: np.ndarray) -> str:
-    """`10 samples of -9999 and 1 of 1e+10, far outside of all others`; a large share is said."""
+    """Return `10 samples of -9999 and 1 of 1e+10, far outside of all others`, and a large share."""
     share = np.count_nonzero(at) / np.count_nonzero(~np.isnan(numbers))
     often = f" ({100 * share:.0f} % of all)" if share > _MOST else ""
     return f"{value_words(numbers[at])}{often}, far outside of all others"
 
 
 def value_words(values: np.ndarray) -> str:
-    """`10 samples of -9999 and 1 of 1e+10`; of at least one value (K,)."""
+    """Return `10 samples of -9999 and 1 of 1e+10`, for at least one value (K,)."""
     numbers, counts = np.unique(values, return_counts=True)
     words = [f"{n} of {v:.7g}" for v, n in zip(numbers[:3], counts[:3], strict=True)]
     words[0] = words[0].replace(" of", " sample of" if counts[0] == 1 else " samples of", 1)
@@ -132,28 +137,30 @@ def value_words(values: np.ndarray) -> str:
     return " and ".join(words) + more
 
 
-# Samples of a log that no motion leads to, and numbers that nothing measures.
+# Strays: samples that no motion reaches, and numbers that no sensor measures.
 
 _MOST_STRAYS = 0.05
-"""part of the samples that no motion leads to, at most"""
+"""Largest share of strays."""
 _MOTION = 50
-"""samples from which the range of a motion is known"""
+"""Fewest samples that define the range of a motion."""
 _FAR, _FARTHER = 5.0, 20.0
-"""times the range of all other samples, from which on no motion leads there; the second for
-inputs, since a stick may be pushed out of noise for a moment, and for signals of few values"""
+"""Distance of a stray, in ranges of all other samples. The second is for inputs, because a stick
+may briefly be pushed out of noise, and for signals of few values."""
 _QUICK = 0.04
-"""s, between two samples of which a motion does not come and go"""
+"""Longest usual step [s] within which a motion cannot come and go."""
 _LONGEST = 3
-"""such samples in a row, at most; one value that a sensor holds counts once"""
+"""Most strays in a row; a value that a sensor holds counts once."""
 _STRAY_LEVELS, _FEW_LEVELS = 8, 3
-"""distinct values of a signal beside its strays: below the first it has few, below the second too
-few to tell"""
+"""Distinct values of a signal besides its strays. Below the first it has few, below the second too
+few to decide."""
 
 
 @dataclass(frozen=True, eq=False)
 class Strays:
-    """Samples that may stand for no value and are kept, since nobody knows: their times (K,) [s],
-    their values (K,), as the log has them, and `why` they are odd."""
+    """Samples that may mean no value but are kept, because that is not certain.
+
+    `times` (K,) [s], `values` (K,) in the log's numbers, and `why` they are unusual.
+    """
 
     times: np.ndarray
     values: np.ndarray
@@ -166,8 +173,9 @@ class Strays:
 
 
 def strays(seconds: np.ndarray, numbers: np.ndarray, kind: str) -> tuple[Strays, ...]:
-    """Samples that may well be none and are not sure to be: single ones to which no motion leads,
-    and many that are larger than any measurement.
+    """Return samples that probably mean no value but are not certain marks.
+
+    They are isolated samples that no motion reaches, or samples larger than any measurement.
     """
     absurd, (alone, far) = is_absurd(numbers), _unreached(seconds, numbers, kind)
     off = f"unreachable by motion: more than {far:g} times the range of all others away"
@@ -176,7 +184,7 @@ def strays(seconds: np.ndarray, numbers: np.ndarray, kind: str) -> tuple[Strays,
 
 
 def stray_words(strays: Strays) -> str:
-    """`3 samples of -99, the first at 12.3 s, which ...`."""
+    """Return `3 samples of -99, the first at 12.3 s, which ...`."""
     words = value_words(strays.values)
     if np.unique(strays.values).size > 3:
         low, high = strays.values.min(), strays.values.max()
@@ -186,13 +194,12 @@ def stray_words(strays: Strays) -> str:
 
 
 def _unreached(seconds: np.ndarray, numbers: np.ndarray, kind: str) -> tuple[np.ndarray, float]:
-    """Return a mask of the numbers (N,) that stand alone, so far outside of all others that no
-    motion leads there and back, and their distance in ranges."""
+    """Return a mask of isolated numbers (N,) that no motion reaches, and their limit [ranges]."""
     seen, none = np.flatnonzero(np.isfinite(numbers)), np.zeros(numbers.shape, bool)
     x, far = numbers[seen], _FAR if kind == "output" else _FARTHER
     if x.size < _MOTION:
         return none, far
-    # What a sensor holds until its next sample is one. A stick that stays was moved there.
+    # A value that a sensor holds counts once. A stick that stays was moved there.
     new = np.r_[True, x[1:] != x[:-1]] if kind == "output" else np.ones(x.size, bool)
     if np.count_nonzero(new) < _MOTION:
         new[:], far = True, _FARTHER
@@ -202,7 +209,8 @@ def _unreached(seconds: np.ndarray, numbers: np.ndarray, kind: str) -> tuple[np.
         return none, far
     low, high = np.quantile(y, [_MOST_STRAYS, 1 - _MOST_STRAYS])
     out = _beyond(y, low, high, far)
-    # Where it stays, or begins or ends, it moved; what is near to that is reached too.
+    # A value that stays, begins or ends the record was reached by a motion, and so were values near
+    # it.
     alone = _alone(out, y, _LONGEST if quick else 1)
     if not alone.any():
         return none, far
@@ -222,8 +230,10 @@ def _beyond(y: np.ndarray, low: float, high: float, far: float) -> np.ndarray:
 
 
 def _alone(out: np.ndarray, y: np.ndarray, most: int) -> np.ndarray:
-    """Return a mask of the samples that are `out` (N,) to one side and stand between others, at
-    most `most` in a row."""
+    """Return a mask of the samples `out` (N,) to one side and between others.
+
+    At most `most` are in a row.
+    """
     edges = np.flatnonzero(np.diff(np.r_[False, out, False].astype(int)))
     at, above = np.zeros(out.shape, bool), y > np.median(y)
     for begin, end in edges.reshape(-1, 2):
@@ -232,30 +242,29 @@ def _alone(out: np.ndarray, y: np.ndarray, most: int) -> np.ndarray:
     return at
 
 
-# Slow outputs in fast tables: many loggers write the last value again until the next is there.
-# Taken as measurements, the repeated values say that the signal stood still between two samples.
+# Slow outputs in fast tables: many loggers repeat the last value until the next sample. Used as
+# measurements, repeated values mean that the signal was constant in between.
 
 REPEATS = ("auto", "keep", "missing")
-"""choices for repeated values: missing samples where that is unmistakable, or as stated"""
+"""Options for repeated values: missing if unmistakable, or as stated."""
 
 _SHORTEST_RUN = 3
-"""samples that a run of equal values has at least: two are equal by chance or resolution"""
+"""Shortest run of equal values [samples]; two may be equal by chance or resolution."""
 _REPEATED = 20
-"""complete runs from which the length of one is told"""
+"""Fewest complete runs from which the usual length is known."""
 _REGULAR = 0.9
-"""part of the runs that are of one length, or of twice that"""
+"""Smallest share of runs with the usual length or twice that."""
 _FEWEST_SINGLE = 0.8
-"""part of the runs that are of the one length"""
+"""Smallest share of runs with the usual length."""
 _ONE_COUNT = 0.5
-"""part of the jumps that are one count of the resolution, from which on a slow motion that is
-coarsely resolved looks the same"""
+"""Share of jumps by one count of the resolution, from which on a slow motion with coarse resolution
+looks the same."""
 _MOVES = 0.5
-"""part of its samples at which another output moves, which shows that the vehicle did"""
+"""Smallest share of samples at which another output must move to show that the vehicle did."""
 
 
 def usual_run(values: np.ndarray) -> int | None:
-    """Return the number of samples for which each value of an output (N,) is repeated; None
-    unless unmistakable."""
+    """Return for how many samples each value of an output (N,) is repeated; None if unclear."""
     lengths, jumps = _runs(values)
     if lengths.size < _REPEATED:
         return None
@@ -267,23 +276,23 @@ def usual_run(values: np.ndarray) -> int | None:
     double = np.abs(lengths - 2 * usual) <= 2 * near  # two samples of the same value
     if single.mean() < _FEWEST_SINGLE or (single | double).mean() < _REGULAR:
         return None
-    # A slow motion in whole degrees repeats values too, and then goes on by one.
+    # A slow motion in whole degrees also repeats values, but then moves by one count.
     if np.mean(jumps <= 1.5 * jumps.min()) >= _ONE_COUNT:
         return None
     return usual
 
 
 def without_repeats(values: np.ndarray, usual: int) -> np.ndarray:
-    """An output (N,) with the first sample of each value alone, the others missing.
+    """Return an output (N,) with only the first sample of each value, the others missing.
 
-    Where a value stays for longer than the `usual` number of samples it was measured again, and
-    every so many are kept.
+    A value that stays for longer than the `usual` number of samples was measured again, so every
+    `usual`-th sample is kept.
     """
     begins = np.flatnonzero(np.r_[True, values[1:] != values[:-1]])
     ends = np.r_[begins[1:], values.size]
     since = np.arange(values.size) - np.repeat(begins, ends - begins)
     left = np.repeat(ends, ends - begins) - np.arange(values.size)
-    # A run that is one sample too long is one measurement, and not two.
+    # A run that is one sample too long is one measurement, not two.
     measured = (since == 0) | ((since % usual == 0) & (left > usual / 2))
     return np.where(measured, values, np.nan)
 
@@ -291,19 +300,19 @@ def without_repeats(values: np.ndarray, usual: int) -> np.ndarray:
 def repeats_removed(
     outputs: Mapping[str, np.ndarray], stated: Mapping[str, str]
 ) -> tuple[dict[str, np.ndarray], list[Finding]]:
-    """Outputs (N,), each on its own clock, with repeated values as missing samples, and notes."""
+    """Return outputs (N,), each on its own clock, with repeats as missing samples, and notes."""
     made, notes = dict(outputs), []
     runs = {n: usual_run(y) for n, y in outputs.items()}
     moving = any(runs[n] is None and _moves(y) for n, y in outputs.items())
     for name, y in outputs.items():
         usual, lengths = runs[name], _runs(y)[0]
         if stated[name] == "missing" and usual is None and lengths.size:
-            # Stated by somebody who knows: then no further sign is asked for.
+            # Stated by the user, so no further evidence is needed.
             usual = round(float(np.median(lengths)))
         if stated[name] == "keep" or usual is None or usual < 2:
             continue
         if stated[name] == "auto" and not moving:
-            # Nothing else shows that the vehicle moved while this signal stood still.
+            # No other signal shows that the vehicle moved while this one was constant.
             words = (
                 f"{name} keeps each value for {usual} samples; if the sensor is that slow, state "
                 "`repeats: missing`"
@@ -320,10 +329,10 @@ def repeats_removed(
 
 
 def _runs(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lengths (r,) of the complete runs of equal values, and sizes (r + 1,) of the jumps."""
+    """Return lengths (r,) of complete runs of equal values, and sizes (r + 1,) of the jumps."""
     seen = values[~np.isnan(values)]
     at = np.flatnonzero(seen[1:] != seen[:-1])
-    with np.errstate(over="ignore"):  # of huge values infinite jumps: no less regular
+    with np.errstate(over="ignore"):  # huge values give infinite jumps, which are no less regular
         return np.diff(at), np.abs(seen[at + 1] - seen[at])
 
 

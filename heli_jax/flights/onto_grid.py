@@ -1,7 +1,7 @@
-"""From signals on clocks of their own, as logs have them, to a `Flight` on one uniform grid.
+"""Resampling of signals on separate clocks to a `Flight` on one uniform grid.
 
-The rows of a table are a topic too: its places in messages are lines, those of an autopilot's log
-are times.
+The rows of a table are a topic too. Messages place a fault by line in a table, and by time in an
+autopilot's log.
 """
 
 import math
@@ -48,30 +48,30 @@ from heli_jax.flights.resample import (
 )
 
 MOST_UPSAMPLING = 100
-"""times the log's rate: more is a slip, and fills the memory with straight lines"""
+"""Largest ratio of the requested rate to the log's; more is a slip and fills the memory."""
 _ALIKE = 1e-3
-"""by which the rate of a grid and that of an output differ at most where both are one"""
+"""Largest relative difference between two rates that count as equal."""
 _SAME = 1e-6
-"""of a step, by which stamps differ at most that are one"""
+"""Largest difference between two stamps that count as equal [steps]."""
 _MOST_GAPS = 20
-"""times the samples that there are"""
+"""Largest ratio of grid instants to samples."""
 _AN_INPUT = (
     "; an input needs a value at every sample: fill it in, or choose windows without that part"
 )
 
 
-# The clocks of a log's topics, and signals on them.
+# Clocks of a log's topics, and the signals on them.
 
 
 @dataclass(frozen=True, eq=False)
 class TopicClock:
-    """The times of one topic inside the window.
+    """Times of one topic inside the window.
 
     Attributes:
-        name: of the topic.
+        name: name of the topic.
         seconds: (N,) [s] from the log's beginning.
-        rows: of the topic that they are.
-        topic: itself.
+        rows: rows of the topic at these times.
+        topic: the topic itself.
     """
 
     name: str
@@ -81,7 +81,7 @@ class TopicClock:
 
     @property
     def usual(self) -> float:
-        """The usual step [s]."""
+        """Median step [s]."""
         return float(np.median(np.diff(self.seconds)))
 
     @property
@@ -95,14 +95,14 @@ class TopicClock:
         return replace(self, seconds=self.seconds[rows], rows=of_topic)
 
     def grid(self) -> Grid | Uneven:
-        """The uniform grid that the stamps are, if they are one."""
+        """Return the uniform grid of the stamps, or `Uneven`."""
         rounding, table = rounding_of(self.seconds), self.topic.rows
         if table is not None:
             rounding = rounding_of(table.stamps[self.rows]) * table.scale
         return uniform_grid(self.seconds, rounding)
 
     def wrong(self, path: str, problem: str, i: int) -> InputError:
-        """The error at the i-th of the times, with the line of a table or the topic's name."""
+        """Return the error at the i-th time, with the line of a table or the topic's name."""
         places = (f"topic {shown(self.name)}",)
         if (rows := self.topic.rows) is not None:
             places = rows.table.place(self.rows.start + i), column(self.topic.clock)
@@ -118,19 +118,19 @@ class ClockedSignal:
 
     @property
     def timed(self) -> Timed:
-        """The stamps and the samples."""
+        """Stamps and samples."""
         return Timed(self.clock.seconds, self.values)
 
 
 def rows_in_window(
     path: str, elapsed: np.ndarray, window: tuple[float, float] | None, *place: str
 ) -> slice:
-    """The rows of a clock (N,) [s] inside the window."""
+    """Return the rows of a clock (N,) [s] inside the window."""
     first, last = 0, elapsed.size
     where = ""
     if window is not None and elapsed.size > 1:
-        # The bounds are inclusive whatever the rounding of the stamps. The median and not the mean,
-        # which would count the gaps.
+        # A tolerance keeps the bounds inclusive despite rounded stamps. It uses the median, because
+        # gaps change the mean.
         near = 1e-3 * float(np.median(np.diff(elapsed)))
         first = int(np.searchsorted(elapsed, window[0] - near, side="left"))
         last = int(np.searchsorted(elapsed, window[1] + near, side="right"))
@@ -148,7 +148,7 @@ def topic_clock(log: ChannelLog, topic: Topic, window: tuple[float, float] | Non
     elapsed = topic.times - log.first_time
     if elapsed.size and not np.all(np.abs(elapsed) <= LATEST):
         raise wrong(log.path, "got times that are no finite numbers, expected a clock", *place)
-    # Stamps that go back outside of the window do no harm.
+    # Stamps that go back outside the window do no harm.
     if window is not None and np.any(np.diff(elapsed) <= 0):
         inside = np.flatnonzero((elapsed >= window[0]) & (elapsed <= window[1]))
         rows = slice(int(inside[0]), int(inside[-1]) + 1) if inside.size else slice(0, 0)
@@ -160,7 +160,7 @@ def topic_clock(log: ChannelLog, topic: Topic, window: tuple[float, float] | Non
         row, fault = back
         problem = f"the time {fault} after {clock.seconds[row - 1]:.6g} s, expected increasing"
         raise wrong(log.path, f"{problem} times; give a window without it", *place)
-    # The median and not the mean, which one long gap would lift above any limit.
+    # The median, because one long gap would raise the mean above any limit.
     if clock.usual < SHORTEST_STEP:
         problem = "the usual step is shorter than 1 ns, expected a clock; look at the time's unit;"
         raise clock.wrong(log.path, f"{problem} it begins", 0)
@@ -183,9 +183,9 @@ def _in_si(
     log: ChannelLog, request: Request, key: Key, numbers: np.ndarray, clock: TopicClock
 ) -> ClockedSignal:
     signal, kind, numbers = request.signals[key], key[1], numbers[clock.rows]
-    with np.errstate(over="ignore"):  # what overflows is refused below
+    with np.errstate(over="ignore"):  # overflow is refused below
         values = signal.to_si(numbers)
-    # An output may be missing here and there.
+    # An output may have missing samples.
     bad = infinite(values, numbers) if kind == "output" else ~np.isfinite(values)
     if not bad.any():
         return ClockedSignal(clock, values)
@@ -204,8 +204,8 @@ def _in_si(
 def window_note(
     window: tuple[float, float] | None, times: Iterable[np.ndarray], begin: float
 ) -> tuple[Finding, ...]:
-    """A note where a window reaches beyond the clocks (N,) of a log that begins at a time [s]."""
-    # The one that ends first is where the flight does.
+    """Return a note if the window exceeds the clocks (N,) of a log that begins at `begin` [s]."""
+    # The flight ends with the clock that ends first.
     last = min((t for t in times if t.size > 1), key=lambda t: t[-1], default=None)
     if window is None or last is None:
         return ()
@@ -216,28 +216,28 @@ def window_note(
     return (note("windows.cut", f"{words}, which ends at {end:.6g} s", value=end),)
 
 
-# From them to one grid.
+# Signals on one grid.
 
 
 def flight_of_signals(
     signals: Mapping[Key, ClockedSignal], request: Request, source: Source
 ) -> Flight:
-    """The flight of signals with clocks of their own.
+    """Make a flight from signals with separate clocks.
 
-    The samples of a table stay as they are where they are a uniform grid of the rate that is asked
-    for. Else they are resampled: inputs by their hold, outputs on straight lines where they are as
-    fast as the rate; what is slower is missing between its samples.
+    A table that is already a uniform grid of the requested rate keeps its samples. Otherwise,
+    signals are resampled: inputs by their hold, outputs linearly if they are as fast as the rate. A
+    slower output is missing (NaN) between its samples.
     """
     clocks, rate, path = clocks_of(signals.values()), request.options.rate, source.path
     grid = None
     if len(clocks) == 1 and (rate is None or clocks[0].topic.rows is not None):
-        # Before the samples are looked at: a wrong unit makes anything of their steps.
+        # Checked before the samples, because a wrong unit of time distorts their steps.
         grid = clocks[0].grid()
         if isinstance(grid, Uneven) and rate is None:
             raise _uneven(path, clocks[0], grid)
     logged = as_logged(request, {key: s.timed for key, s in signals.items()})
     values = {key: timed.values for key, timed in logged.signals.items()}
-    # Before any resampling, which moves an input at more samples than the log shows it to.
+    # Before any resampling, which makes an input move at more samples than the log shows.
     holds = decided_holds(request, values)
     outputs = request.of_kind("output", values)
     stated = {name: request.signals[name, "output"].repeats for name in outputs}
@@ -245,8 +245,8 @@ def flight_of_signals(
     values |= {(name, "output"): y for name, y in once.items()}
     signals = {key: replace(s, values=values[key]) for key, s in signals.items()}
     notes = [*other_units(request), *logged.notes, *repeated, *_missing(request, signals)]
-    # A rate that leaves the log's own grid by less than half a sample at its end is that grid: the
-    # samples stay as they are, unblurred by interpolation.
+    # If the rate differs from the log's grid by less than half a sample at the end, it is the same
+    # grid. The samples then stay free of interpolation.
     start, end = float(clocks[0].seconds[0]), float(clocks[0].seconds[-1])
     if isinstance(grid, Grid) and (
         rate is None or abs(rate * grid.dt - 1.0) * clocks[0].seconds.size < 0.5
@@ -257,7 +257,8 @@ def flight_of_signals(
         if rate is None:
             raise _several(path, clocks)
         if isinstance(grid, Grid):
-            # The grid is better than its rounded stamps: held inputs would slip by a sample.
+            # The grid is more exact than its rounded stamps, by which held inputs would slip by a
+            # sample.
             even = start + grid.dt * np.arange(clocks[0].seconds.size)
             clock = replace(clocks[0], seconds=even)
             signals = {key: replace(s, clock=clock) for key, s in signals.items()}
@@ -292,7 +293,7 @@ def flight_of_signals(
 def decided_holds(request: Request, values: Mapping[Key, np.ndarray]) -> dict[str, Decision]:
     """Decide the hold of each input: as stated, or by its own samples (N,)."""
     return {
-        # No reason where it is stated: the log decided nothing.
+        # A stated hold has no reason.
         key: decide(values[key, kind]) if signal.hold == "auto" else Decision(signal.hold, "")
         for (key, kind), signal in request.signals.items()
         if kind == "input"
@@ -300,7 +301,7 @@ def decided_holds(request: Request, values: Mapping[Key, np.ndarray]) -> dict[st
 
 
 def _missing(request: Request, signals: Mapping[Key, ClockedSignal]) -> list[Finding]:
-    """A note for every output with missing samples: how many, and where in the log."""
+    """Return a note for every output with missing samples: how many, and where in the log."""
     notes = []
     for key, signal in signals.items():
         missing = np.isnan(signal.values)
@@ -315,13 +316,15 @@ def _missing(request: Request, signals: Mapping[Key, ClockedSignal]) -> list[Fin
 
 
 def clocks_of(signals: Iterable[ClockedSignal]) -> list[TopicClock]:
-    """One for each topic, since signals of the same topic share their stamps."""
+    """Return one clock for each topic, because signals of a topic share their stamps."""
     return list({s.clock.name: s.clock for s in signals}.values())
 
 
 def on_all_the_time(signals: Mapping[Key, ClockedSignal], rate: float) -> list[TopicClock]:
-    """The clocks whose samples the flight needs throughout: of the inputs, and of outputs that are
-    not slower than the `rate` [Hz]; what is slower is missing most of the time anyway."""
+    """Return the clocks of inputs and of outputs not slower than `rate` [Hz].
+
+    The flight needs their samples throughout; slower outputs are missing most of the time anyway.
+    """
     needed = [s for (_, kind), s in signals.items() if kind == "input"]
     needed += [
         s for (_, kind), s in signals.items() if kind == "output" and not is_slower(s.timed, rate)
@@ -332,14 +335,14 @@ def on_all_the_time(signals: Mapping[Key, ClockedSignal], rate: float) -> list[T
 def _times(
     path: str, signals: Mapping[Key, ClockedSignal], rate: float
 ) -> tuple[np.ndarray, list[Finding]]:
-    """The times (M,) [s] of the grid of a rate [Hz], and notes on how the signals come there."""
+    """Return the times (M,) [s] of a grid of a rate [Hz], and notes on the resampling."""
     clocks, notes = on_all_the_time(signals, rate), []
     for clock in clocks:
         found = rate_notes(clock.seconds, rate)
         notes += [n.of(clock.name) if clock.topic.rows is None else n for n in found]
         steps, most = np.diff(clock.seconds), longest_gap(clock.seconds)
         row = int(np.argmax(steps))
-        # A step of exactly the limit, but for its rounding, passes.
+        # Rounding is tolerated for a step of exactly the limit.
         if steps[row] > most * (1 + 1e-9):
             problem = f"a gap of {steps[row]:.6g} s, expected none longer than {most:.3g} s; give a"
             problem += " window without it, or `gaps: split`; it ends"
@@ -350,12 +353,12 @@ def _times(
 
 
 def _uneven(path: str, clock: TopicClock, uneven: Uneven) -> InputError:
-    """The error for stamps that are no uniform grid, with the remedy."""
+    """Return the error for stamps that are no uniform grid, with the remedy."""
     problem = f"a step of {uneven.step:.6g} s where {uneven.usual:.6g} s is usual"
     if uneven.drift is not None:
         problem = f"the times leave a uniform grid by {uneven.drift:.2g} samples"
-    # Where a gap is too long to be bridged, a rate would only lead to the next error, and the parts
-    # beside it may well be uniform.
+    # If a gap is too long to be bridged, a rate would only cause the next error. The parts beside
+    # the gap may be uniform.
     bridged = np.diff(clock.seconds).max() <= longest_gap(clock.seconds) * (1 + 1e-9)
     remedy = f"`rate: {1 / uneven.usual:.4g}` to resample, or " if bridged else ""
     remedy += "a window without such steps" + ("" if bridged else " or `gaps: split`")
@@ -372,43 +375,42 @@ def _several(path: str, clocks: Sequence[TopicClock]) -> InputError:
 def common_times(
     path: str, clocks: list[TopicClock], rate: float, on: TopicClock | None = None
 ) -> np.ndarray:
-    """Times (M,) [s] at the rate [Hz] at which all topics have samples before and behind.
+    """Return times (M,) [s] at the rate [Hz] at which all topics have samples before and after.
 
     Args:
-        clocks: of the topics, at least one; their times count from the log's beginning.
-        rate: of the times [Hz].
-        on: a clock at a sample of which they begin: one of that rate. Samples that fall on the grid
-            stay as they are; a mean of two neighbours has less noise, and that is not white.
+        clocks: clocks of the topics, at least one; their times count from the log's beginning.
+        rate: rate of the times [Hz].
+        on: clock of the same rate, with a sample at which the times begin. Its samples then stay on
+            the grid. A mean of two neighbours has less noise, and that noise is not white.
     """
-    # Nothing is extrapolated: what a topic did before its first sample or behind its last nobody
-    # knows.
+    # No extrapolation: a topic is unknown before its first sample and after its last.
     start = max(float(clock.seconds[0]) for clock in clocks)
     if on is not None:
         later = on.seconds[on.seconds >= start - _SAME * on.usual]
         start = max(start, float(later[0])) if later.size else start
     end = min(float(clock.seconds[-1]) for clock in clocks)
     count, usual = (end - start) * rate, min(clock.usual for clock in clocks)
-    # Written so that a NaN is refused too, here and below.
+    # Written so that NaN is refused too, here and below.
     if not count >= FEWEST - 1 - 1e-6:
         problem = f"a rate of {rate:g} Hz leaves fewer than {FEWEST} samples"
         raise wrong(path, f"{problem} of {max(count / rate, 0.0):.6g} s, expected more")
-    # The product can overflow where the rate alone is finite.
+    # The product can overflow even if the rate is finite.
     if not (rate * usual <= MOST_UPSAMPLING and math.isfinite(count)):
         problem = f"a rate of {rate:g} Hz for a log of about {1 / usual:.4g} Hz"
-        # A thousandth of such a step is one of a flight.
+        # A thousandth of such a step is plausible for a flight.
         unit = "; is its time in ms (time.unit)?" if 1.0 <= usual <= 1e3 else ""
         raise wrong(path, f"{problem}, expected at most {MOST_UPSAMPLING} times as much{unit}")
-    # One wrong stamp at the end of a damaged log would otherwise fill the memory.
+    # Otherwise one wrong stamp at the end of a damaged log would fill the memory.
     most = _MOST_GAPS * max(clock.seconds.size * max(1.0, rate * clock.usual) for clock in clocks)
     if count > most:
         problem = f"the times go over {end - start:.6g} s, of which samples cover less than 5 %"
         raise wrong(path, f"{problem}, expected a window without such gaps")
-    # Counted and multiplied, never added up: the sum of 1e6 rounded steps would drift.
+    # Multiplied, not summed: the sum of 1e6 rounded steps would drift.
     return start + np.arange(int(count + 1e-6) + 1) / rate
 
 
 class OnGrid(NamedTuple):
-    """Signals on a grid: samples (M,) by key, what inputs do between them, and notes."""
+    """Signals on a grid: samples (M,) by key, hold of each input, and notes."""
 
     samples: dict[Key, np.ndarray]
     holds: dict[str, Decision]
@@ -421,25 +423,24 @@ def at_times(
     holds: Mapping[str, Decision],
     times: np.ndarray,
 ) -> OnGrid:
-    """The signals on a grid.
+    """Return the signals on a grid.
 
-    A held input has the mean of what it was until the grid's next instant; a mixed one jumps at the
-    instant nearest to its jump. Other inputs and the outputs are interpolated, or low-pass filtered
-    where the rate goes down; outputs that are slower than the grid stand at the instants nearest to
-    their own. A held input that a low-passed output follows within a sample is low-passed too, and
-    is linear between samples then.
+    A held input is averaged from one instant to the next. A mixed one jumps at the instant nearest
+    to its jump. Other inputs and the outputs are interpolated, or low-pass filtered if the rate
+    decreases. Samples of outputs slower than the grid go to their nearest instants. If a low-passed
+    output follows a held input within a sample, the input is low-passed too. It is then linear
+    between samples.
 
     Args:
-        request: names them.
-        signals: by key, SI, each on its own clock.
-        holds: by input.
-        times: of the grid (M,) [s].
+        request: names of the signals, and options.
+        signals: signals by key, SI, each on its own clock.
+        holds: hold by input.
+        times: times of the grid (M,) [s].
     """
     samples, notes, rate = {}, [], 1.0 / float(times[1] - times[0])
     alike = _alike(request, signals, holds, times)
-    # A linear vehicle answers a filtered stick with the filtered motion. The mean of each step,
-    # beside an output that is filtered alone, leaves the ringing of the output's jumps to be
-    # explained by the vehicle.
+    # Input and output need the same filter. If only the output is filtered, its ringing after jumps
+    # would be attributed to the vehicle.
     low = {n: held_low_passed(*signals[n, "input"], times) for n in alike}
     for (key, kind), signal in signals.items():
         if kind == "input":
@@ -457,7 +458,7 @@ def at_times(
                 )
                 notes.append(note(LOW_PASSED, words, key))
             else:
-                # A low-pass filter would turn a stick that jumps into one that rings.
+                # A low-pass filter would add ringing to a stick that jumps.
                 samples[key, kind] = held_mean(*signal, times)
         elif is_slower(signal, rate):
             samples[key, kind] = at_nearest(signal, times)
@@ -471,7 +472,7 @@ def at_times(
             notes.append(note("resampling.slower", words, key, value=count))
         else:
             own = own_clock(signal)
-            # Missing rows are no longer there to say where too much is missing.
+            # `own` lacks the missing rows, so gaps are found here.
             gaps = in_gaps(own.seconds, times) if own is not signal else False
             jumps = [n for n in alike if request.options.follows.get((n, key))]
             if jumps:
@@ -483,7 +484,7 @@ def at_times(
                 made = at_own_rate(own, times)
             samples[key, kind] = np.where(gaps, np.nan, made)
     decided = {n: low_passed(alike[n]) if n in alike else d for n, d in holds.items()}
-    # What was low-passed has no jumps left.
+    # A low-passed signal has no jumps.
     decided |= {
         n: d._replace(hold="linear")
         for n, d in holds.items()
@@ -498,8 +499,10 @@ def _alike(
     holds: Mapping[str, Decision],
     times: np.ndarray,
 ) -> dict[str, list[str]]:
-    """The held inputs that have to be filtered, with the filtered outputs that follow them within a
-    sample of the grid (M,) [s]."""
+    """Return the held inputs to be filtered, with the filtered outputs that follow them.
+
+    An output follows an input if it responds within a sample of the grid (M,) [s].
+    """
     alike: dict[str, list[str]] = {}
     for name, output in request.options.follows:
         held = name in holds and holds[name].hold == "zero-order"
@@ -518,15 +521,16 @@ def _resampled_with(
     The output's samples alone would put it half a step early.
 
     Args:
-        inputs: held ones that it follows at the very sample, each with what `held_low_passed`
-            makes of it.
+        signal: the output.
+        inputs: held inputs that the output follows without delay, each with the result of
+            `held_low_passed`.
         times: (M,) [s].
     """
     seconds, values = signal
     held = np.array([hold(*u, np.maximum(seconds, u.seconds[0])) for u, _ in inputs])
     moves = np.diff(values)
     known = np.isfinite(moves)
-    # Of an input that never jumps the least norm makes nothing.
+    # The minimum-norm solution gives a gain of zero to an input that never jumps.
     gains = np.linalg.lstsq(np.diff(held)[:, known].T, moves[known], rcond=None)[0]
     jumping = gains @ np.array([low for _, low in inputs])
     return resampled(seconds, values - gains @ held, times) + jumping

@@ -21,10 +21,11 @@ from heli_jax.flights.log import ChannelLog, Table, require_short_names, shown, 
 from heli_jax.regular_file import open_regular, require_regular
 
 _SNIFFED = 8192
-"""bytes: a DataFlash log in text may begin with the firmware's own lines"""
+"""Bytes read to recognise a format: a DataFlash text log may begin with the firmware's own lines.
+"""
 _TEXTS = (".csv", ".txt", ".tsv", ".asc", ".dat", ".log", ".lvm", ".prn", ".tab")
 _ARRAYS = (".mat", ".nc", ".h5", ".hdf5")
-"""which go by their ending: MATLAB 7.3, NetCDF 4 and HDF5 files begin alike"""
+"""Endings that decide the format, because MATLAB 7.3, NetCDF 4 and HDF5 files begin alike."""
 EXPECTED = (
     "expected a table (.csv, .txt, .tsv, .asc, .dat, .lvm, .parquet, .feather, .json), arrays "
     "(.mat, .nc, .h5, .hdf5, .npz, .npy) or an autopilot's log (.ulg, .bin, .log, .bbl, .bfl)"
@@ -32,7 +33,7 @@ EXPECTED = (
 
 
 def open_table(path: str | Path) -> Table:
-    """Open a table of rows: text, Parquet or arrays, of which one column is the time."""
+    """Open a table of rows: text, Parquet or arrays; one of its columns is the time."""
     log = open_log(path)
     if isinstance(log, ChannelLog):
         raise wrong(log.path, f"is a log of {log.format}, expected a table in CSV or Parquet")
@@ -40,15 +41,14 @@ def open_table(path: str | Path) -> Table:
 
 
 def open_log(path: str | Path, flight: int | None = None) -> Table | ChannelLog:
-    """Open a log of any format; columns of tables are read when they are asked for.
+    """Open a log of any format; columns of tables are read on request.
 
     Returns:
         A table, whose time is one of its columns, or the channels of an autopilot's log.
 
     Raises:
-        InputError: there is no such file, it is no regular one, it is larger than a log of its
-            format may be, it cannot be read, or it is of no readable format; it holds several
-            flights and none is named, or not the one that is.
+        InputError: the file is missing, not regular, too large for its format, not readable or of
+            an unknown format; or it holds several flights and none, or an absent one, is requested.
     """
     logs = chosen_flights(path, open_flights(path), flight)
     if not isinstance(logs, tuple):
@@ -65,7 +65,7 @@ def open_log(path: str | Path, flight: int | None = None) -> Table | ChannelLog:
 def chosen_flights(
     path: str | Path, logs: Table | tuple[ChannelLog, ...], flight: int | None
 ) -> Table | tuple[ChannelLog, ...]:
-    """The flight of a number, or all without one."""
+    """Return the flight with this number, or all without a number."""
     if flight is None:
         return logs
     if not isinstance(logs, tuple):
@@ -80,10 +80,10 @@ def chosen_flights(
 
 
 def open_flights(path: str | Path) -> Table | tuple[ChannelLog, ...]:
-    """As `open_log`, but all flights of an autopilot's log."""
+    """Open all flights of a log, as `open_log`."""
     path = Path(path)
     try:
-        # Any size here: each reader has a limit of its own.
+        # Any size: each reader has its own limit.
         size = require_regular(path, "a log", sys.maxsize)
         if not size:
             raise wrong(str(path), "is empty, expected a log")
@@ -101,7 +101,7 @@ _Reader = Callable[[Path], Table | tuple[ChannelLog, ...]]
 
 
 class Format(NamedTuple):
-    """A format that is read: by what its files begin with, and by their ending."""
+    """A format that can be read: recognised by its first bytes or its ending."""
 
     read: _Reader
     endings: tuple[str, ...]
@@ -140,7 +140,7 @@ def _reader(path: Path) -> _Reader:
             )
             raise wrong(str(path), f"{problem}; expected it unpacked")
         return csv_text.open_csv
-    # By the ending where it says enough, so that a damaged Parquet file is called so, and no text.
+    # The ending decides where it is reliable, so that a damaged Parquet file is not read as text.
     named = next((f.read for f in FORMATS if ending in f.endings), None)
     marked = None
     if ending not in (*_ARRAYS, ".parquet"):
@@ -152,22 +152,22 @@ def _reader(path: Path) -> _Reader:
 
 
 def _by_content(head: bytes, is_table: bool) -> _Reader | None:
-    """The reader of a file whose first bytes say what it is, whatever it is called.
+    """Return the reader of a file that its first bytes identify, whatever its name.
 
-    A table begins with the user's own text, which may look like the mark of another format;
-    but an autopilot's log may have been given the name of a table.
+    A table begins with the user's own text, which may look like the mark of another format. An
+    autopilot's log may have the ending of a table.
     """
     for known in FORMATS:
         if known.marks and head.startswith(known.marks) and (known.of_autopilot or not is_table):
             return known.read
     if dataflash.is_dataflash_text(head) and (not is_table or head.lstrip().startswith(b"FMT,")):
         return _one(dataflash.open_dataflash_text)
-    # Anywhere in the first bytes: its reader looks for the beginning of each flight, and does not
-    # mind what stands before the first.
+    # Anywhere in the first bytes: its reader searches for the beginning of each flight and skips
+    # what precedes the first.
     return blackbox.open_blackbox if blackbox_frames.MARK in head and not is_table else None
 
 
-# Files that hold flights and are not read: what each is, and what to make of it instead.
+# Files that hold flights but are not read: what they are, and what to do.
 
 _SHEET = "is a spreadsheet; save its sheet as CSV, one table with its names above"
 _PICKLE = (
@@ -205,11 +205,11 @@ _ZIP = b"PK\x03\x04"
 
 
 def _refuse_foreign(path: Path, head: bytes) -> None:
-    """Refuse a file that is known not to be read, by its first bytes or by its ending."""
+    """Refuse a file that is known to be unreadable, by its first bytes or its ending."""
     ending = path.suffix.lower()
     words = next((words for mark, words in _BY_MARK if head.startswith(mark)), None)
     if words is None and head.startswith(_ZIP) and ending != ".npz":
-        # Spreadsheets are archives inside.
+        # Spreadsheets are zip archives inside.
         is_sheet = b"xl/" in head or b"[Content_Types].xml" in head or b"spreadsheet" in head
         words = _SHEET if is_sheet else _ARCHIVE
     words = words or _BY_ENDING.get(ending)

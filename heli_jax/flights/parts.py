@@ -1,4 +1,4 @@
-"""A flight with gaps as several: nobody knows what lies in a gap, but what lies beside it."""
+"""Division of a flight at its gaps into several flights."""
 
 import dataclasses
 from collections.abc import Iterable, Sequence
@@ -10,14 +10,16 @@ from heli_jax.flights.flight import Flight
 from heli_jax.flights.resample import longest_gap
 
 SHORTEST = 2.0
-"""s; a part brings an initial state and biases of its own, which shorter ones hardly tell"""
+"""Shortest part [s]. Each part has its own initial state and biases, which shorter ones hardly
+determine."""
 FEWEST = 50
-"""samples of the fastest clock in a part"""
+"""Fewest samples of the fastest clock in a part."""
 
 
 def stretches(clocks: Sequence[np.ndarray]) -> list[tuple[float, float]]:
-    """First and last time [s] of each stretch in which no clock has a gap that nothing bridges; a
-    lone row between gaps is a stretch too.
+    """Return first and last time [s] of each stretch in which no clock has a long gap.
+
+    A single row between gaps is a stretch too.
     """
     begin = max(float(seconds[0]) for seconds in clocks)
     end = min(float(seconds[-1]) for seconds in clocks)
@@ -44,7 +46,7 @@ def is_too_short(stretch: tuple[float, float], clocks: Sequence[np.ndarray]) -> 
 
 
 def spans(signals: Iterable[np.ndarray]) -> list[tuple[int, int]]:
-    """First sample, and that behind the last, of each stretch in which every signal has numbers."""
+    """Return the stretches [first, end) of samples in which every signal has numbers."""
     seen = np.all([np.isfinite(y) for y in signals], axis=0)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]]).astype(int)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
@@ -56,12 +58,14 @@ def spans(signals: Iterable[np.ndarray]) -> list[tuple[int, int]]:
 def part(
     flight: Flight, first: int, last: int, name: str = "", note: Finding | None = None
 ) -> Flight:
-    """The samples from `first` up to but not including `last`.
+    """Return the samples from `first` up to but not including `last`.
 
     Args:
-        flight: the whole.
-        name: of the part; that of the whole unless given.
-        note: what its source says of it, beside what the reader noted.
+        flight: the whole flight.
+        first: first sample.
+        last: end, exclusive.
+        name: name of the part; by default that of the whole.
+        note: a further note for its source.
 
     Raises:
         ValueError: there are no such samples.

@@ -1,7 +1,7 @@
-"""Presets: which channels of an autopilot's log are which signals, as tables in YAML files.
+"""Presets: tables in YAML files that map an autopilot's channels to signals.
 
-`presets/signals.yaml` says what the signals mean and which inputs and outputs of models they are;
-each other file there is the table of one autopilot.
+`presets/signals.yaml` defines the signals and the models' inputs and outputs that they are. Each
+other file there is the table of one autopilot.
 """
 
 import functools
@@ -21,8 +21,8 @@ from heli_jax.yaml_file import parse_mapping
 
 _SIGNALS = "signals"
 _FEWEST = 8
-"""samples of a topic, as for a fit: what was published twice is no signal"""
-# The first name of each dotted one: that of a topic, which may have instances.
+"""Fewest samples of a topic, as for a fit; a topic published twice is no signal."""
+# First part of a dotted name: a topic, which may have instances.
 _TOPIC = re.compile(r"(?<![\w.\])])([A-Za-z_]\w*)\.(?=[A-Za-z_])")
 
 
@@ -31,14 +31,14 @@ class Alternative:
     """One channel that a signal may be: (number - offset) scale in `unit`, inverted or not.
 
     Attributes:
-        channel: as a configuration names it; a topic without an instance stands for any number.
-        unit: of the signal.
-        scale: see above.
-        offset: in the channel's own unit.
-        invert: whether its sign is the other one.
-        instance: of its topic, where the log has several.
-        stated: whether the log itself has to state the unit.
-        source: of unit, axes and sign.
+        channel: name as in a configuration; a topic without an instance matches any instance.
+        unit: unit of the signal.
+        scale: factor in the formula above.
+        offset: offset in the channel's own unit.
+        invert: True if the sign is reversed.
+        instance: instance of its topic, if the log has several.
+        stated: True if the log itself must state the unit.
+        source: source of unit, axes and sign.
     """
 
     channel: str
@@ -53,15 +53,15 @@ class Alternative:
 
 @dataclass(frozen=True)
 class Preset:
-    """The table of one autopilot.
+    """Table of one autopilot.
 
     Attributes:
-        name: as a configuration has it.
-        version: of the table.
-        formats: of the logs it is for.
-        meaning: which firmware, in words.
-        signals: the channels that each may be, the best first.
-        missing: why a signal is not there, where there is a reason to tell.
+        name: name as in a configuration.
+        version: version of the table.
+        formats: log formats it applies to.
+        meaning: the firmware, in words.
+        signals: channels that each signal may be, the best first.
+        missing: reason why a signal is absent, if there is one.
     """
 
     name: str
@@ -88,7 +88,7 @@ class ModelSignal:
 
 @dataclass(frozen=True)
 class Meaning:
-    """Meaning of a signal: its SI unit, and axes and sign in words."""
+    """Definition of a signal: its SI unit, and its axes and sign in words."""
 
     unit: str
     meaning: str
@@ -101,8 +101,8 @@ def _files() -> list[Traversable]:
 
 @functools.cache
 def presets() -> tuple[str, ...]:
-    """The names of those that ship."""
-    # By the files that are there: a new one ships without a list that has to name it.
+    """Return the names of the presets in the package."""
+    # From the files, so that a new preset needs no entry in a list.
     names = [file.name.removesuffix(".yaml") for file in _files()]
     return tuple(sorted(name for name in names if name != _SIGNALS))
 
@@ -115,10 +115,10 @@ def _content(name: str) -> dict:
 
 @functools.cache
 def preset(name: str) -> Preset:
-    """The preset of that name.
+    """Return the preset of that name.
 
     Raises:
-        ValueError: there is none; with the nearest name there is.
+        ValueError: there is none; names the nearest.
     """
     if name not in presets():
         raise ValueError(f"no preset {name!r:.60}{nearest(name, presets())}")
@@ -140,24 +140,24 @@ def preset(name: str) -> Preset:
 
 @functools.cache
 def meanings() -> Mapping[str, Meaning]:
-    """Return the meanings of the signals by name."""
+    """Return the definitions of the signals by name."""
     return {name: Meaning(**m) for name, m in _content(_SIGNALS)["signals"].items()}
 
 
 @functools.cache
 def model_inputs() -> Mapping[str, ModelSignal]:
-    """By the name of a model's input which signals it may be."""
+    """Return the signals that a model's input may be, by the input's name."""
     return {name: ModelSignal(**m) for name, m in _content(_SIGNALS)["inputs"].items()}
 
 
 @functools.cache
 def model_outputs() -> Mapping[str, str]:
-    """By the name of a model's output which signal it is."""
+    """Return the signal that a model's output is, by the output's name."""
     return _content(_SIGNALS)["outputs"]
 
 
 def choose(log: Table | ChannelLog, alternatives: Sequence[Alternative]) -> Alternative | None:
-    """The first alternative that a log has, its channel as this log names it; None without one."""
+    """Return the first alternative in a log, with the channel's name in this log; else None."""
     names = frozenset(log.names)
     topics = {t.name for t in log.topics} if isinstance(log, ChannelLog) else set()
     for alternative in alternatives:
@@ -184,13 +184,13 @@ def _serves(log: ChannelLog, needed: Sequence[str], alternative: Alternative) ->
     topics = [ChannelLog.topic_of(log, name) for name in needed]
     if any(t.times.size < _FEWEST or not t.clock for t in topics):
         return False
-    # A count whose unit the header does not make sure would scale a fit by a wrong factor.
+    # A count whose unit the header does not state could scale a fit by a wrong factor.
     return not alternative.stated or topics[0].units.get(needed[0]) == alternative.unit
 
 
 def fitting_presets(log_format: str, names: Sequence[str]) -> list[str]:
-    """Return the presets for a format of which a log has the roll rate and the roll command."""
-    # Instances are told apart by the reader; here any will do.
+    """Return the presets for a format whose roll rate and roll command are in the log."""
+    # The reader separates instances; here any instance counts.
     bare = {*names, *(re.sub(r"^(\w+)\[\d+\]\.", r"\1.", name) for name in names)}
     return [
         name
@@ -203,27 +203,27 @@ def fitting_presets(log_format: str, names: Sequence[str]) -> list[str]:
     ]
 
 
-# Which channels of a log become which columns, as a preset or a configuration names them.
+# Assignment of channels to columns, by a preset or a configuration.
 
 
 class Named(NamedTuple):
-    """Columns by name, each with the channel that it is in SI."""
+    """Columns by name, each with its channel, in SI."""
 
     signals: Mapping[str, Signal]
     notes: tuple[Finding, ...] = ()
-    """what is not among them"""
+    """Notes on the columns that are absent."""
     required: bool = True
-    """whether a channel without a usable clock is an error; it is left out otherwise"""
+    """True if a channel without a usable clock is an error; otherwise it is left out."""
 
 
 type NamedBy = Callable[[Table | ChannelLog], Named]
 
 
 def by_preset(name: str) -> NamedBy:
-    """All signals of a preset that a log has, under the preset's names.
+    """Return a function that finds all signals of a preset in a log, under the preset's names.
 
     Raises:
-        ValueError: there is none of this name.
+        ValueError: there is no preset of this name.
     """
     table = preset(name)
 

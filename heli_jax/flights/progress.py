@@ -10,29 +10,29 @@ from heli_jax import stages
 from heli_jax.regular_file import size_words
 
 STEP = 1 << 22
-"""bytes between two calls of `advance`"""
+"""Bytes between two calls of `advance`."""
 
 
 def reading(path: str | Path, size: int) -> contextlib.AbstractContextManager[None]:
-    """A file is read meanwhile."""
-    # Names may hold anything; a terminal obeys escape sequences.
+    """Report that a file is read meanwhile."""
+    # Names may hold anything, and a terminal obeys escape sequences.
     name = "".join(c if c.isprintable() else "?" for c in Path(path).name)[:40]
     return stages.stage(f"reading {name} ({size_words(size)})", total=size)
 
 
 def advance(done: int) -> None:
-    """The first `done` bytes of the file that is read are read."""
+    """Report that the first `done` bytes of the file were read."""
     stages.reach(done)
 
 
-# The fingerprint of a file, computed beside other work.
+# SHA-256 of a file, computed in parallel with other work.
 
 
 class Digest:
-    """SHA-256 of a file, all bytes of it or where it is, in a thread of its own: of a large one it
-    takes as long as reading it.
+    """SHA-256 of a file, from its bytes or its path, in a separate thread.
 
-    It begins when it is told to, or asked for: pyarrow reads with all cores there are.
+    For a large file it takes as long as reading it. It starts on request, because pyarrow reads
+    with all cores.
     """
 
     def __init__(self, source: bytes | Path) -> None:
@@ -53,9 +53,9 @@ class Digest:
             pool.shutdown(wait=False)
 
     def begin(self) -> None:
-        """Begin, if it has not."""
+        """Start, if not yet started."""
         _ = self._made
 
     def hex(self) -> str:
-        """The fingerprint, once it is there."""
+        """Wait for the hash and return it."""
         return self._made.result()

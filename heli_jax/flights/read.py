@@ -1,4 +1,4 @@
-"""From logs to flights, whatever the files' formats."""
+"""Flights from logs of any format."""
 
 import copy
 import dataclasses
@@ -36,11 +36,11 @@ from heli_jax.flights.request import FEWEST, Also, Key, ReadOptions, Request, wi
 
 _DEFAULT = ReadOptions()
 _SHORTEST = 0.05
-"""s: no vehicle answers a stick sooner"""
+"""Shortest flight [s]: no vehicle responds to a stick sooner."""
 _STILL = 1e-100
-"""SI: an output that moves by no more does not move"""
+"""Largest range of an output that counts as constant [SI]."""
 _SHARED = 0.5
-"""of the shorter of two logs of one clock that the other covers too, at least"""
+"""Smallest shared part of two logs of one clock, relative to the shorter one."""
 
 type _Log = str | Path | ChannelLog | Table
 
@@ -57,17 +57,17 @@ def read_flight(
     """Read one run from a log.
 
     Args:
-        path: the log: a table, arrays or what an autopilot wrote (docs/logs.md); or one that is
-            open, by `heli_jax.flights.open_log.open_log`.
-        time: the column of time stamps, in seconds where only its name is given; None for an
-            autopilot's log, whose topics have clocks of their own.
-        inputs: the log's signals by the model's names; two inputs may share a column. What one
-            does between samples is its `hold`; "auto" decides by how it moves in the log. One
-            that the log lacks may be a `constant`.
-        outputs: the same for what was measured.
-        options: which part of the log, at which rate; all of it unless given.
-        **keywords: fields of ReadOptions, in place of those of `options`: `rate` [Hz], `window`
-            [s], `known` [SI], `hold_out`, `name`, `number`, `also`.
+        path: path of the log: a table, arrays or an autopilot's log (docs/logs.md); or a log opened
+            by `heli_jax.flights.open_log.open_log`.
+        time: column of time stamps, in seconds if only its name is given; None for an autopilot's
+            log, whose topics have their own clocks.
+        inputs: the log's signals by the model's names; two inputs may share a column. `hold` is an
+            input's behaviour between samples; "auto" decides it from the log. An input that the log
+            lacks may be a `constant`.
+        outputs: the same for the measured outputs.
+        options: part and rate of the log to read; by default all of it.
+        **keywords: fields of ReadOptions that replace those of `options`: `rate` [Hz], `window`
+        [s], `known` [SI], `hold_out`, `name`, `number`, `also`.
 
     Raises:
         InputError: one sentence on what is wrong with the log or with the arguments.
@@ -87,24 +87,23 @@ def read_parts(
     options: ReadOptions = _DEFAULT,
     **keywords: Any,
 ) -> tuple[Flight, ...]:
-    """Read one run from a log, split where a gap is too long to be bridged, or the runs of a table
-    in which the time begins anew.
+    """Read one run from a log, split at gaps that are too long, or at the runs of a table.
 
     Args:
-        path: as of `read_flight`, and so are the others.
+        path: as in `read_flight`, and so are the other arguments.
 
     Returns:
-        The run as it is where it has no such gap, else its parts, named `NAME, part 1` and so on.
-        Parts of less than 2 s or 50 samples, and those in which no input moves where one does in
-        others, are left out; the first one's notes say which.
+        The unchanged run if it has no such gap, else its parts, named `NAME, part 1` and so on.
+        Parts of less than 2 s or 50 samples are left out. So are parts without a moving input, if
+        an input moves in other parts. The notes of the first part list what was left out.
 
     Raises:
-        InputError: as `read_flight`, or no part is left.
+        InputError: as in `read_flight`, or no part is left.
     """
     options = dataclasses.replace(options, **keywords, split=True)
     logs = _opened(path, time, inputs, outputs, options)
     request = logs.request
-    # A slow sensor whose rows are padded with marks is needed at its own instants alone.
+    # A slow sensor padded with marks is needed only at its own instants.
     signals = {
         key: dataclasses.replace(s, values=measured(request.signals[key], s.values))
         if key[1] == "output"
@@ -117,7 +116,8 @@ def read_parts(
     intervals = stretches(clocks)
     if len(intervals) < 2:
         return (_flight(logs, request),)
-    # By the whole run: of the few moves in a part the same stick may look different.
+    # Decided from the whole run, because a part has few moves and the same stick may look
+    # different.
     holds = decided_holds(request, {key: signal.values for key, signal in signals.items()})
     inputs_of = [s for (_, kind), s in signals.items() if kind == "input"]
     moving = [i for i in intervals if any(_moves(u, *i) for u in inputs_of)]
@@ -127,8 +127,8 @@ def read_parts(
         try:
             if is_too_short((start, end), clocks):
                 raise InputError("too short")
-            # On the ground before and behind a flight; where nothing moves anywhere each part is a
-            # free decay.
+            # Such a part is on the ground before or after a flight. If no input moves in any part,
+            # each is a free decay.
             if moving and inputs_of and (start, end) not in moving:
                 raise InputError("no input moves")
             part = _part(request, (start, end), name, holds)
@@ -163,7 +163,7 @@ def _moves(signal: ClockedSignal, start: float, end: float) -> bool:
 def _part(
     request: Request, window: tuple[float, float], name: str, holds: Mapping[str, Decision]
 ) -> Request:
-    """The request for one part of a run."""
+    """Return the request for one part of a run."""
     part = copy.copy(request)
     part.options = dataclasses.replace(request.options, window=window, name=name)
     part.signals = {
@@ -174,7 +174,7 @@ def _part(
 
 
 def _enough_measured(flight: Flight) -> Flight:
-    """Without outputs of which a part has next to nothing, such as those of a slow sensor."""
+    """Remove outputs with too few samples in a part, such as those of a slow sensor."""
     few = [n for n, y in flight.outputs.items() if np.isfinite(y).sum() < FEWEST]
     if not few:
         return flight
@@ -195,12 +195,11 @@ def _with_notes(flight: Flight, *notes: Finding) -> Flight:
     return dataclasses.replace(flight, source=source)
 
 
-# A log, and others of the same flight with clocks of their own.
+# A log, and other logs of the same flight with their own clocks.
 
 
 class _Beside(NamedTuple):
-    """The signals of a further log, by the clock of the first [s], and a note on how that was
-    found."""
+    """Signals of a further log on the clock of the first [s], and a note on the alignment."""
 
     signals: Mapping[Key, ClockedSignal]
     note: Finding
@@ -211,12 +210,12 @@ class _Opened(NamedTuple):
 
     log: ChannelLog
     keys: frozenset[Key]
-    """the signals that the first log holds"""
+    """Signals in the first log."""
     beside: tuple[_Beside, ...]
     request: Request
-    """for the signals of all of them"""
+    """Request for the signals of all logs."""
     inputs: Mapping[str, Signal]
-    """all that are asked for, constants too, in the user's order"""
+    """All requested inputs, constants too, in the user's order."""
 
 
 def _opened(
@@ -226,7 +225,7 @@ def _opened(
     outputs: Mapping[str, Signal],
     options: ReadOptions,
 ) -> _Opened:
-    """The logs, those beside the first aligned with it."""
+    """Open the logs and align the further ones with the first."""
     logged = {name: s for name, s in inputs.items() if s.constant is None}
     is_open = not isinstance(path, str | Path)
     # Checked before a log is opened, which may take minutes.
@@ -248,8 +247,7 @@ def _opened(
 
 
 def _clocked(logs: _Opened, request: Request) -> dict[Key, ClockedSignal]:
-    """The signals inside the window, each on its clock, in seconds from the first log's
-    beginning."""
+    """Return the signals inside the window on their clocks [s], from the first log's beginning."""
     signals = signals_of(logs.log, _only(request, logs.keys))
     for one in logs.beside:
         signals |= {key: _within(s, request) for key, s in one.signals.items()}
@@ -257,7 +255,7 @@ def _clocked(logs: _Opened, request: Request) -> dict[Key, ClockedSignal]:
 
 
 def _flight(logs: _Opened, request: Request) -> Flight:
-    """The flight inside the window, with its constant inputs."""
+    """Return the flight inside the window, with its constant inputs."""
     log = logs.log
     try:
         notes = (*log.notes, *_beyond(logs, request), *(one.note for one in logs.beside))
@@ -267,7 +265,7 @@ def _flight(logs: _Opened, request: Request) -> Flight:
             Source(log.path, log.sha256, notes, log.firmware, log.parameters, first_time=log.begin),
         )
     except InputError as e:
-        # A wrong unit of the clock makes errors of other kinds.
+        # A wrong unit of the clock causes errors of other kinds.
         said = [n for n in log.notes if n.code == "units.contradicted"]
         if not said:
             raise
@@ -276,7 +274,7 @@ def _flight(logs: _Opened, request: Request) -> Flight:
     values, reasons = dict(flight.inputs), dict(flight.hold_reason)
     for name, signal in logs.inputs.items():
         if signal.constant is not None:
-            # Scale and offset are of numbers in a log, and a constant is none.
+            # Scale and offset apply to numbers in a log, not to a constant.
             plain = dataclasses.replace(signal, scale=1.0, offset=0.0, invert=False)
             values[name] = plain.to_si(np.full(flight.n_samples, signal.constant))
             reasons[name] = "a constant"
@@ -291,7 +289,7 @@ def _flight(logs: _Opened, request: Request) -> Flight:
 
 
 def _beyond(logs: _Opened, request: Request) -> tuple[Finding, ...]:
-    """A note where the window reaches beyond the first log."""
+    """Return a note if the window reaches beyond the first log."""
     log = logs.log
     times = [log.topic_of(request.signals[key].name).times for key in logs.keys]
     return window_note(request.options.window, times, log.first_time)
@@ -300,7 +298,7 @@ def _beyond(logs: _Opened, request: Request) -> tuple[Finding, ...]:
 def _open(request: Request, log: ChannelLog | Table | None = None) -> ChannelLog:
     log = log or open_log(request.path, request.options.number)
     if request.time is None and isinstance(log, ArrayTable):
-        # Arrays may have clocks of their own beside them in the file.
+        # Arrays may have their own clocks in the file.
         log = by_clocks(log) or log
     if not isinstance(log, ChannelLog):
         return load_table(log, request)
@@ -311,8 +309,7 @@ def _open(request: Request, log: ChannelLog | Table | None = None) -> ChannelLog
 
 
 def _only(request: Request, keys: frozenset[Key], whole: bool = False) -> Request:
-    """Return the request for some signals; over all of the log if `whole`: a lag is found from as
-    much as there is."""
+    """Return the request for some signals; over the whole log if `whole`, as a lag needs."""
     part = copy.copy(request)
     part.signals = {key: s for key, s in request.signals.items() if key in keys}
     if whole:
@@ -321,11 +318,10 @@ def _only(request: Request, keys: frozenset[Key], whole: bool = False) -> Reques
 
 
 def _beside(log: ChannelLog, request: Request, also: Also) -> tuple[_Beside, Request]:
-    """The signals of a further log, its clock shifted to that of the first, and the request for
-    them with the units that they have."""
+    """Return the signals of a further log on the first log's clock, and the request with units."""
     options = ReadOptions(number=also.number)
     asked = Request(also.path, also.time, also.inputs, also.outputs, options)
-    # The log that is open already may be large.
+    # An open log is not opened again, because it may be large.
     file = also.log or open_log(asked.path, asked.options.number)
     other = _open(asked, file)
     asked = with_file_units(other, asked)
@@ -340,7 +336,7 @@ def _beside(log: ChannelLog, request: Request, also: Also) -> tuple[_Beside, Req
         said = _as_one(request, also, _span(ours, log.begin), _span(signals, other.begin), stated)
     shifted = {}
     for key, signal in signals.items():
-        # Two files may well have topics of the same name.
+        # Two files may have topics of the same name.
         clock = signal.clock
         called = clock.name if clock.name == name else f"{name}, {clock.name}"
         clock = dataclasses.replace(clock, name=called, seconds=clock.seconds + lag)
@@ -351,19 +347,19 @@ def _beside(log: ChannelLog, request: Request, also: Also) -> tuple[_Beside, Req
 def _aligned(
     log: ChannelLog, request: Request, also: Also, file: ChannelLog | Table, name: str
 ) -> tuple[float, Finding]:
-    """Return the correction of a further log's times [s], by a motion that both logs hold."""
+    """Return the correction of a further log's times [s], from a motion in both logs."""
     key = next((key for key in request.signals if key[0] == also.same), None)
     if key is None:
         known = ", ".join(dict.fromkeys(name for name, _ in request.signals))
         problem = f"expected a signal of the first log ({known}), got {also.same!r:.60}"
         raise wrong(also.path, problem, "align.with")
-    # Apart from the others, since it may well be one of them.
+    # In a request of its own, because it may also be one of the other signals.
     options = ReadOptions(number=also.number)
     alone = Request(also.path, also.time, {}, {also.same: Signal(also.to, "1", "1")}, options)
     reference = signals_of(log, _only(request, frozenset({key}), whole=True))[key].timed
     (twin,) = signals_of(_open(alone, file), alone).values()
     reference = reference._replace(values=measured(request.signals[key], reference.values))
-    # A scale does not matter for it, so that no unit is asked for.
+    # The scale does not affect the correlation, so no unit is needed.
     motion = (-1.0 if also.reverse else 1.0) * without_marks(twin.values)
     try:
         lag = lag_between(reference, twin.timed._replace(values=motion))
@@ -387,7 +383,7 @@ def _as_one(
     theirs: tuple[float, float],
     name: str,
 ) -> Finding:
-    """A note that the times of two logs, from first to last [s], count alike."""
+    """Return a note that the times of two logs, from first to last [s], share one clock."""
     first, shared = Path(request.path).name, min(ours[1], theirs[1]) - max(ours[0], theirs[0])
     if not shared >= _SHARED * min(ours[1] - ours[0], theirs[1] - theirs[0]):
         raise wrong(
@@ -404,14 +400,14 @@ def _as_one(
 
 
 def _span(signals: Mapping[Key, ClockedSignal], first_time: float) -> tuple[float, float]:
-    """First and last time of signals [s], in the log's own count."""
+    """Return the first and last time of signals [s], in the log's own count."""
     clocks = [s.clock.seconds for s in signals.values()]
     begin, end = min(float(c[0]) for c in clocks), max(float(c[-1]) for c in clocks)
     return first_time + begin, first_time + end
 
 
 def _within(signal: ClockedSignal, request: Request) -> ClockedSignal:
-    """The part of a signal inside the window."""
+    """Return the part of a signal inside the window."""
     if request.options.window is None:
         return signal
     clock = signal.clock
@@ -423,7 +419,7 @@ def _within(signal: ClockedSignal, request: Request) -> ClockedSignal:
 
 
 def require_some_time(flight: Flight) -> None:
-    """Refuse a flight in which no vehicle can have moved."""
+    """Refuse a flight too short for any vehicle to move."""
     if flight.duration >= _SHORTEST:
         return
     path = flight.source.path if flight.source else flight.name or "flight"
@@ -432,7 +428,7 @@ def require_some_time(flight: Flight) -> None:
 
 
 def require_moving_outputs(flight: Flight) -> None:
-    """Refuse a flight in which no output does anything: gains of zero fit it, without any noise."""
+    """Refuse a flight in which all outputs are constant: gains of zero would fit without noise."""
     seen = {n: y[np.isfinite(y)] for n, y in flight.outputs.items()}
     still = {n: y[0] for n, y in seen.items() if y.size and np.ptp(y) <= _STILL}
     if not still or len(still) < len(seen):

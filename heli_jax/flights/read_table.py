@@ -1,9 +1,9 @@
 """Tables of rows as logs of topics, once their clock is known.
 
-A table is a log of one topic. Rows that hold the values of one topic each and leave other cells
-empty (an outer join, as PlotJuggler, MAVExplorer and pandas write it) are several: the columns that
-are filled in the same rows are a topic, whose clock is that of these rows. A join that was filled
-forward is told by its repeated values (`repeats.carried_on`).
+A table usually is a log of one topic. In an outer join, as PlotJuggler, MAVExplorer and pandas
+write it, each row holds the values of one topic and other cells are empty. Columns that are filled
+in the same rows are then a topic, with the clock of these rows. A join that was filled forward is
+recognised by its repeated values (`repeats.carried_on`).
 """
 
 import itertools
@@ -44,15 +44,15 @@ from heli_jax.flights.request import Request
 from heli_jax.flights.resample import SLOWER, usual_step
 
 _SHARED = 0.1
-"""of the rows of the smaller of two topics that hold the other too, at most: stamps may coincide"""
+"""Largest share of the smaller topic's rows that also hold the other one; stamps may coincide."""
 _FEWEST = 8
-"""rows of a topic"""
+"""Fewest rows of a topic."""
 _NAMED = 2
-"""columns by which a topic is called"""
+"""Columns in the name of a topic."""
 
 
 def load_table(table: Table, request: Request) -> ChannelLog:
-    """Return the columns that are asked for, with their clock."""
+    """Return the requested columns with their clock."""
     time, runs = request.time, request.options.runs
     if time is None:
         problem = "no time is stated, expected the name of the column of time stamps"
@@ -91,7 +91,7 @@ def _with_clock(
     columns = {n: x for n, x in numbers.items() if n != time.name}
     stated = {n: table.units[n] for n in columns if table.units.get(n)}
     rows = TableRows(table, stamps, scale)
-    # Subtracted first, so that a calendar's digits do not cost any.
+    # Subtracted first, so that the digits of a calendar date cost no precision.
     first = float(stamps[0]) if stamps.size else 0.0
     times = (stamps - first) * scale
     topic = Topic(name or Path(table.path).name, times, columns, stated, time.name, rows)
@@ -102,7 +102,7 @@ def _checked(table: Table, time: Signal, stamps: np.ndarray) -> tuple[Finding, .
     """Refuse stamps (N,) that are no clock; return notes on their unit."""
     stated = None if time.name == ROWS else table.time_unit(time.name)
     scale = clock_scale(table, time)
-    # A type is unmistakable; only words may be meant for something else.
+    # A type is unmistakable; words may mean something else.
     is_sure = time.scale != 1.0 or (stated and not table.units.get(time.name))
     said = () if is_sure else unit_notes(time, stated)
     with np.errstate(over="ignore"):
@@ -122,10 +122,10 @@ def _checked(table: Table, time: Signal, stamps: np.ndarray) -> tuple[Finding, .
 
 
 def guessed_log(table: Table, time: str | None, unit: str | None, rate: float | None) -> ChannelLog:
-    """Return all columns of numbers as one topic; the notes say what was assumed and left out.
+    """Return all columns of numbers as one topic; the notes list assumptions and omissions.
 
     Args:
-        time: the clock, where it is named; else guessed.
+        time: name of the clock; guessed if None.
         rate: samples a second [Hz] of a table without times.
     """
     info = describe_table(table, time, unit, rate)
@@ -146,7 +146,7 @@ def guessed_log(table: Table, time: str | None, unit: str | None, rate: float | 
         words = f"column {shown(clock.column)} is taken as the clock in {clock.unit}"
         notes.append(note("clock.guessed", words, clock.column))
     rows = next((c.count for c in info.columns if c.name == clock.column), info.n_rows)
-    # Arrays may have lengths of their own; rows of a table with empty cells are of one length.
+    # Arrays may have different lengths; rows of a table with empty cells have one length.
     whole = not isinstance(table, ArrayTable)
     numeric = [c for c in info.columns if c.kind == "number"]
     names = [c.name for c in numeric if whole or c.count == rows]
@@ -156,7 +156,7 @@ def guessed_log(table: Table, time: str | None, unit: str | None, rate: float | 
     if texts:
         words = listed(f"{shown(c.name)}{f' ({c.strays})' if c.strays else ''}" for c in texts)
         notes.append(note(LEFT_OUT, f"left out: text in {words}", *(c.name for c in texts)))
-    # The columns are keyed by name from here on, and one of the two would be lost without a word.
+    # The columns are keyed by name from here on, so one of two with the same name would be lost.
     twice = next((n for n in names if names.count(n) > 1), None)
     if twice is not None:
         raise wrong(table.path, f"two columns are named {shown(twice)}, expected different names")
@@ -203,13 +203,14 @@ def takes_turns(groups: Sequence[RowGroup]) -> bool:
 def is_joined(
     seconds: np.ndarray, columns: Mapping[str, np.ndarray], needed: Collection[str]
 ) -> bool:
-    """True if the rows of a table, at `seconds` (N,), are those of several topics.
+    """True if the rows of a table, at `seconds` (N,), belong to several topics.
 
     Args:
-        columns: that are asked for (N,), NaN where a cell is empty.
-        needed: those of them that no sample may be missing of, such as inputs.
+        seconds: times of the rows (N,) [s].
+        columns: requested columns (N,), NaN where a cell is empty.
+        needed: columns that must not miss samples, such as inputs.
     """
-    # Before a column's first value, and behind its last, there is nothing to fill forward with.
+    # Before a column's first value and after its last, there is no value to fill from.
     seen = [rows for x in columns.values() if (rows := np.flatnonzero(~np.isnan(x))).size]
     begin = max((int(rows[0]) for rows in seen), default=0)
     end = min((int(rows[-1]) + 1 for rows in seen), default=0)
@@ -220,7 +221,7 @@ def is_joined(
         return False
     groups = row_groups(columns)
     some = np.any([g.rows for g in groups], axis=0)
-    # A row that holds nothing of what is asked for is one of another topic.
+    # A row without any requested value belongs to another topic.
     if all(np.array_equal(~np.isnan(columns[name]), some) for name in lacking):
         return True
     step = usual_step(seconds)
@@ -229,9 +230,10 @@ def is_joined(
 
 
 def without_joins(log: ChannelLog, joined: bool = False) -> ChannelLog:
-    """Return the log with topics of their own where the rows of a table hold one topic each.
+    """Return the log with separate topics if the rows of a table hold one topic each.
 
     Args:
+        log: the log.
         joined: True if they are known to do so.
     """
     topics: list[Topic] = []
@@ -253,8 +255,8 @@ def without_joins(log: ChannelLog, joined: bool = False) -> ChannelLog:
         known = (t for t in parts if t.times.size > 1)
         rates = listed(f"{t.name} at about {1 / usual_step(t.times):.4g} Hz" for t in known)
         words = (
-            f"its rows hold one topic each and leave other cells empty: each column is taken at "
-            f"the rows that hold it ({rates})"
+            f"each row holds one topic and leaves other cells empty: each column is read at "
+            f"its own rows ({rates})"
         )
         notes.append(note("channels.joined", words, value=len(parts)))
         topics += parts

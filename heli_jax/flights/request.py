@@ -1,7 +1,6 @@
 """Request for the signals of a log, checked before the log is read.
 
-Checked before, because a log can take minutes to read, and a wrong unit or a reversed window need
-not wait for it.
+A log can take minutes to read; a wrong unit or a reversed window is reported at once.
 """
 
 import copy
@@ -18,26 +17,26 @@ from heli_jax.flights.log import ChannelLog, Table, column, shown, wrong
 from heli_jax.flights.marks import REPEATS
 
 Key = tuple[str, str]
-"""a model's name, and `input` or `output`"""
+"""The model's name, and `input` or `output`."""
 FEWEST = 8
-"""samples in a run"""
+"""Fewest samples in a run."""
 
 
 @dataclass(frozen=True)
 class Also:
-    """A further log of the same flight, whose clock may know nothing of the first one's.
+    """A further log of the same flight, whose clock may be independent of the first one's.
 
     Attributes:
-        path: of the log.
-        same: the signal of the first log, by the model's name, that both hold; empty where both
-            have one clock.
-        to: the column or channel of the same motion in this log, in any unit.
+        path: path of the log.
+        same: signal of the first log, by the model's name, that both hold; empty if both have one
+            clock.
+        to: column or channel of the same motion in this log, in any unit.
         inputs: signals to take from this log, by the model's names.
-        outputs: the same for what was measured.
-        time: the column of time stamps of a table.
-        number: which flight of a file that holds several, from 1.
-        reverse: whether `to` has the opposite sign.
-        log: the log itself, where it is open already.
+        outputs: the same for measured outputs.
+        time: column of time stamps of a table.
+        number: number of the flight in a file that holds several, from 1.
+        reverse: True if `to` has the opposite sign.
+        log: the log itself, if it is already open.
     """
 
     path: str
@@ -56,35 +55,35 @@ class ReadOptions:
     """Options of `read_flight`; each field is also its keyword."""
 
     rate: float | None = None
-    """resample to this rate [Hz]; without it the stamps must be a uniform grid"""
+    """Rate to resample to [Hz]; without it the stamps must be a uniform grid."""
     window: tuple[float, float] | None = None
-    """first and last time to use [s], counted from the log's first sample"""
+    """First and last time to use [s], counted from the log's first sample."""
     known: Mapping[str, float] | None = None
-    """parameters that differ in this run, SI"""
+    """Parameters that differ in this run, SI."""
     hold_out: bool = False
-    """whether the run serves for validation alone"""
+    """True if the run is for validation only."""
     name: str = ""
-    """what to call the run"""
+    """Name of the run."""
     number: int | None = None
-    """which flight of a file that holds several, from 1"""
+    """Number of the flight in a file that holds several, from 1."""
     also: tuple[Also, ...] = ()
-    """further logs of the same flight, aligned with this one; they need a rate"""
+    """Further logs of the same flight, aligned with this one; they need a rate."""
     follows: Mapping[tuple[str, str], bool] = field(default_factory=dict)
-    """the inputs that an output follows within a sample of the rate, as (input, output), and
-    whether it does so at the very sample; such held inputs are low-passed as the output is"""
+    """Pairs (input, output) in which the output follows the input within a sample. The value is
+    True if it follows without delay. Such held inputs are low-passed like the output."""
     runs: str = ""
-    """the column of a table that numbers its runs"""
+    """Column of a table that numbers its runs."""
     swashplate: Swashplate | None = None
-    """geometry of the channels `ccpm.collective`, `ccpm.roll` and `ccpm.pitch`"""
+    """Geometry of the channels `ccpm.collective`, `ccpm.roll` and `ccpm.pitch`."""
     split: bool = False
-    """whether runs are told by a time that begins anew, to become flights of their own"""
+    """True if runs, separated by a time that begins anew, become separate flights."""
 
 
 def require_rate_and_window(
     path: str, rate: float | None, window: tuple[float, float] | None
 ) -> None:
-    """Refuse a rate or a window of which a log has no part."""
-    # NaN passes no comparison, so each bound is written as what has to hold.
+    """Refuse an invalid rate or window."""
+    # NaN passes no comparison, so each condition states what must hold.
     if rate is not None and not (rate > 0 and math.isfinite(rate)):
         raise wrong(path, f"rate is {rate:g}, expected a positive number in Hz")
     if window is not None and not (
@@ -95,7 +94,7 @@ def require_rate_and_window(
 
 
 class Request:
-    """The signals, the rate and the window that a user wants from a log."""
+    """Signals, rate and window that a user wants from a log."""
 
     def __init__(
         self,
@@ -108,12 +107,12 @@ class Request:
         self.path, self.options = path, options
         self.known = dict(options.known or {})
         self.time = Signal(time, "s", "s", assumed=True) if isinstance(time, str) else time
-        # By name and kind: a model may call an input and an output the same.
+        # By name and kind: a model may give an input and an output the same name.
         self.signals = {(key, "input"): signal for key, signal in inputs.items()}
         self.signals |= {(key, "output"): signal for key, signal in outputs.items()}
         if not self.signals:
             raise wrong(path, "no input or output is asked for, expected at least one")
-        # Columns first: a column with two uses makes every further sentence about it doubtful.
+        # Columns first: a column with two uses makes further messages about it doubtful.
         self._check_columns()
         uses = {f"{kind} {key!r}": signal for (key, kind), signal in self.signals.items()}
         if self.time is not None:
@@ -127,11 +126,11 @@ class Request:
                 raise wrong(path, f"known {name!r} is {value:g}, expected a finite number")
 
     def of_kind[V](self, kind: str, samples: Mapping[tuple[str, str], V]) -> dict[str, V]:
-        """The samples of all inputs or of all outputs by the model's name, in the user's order."""
+        """Return the samples of inputs or of outputs by the model's name, in the user's order."""
         return {key: samples[key, each] for key, each in self.signals if each == kind}
 
     def noise(self) -> dict[str, float]:
-        """The stated noise of the outputs, in SI."""
+        """Return the stated noise of the outputs, in SI."""
         # abs: a unit may flip the sign of a signal, but a standard deviation has none.
         return {
             key: signal.sd * abs(units.factor(signal.unit, signal.si))
@@ -141,7 +140,7 @@ class Request:
 
     def _check_columns(self) -> None:
         # Two inputs may share a column. Any other double use is a slip: a column that is input and
-        # output at once would be fitted perfectly, and say nothing.
+        # output at once would be fitted perfectly, without information.
         uses = {} if self.time is None else {self.time.name: ("time", "the time")}
         for (key, kind), signal in self.signals.items():
             use = (kind, f"{kind} {key!r}")
@@ -152,7 +151,7 @@ class Request:
 
 
 def _problem(use: str, signal: Signal) -> str:
-    """Reason why a signal is wrong for a use such as `input 'u'`; empty if it is not."""
+    """Return why a signal is wrong for a use such as `input 'u'`; empty if it is not."""
     try:
         scale = abs(units.factor(signal.unit, signal.si))
     except ValueError as e:
@@ -160,8 +159,8 @@ def _problem(use: str, signal: Signal) -> str:
     if problem := scale_problem(signal):
         return f"{use}: {problem}"
     is_input, is_output = use.startswith("input "), use.startswith("output ")
-    # Only what is measured has noise in the estimators; an input is taken as it is logged. What it
-    # repeats is what it was: it stays, as its hold says.
+    # Only outputs have noise in the estimators; an input is used as logged. A repeated input value
+    # is real, and its hold applies.
     for what, stated, elsewhere in (
         ("an sd", signal.sd is not None, is_input),
         ("repeats", signal.repeats != "auto", is_input),
@@ -170,7 +169,7 @@ def _problem(use: str, signal: Signal) -> str:
         if stated and elsewhere:
             others = "outputs" if is_input else "inputs"
             return f"{what} is stated for {use}, expected it for {others} alone"
-    # In SI too: 1e-320 deg is positive, and zero in rad, by which residuals are divided.
+    # In SI too: 1e-320 deg is positive but zero in rad, and residuals are divided by it.
     if signal.sd is not None and not (signal.sd > 0 and 0 < signal.sd * scale < math.inf):
         return f"the sd of {use} is {signal.sd:g}, expected a positive number"
     for what, got, known in (
@@ -182,14 +181,12 @@ def _problem(use: str, signal: Signal) -> str:
     return ""
 
 
-# The unit that a file states for a signal: taken where none is configured, else compared with the
+# The unit that a file states for a signal is used if none is configured, else compared with the
 # configured one.
 
 
 def with_file_units(log: ChannelLog, request: Request) -> Request:
-    """Return the request with the file's units where none was asked for, and with those that
-    contradict what was.
-    """
+    """Return the request with the file's units if none was stated, or if they contradict."""
     made = copy.copy(request)
     made.signals = {
         key: _with_file_unit(log, signal, key[0]) for key, signal in request.signals.items()
@@ -199,13 +196,13 @@ def with_file_units(log: ChannelLog, request: Request) -> Request:
 
 def _with_file_unit(log: ChannelLog, signal: Signal, name: str) -> Signal:
     stated = log.topic_of(signal.name).units.get(signal.name, "").strip()
-    # Who states a scale has made of the numbers what they are.
+    # A stated scale already includes the unit.
     if signal.scale != 1.0 or (signal.assumed and signal.offset) or stated in ("", "-", "1"):
         return signal
     known = units.is_unit(stated)
     try:
         same = math.isclose(units.factor(stated, signal.si if signal.assumed else signal.unit), 1.0)
-    # The file's own words need be no unit that is known here.
+    # The file's unit may be unknown here.
     except ValueError as e:
         same = not known
         if signal.assumed and known:
@@ -218,7 +215,7 @@ def _with_file_unit(log: ChannelLog, signal: Signal, name: str) -> Signal:
 
 
 def other_units(request: Request) -> list[Finding]:
-    """Notes on units that the file states otherwise than the configuration."""
+    """Return notes on units that the file and the configuration state differently."""
     return [
         note(
             "units.contradicted",
@@ -232,7 +229,7 @@ def other_units(request: Request) -> list[Finding]:
 
 
 def taken_note(name: str, signal: Signal) -> Finding | None:
-    """A note on a signal that is read in the file's unit; None for others."""
+    """Return a note on a signal that is read in the file's unit; None for others."""
     if not signal.assumed or signal.unit == signal.si:
         return None
     words = f"no unit stated, {shown(signal.name)} taken in {signal.unit}, as the file says"

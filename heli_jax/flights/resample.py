@@ -1,8 +1,8 @@
-"""A flight's samples on another clock.
+"""Resampling of a flight's samples to another clock.
 
-Throughout, `seconds` (N,) [s] are stamps that increase, `values` (N,) the samples there, NaN where
-one is missing, and `times` (M,) [s] those of a grid, evenly spaced. Results are (M,), in the
-samples' unit, NaN where too much is missing. Holds take times from the first stamp on.
+In all functions, `seconds` (N,) [s] are increasing stamps and `values` (N,) their samples, NaN if
+missing. `times` (M,) [s] is an evenly spaced grid. Results are (M,), in the samples' unit, NaN
+where too many samples are missing. Holds accept times from the first stamp on.
 """
 
 import functools
@@ -13,26 +13,27 @@ import numpy as np
 from heli_jax.finding import Finding, note
 from heli_jax.numerics.jumps import split
 
-# What may be bridged: a few lost samples, or a moment in which a small helicopter's attitude is
-# still near a straight line. What lies in a longer gap nobody knows.
+# A gap is bridged if it is a few lost samples, or so short that a small helicopter's attitude is
+# still near a straight line.
 _GAP_STEPS = 5.0
 _GAP_SECONDS = 0.25
 _GOES_DOWN = 0.9
-"""new rate over old, below which something between the two Nyquist frequencies could fold"""
+"""Ratio of new to old rate, below which frequencies between the two Nyquist frequencies could fold.
+"""
 _CELLS = 16
-"""parts of a grid step over which a held signal is averaged before it is low-passed: the mean takes
-0.1 % off what is at 0.4 of the rate"""
+"""Parts of a grid step over which a held signal is averaged before the low-pass filter. The mean
+attenuates a signal at 0.4 of the rate by 0.1 %."""
 
 
 def longest_gap(seconds: np.ndarray) -> float:
-    """The longest step [s] between stamps (N,) [s] that may be bridged."""
-    # The larger of the two: in a slow log a few steps are longer than the time, and in a fast one
-    # the time is many steps.
+    """Return the longest step [s] between stamps (N,) [s] that is bridged."""
+    # The larger of the two: in a slow log a few steps are longer than the fixed time, in a fast log
+    # the fixed time is many steps.
     return max(_GAP_STEPS * float(np.median(np.diff(seconds))), _GAP_SECONDS)
 
 
 def rate_notes(seconds: np.ndarray, rate: float) -> list[Finding]:
-    """Notes on what becomes of samples at these stamps (N,) [s] at a rate [Hz]."""
+    """Return notes on the resampling of stamps (N,) [s] to a rate [Hz]."""
     usual = float(np.median(np.diff(seconds)))
     words = f"resampled to {rate:.6g} Hz from about {1 / usual:.6g} Hz"
     notes = [note("resampling.rate", words, value=1 / usual)]
@@ -44,29 +45,29 @@ def rate_notes(seconds: np.ndarray, rate: float) -> list[Finding]:
 
 
 def in_gaps(seconds: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Return a mask of the times (M,) that lie in a gap of the stamps (N,) that is not bridged."""
+    """Return a mask of the times (M,) inside a gap of the stamps (N,) that is not bridged."""
     behind = np.clip(np.searchsorted(seconds, times, side="right"), 1, seconds.size - 1)
     step = seconds[behind] - seconds[behind - 1]
     away = np.minimum(np.abs(times - seconds[behind - 1]), np.abs(times - seconds[behind]))
-    # A step of exactly the limit passes whatever its rounding, and a time at a stamp has that
-    # sample, however wide the gap beside it is.
+    # A step of exactly the limit passes despite rounding. A time at a stamp has that sample,
+    # however wide the gap beside it is.
     return (step > longest_gap(seconds) * (1 + 1e-9)) & (away > 1e-9)
 
 
 def hold(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """The value of the sample before each time: a stick stays until the next sample.
+    """Return the value of the sample before each time (zero-order hold).
 
-    For modes and counters, of which no mean makes sense; what acts on a vehicle takes `held_mean`.
-    A time that misses a stamp by rounding alone counts as at the stamp.
+    For modes and counters, which have no meaningful mean; vehicle inputs use `held_mean`. A time
+    that misses a stamp only by rounding counts as at the stamp.
     """
     tolerance = 1e-6 * float(np.median(np.diff(seconds)))
     return values[np.searchsorted(seconds, times + tolerance, side="right") - 1]
 
 
 def held_until_jumps(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """A signal that is held until it jumps, and else follows straight lines.
+    """Resample a signal that is held until it jumps and otherwise follows straight lines.
 
-    A jump comes to the time nearest to its own, so that it remains one on the grid.
+    A jump moves to the nearest time, so that it remains a jump on the grid.
     """
     stairs, rest = split(values)
     nearest = times + 0.5 * (times[1] - times[0])
@@ -74,23 +75,22 @@ def held_until_jumps(seconds: np.ndarray, values: np.ndarray, times: np.ndarray)
 
 
 def held_mean(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """The mean of a stepwise signal over each step of a grid, from its time to the next.
+    """Return the mean of a stepwise signal over each step of a grid, from its time to the next.
 
-    What a vehicle makes of a step is its integral. The mean keeps it wherever the step falls; the
-    value at the grid's time would be late by half a grid step on average, which a fit takes for
-    the vehicle's lag.
+    A vehicle responds to the integral of a step. The mean keeps the integral wherever the step is.
+    The value at the grid's time would be late by half a step on average, which a fit attributes to
+    lag.
 
     Args:
-        seconds: stamps (N,) [s], increasing; each sample stays until the next.
+        seconds: stamps (N,) [s], increasing; each sample holds until the next.
         values: samples (N,), finite.
         times: (M,) [s], evenly spaced, M >= 2, none before the first stamp.
 
     Returns:
-        (M,), in the samples' unit; the samples themselves, to the last bit, where no step falls
-        between two times.
+        (M,), in the samples' unit; bit-identical to the samples if no step is between two times.
     """
     edges = np.append(times, 2 * times[-1] - times[-2])
-    # A stamp that misses a time by rounding alone counts as at it.
+    # A stamp that misses a time only by rounding counts as at it.
     near = np.clip(np.searchsorted(edges, seconds), 1, edges.size - 1)
     nearest = np.where(seconds - edges[near - 1] < edges[near] - seconds, near - 1, near)
     at_edge = np.abs(seconds - edges[nearest]) <= 1e-6 * float(np.median(np.diff(seconds)))
@@ -103,18 +103,18 @@ def held_mean(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.
     lowest = np.minimum.reduceat(pieces, first)
     highest = np.maximum.reduceat(pieces, first)
     steps = np.diff(edges)[np.searchsorted(times, begins, side="right") - 1]
-    # Weighted first: the sum of huge values times seconds could overflow.
+    # Weighted before the product, because huge values times seconds could overflow.
     mean = np.add.reduceat(pieces * (np.diff(bounds) / steps), first)
     return np.clip(mean, lowest, highest)
 
 
 def held_low_passed(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """A stepwise signal through the low-pass filter of `resampled`, at the times of a grid."""
+    """Low-pass a stepwise signal by the filter of `resampled`, at the times of a grid."""
     step = float(times[1] - times[0])
     cell = step / _CELLS
     count = int(np.ceil((max(seconds[-1], times[-1]) - seconds[0]) / cell)) + 1
     means = held_mean(seconds, values, seconds[0] + cell * np.arange(count))
-    # A mean stands for the middle of its cell.
+    # A mean belongs to the middle of its cell.
     return low_pass(means, cell, times - seconds[0] - 0.5 * cell, step)
 
 
@@ -126,42 +126,39 @@ def goes_down(seconds: np.ndarray, times: np.ndarray) -> bool:
 
 
 def resampled(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """A signal that is no step: on straight lines, or low-passed where the rate goes down."""
-    # Where the rate hardly goes down there is nothing to fold, and straight lines keep the samples
-    # as they are.
+    """Resample a signal without steps: linearly, or low-passed if the rate decreases."""
+    # If the rate hardly decreases, nothing folds, and interpolation keeps the samples as they are.
     if not goes_down(seconds, times):
         return interpolate(seconds, values, times)
     return decimate(seconds, values, times)
 
 
 def interpolate(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """The straight line between neighbouring samples."""
+    """Interpolate linearly between neighbouring samples."""
     i = np.clip(np.searchsorted(seconds, times, side="right") - 1, 0, seconds.size - 2)
     part = np.clip((times - seconds[i]) / (seconds[i + 1] - seconds[i]), 0.0, 1.0)
-    # A weighted mean: the difference of two huge values would overflow.
+    # A weighted mean, because the difference of two huge values would overflow.
     between = values[i] * (1.0 - part) + values[i + 1] * part
-    # A missing (NaN) neighbour costs nothing at the stamp itself.
+    # A missing (NaN) neighbour does not matter at the stamp itself.
     return np.where(part == 0.0, values[i], np.where(part == 1.0, values[i + 1], between))
 
 
-# Outputs with clocks of their own on the flight's grid: slower ones are missing between their
-# samples.
+# Outputs with separate clocks on the flight's grid: slower ones are missing between their samples.
 #
-# Straight lines between two samples of a slow sensor are no measurements: a fit that takes them for
-# such believes in twenty samples where there is one, and its intervals come out too narrow.
+# A line between two samples of a slow sensor is no measurement. A fit that uses it as one counts
+# twenty samples instead of one, and its intervals are too narrow.
 
 SLOWER = 1.5
-"""grid steps; an output whose usual step is longer is slower than the grid. Up to here a straight
-line makes at most three samples of two."""
+"""Shortest usual step of an output that counts as slower than the grid [grid steps]. Below it,
+interpolation makes at most three samples from two."""
 _NEAR = 0.75
-"""grid steps, to which a sample is moved along its slope"""
+"""Largest distance by which a sample is moved along its slope [grid steps]."""
 OWN = 1.1
-"""grid steps; an output whose usual step is no longer has a sample for each instant"""
+"""Largest usual step of an output with a sample at each instant [grid steps]."""
 
 
 class Timed(NamedTuple):
-    """A signal on its own clock: stamps (N,) [s], increasing, and samples (N,), NaN where one is
-    missing."""
+    """Signal on its own clock: increasing stamps (N,) [s] and samples (N,), NaN if missing."""
 
     seconds: np.ndarray
     values: np.ndarray
@@ -173,10 +170,12 @@ def usual_step(seconds: np.ndarray) -> float:
 
 
 def own_clock(signal: Timed) -> Timed:
-    """Without missing samples where most are, as those of a slow sensor in a fast table are: the
-    stamps then say how fast it was sampled."""
+    """Return the signal without missing samples if most are missing, else unchanged.
+
+    A slow sensor in a fast table has mostly missing samples; the remaining stamps show its rate.
+    """
     seen = ~np.isnan(signal.values)
-    # A few lost samples leave a clock as it is.
+    # A few lost samples do not change the clock.
     if usual_step(signal.seconds[seen]) > SLOWER * usual_step(signal.seconds):
         return Timed(signal.seconds[seen], signal.values[seen])
     return signal
@@ -184,17 +183,16 @@ def own_clock(signal: Timed) -> Timed:
 
 def is_slower(signal: Timed, rate: float) -> bool:
     """True if a signal was sampled clearly more slowly than `rate` [Hz]."""
-    # 1e-6: a step of exactly the limit, but for its rounding, is none that is longer.
+    # 1e-6: a step of exactly the limit does not count as longer because of rounding.
     return usual_step(own_clock(signal).seconds) * rate > SLOWER * (1 + 1e-6)
 
 
 def at_nearest(signal: Timed, times: np.ndarray) -> np.ndarray:
-    """Each sample at the one of the times (M,) nearest to its own; NaN between.
+    """Move each sample to the nearest of the times (M,); NaN between.
 
-    It is moved there, by half a grid step at most, along the slope between its neighbours (second
-    order, also where steps are uneven). So its value is right to that order, and its noise stays
-    its own: the neighbours add 6 % of variance where the grid is hardly faster, and nothing to
-    speak of where it is many times as fast.
+    The sample moves by at most half a grid step along the slope between its neighbours. This is
+    second order, also for uneven steps. Its noise stays nearly its own: the neighbours add 6 % of
+    variance at most, and little on a much faster grid.
     """
     seen = ~np.isnan(signal.values)
     seconds, values = signal.seconds[seen], signal.values[seen]
@@ -208,8 +206,8 @@ def at_nearest(signal: Timed, times: np.ndarray) -> np.ndarray:
     with np.errstate(over="ignore", invalid="ignore"):
         slope = np.zeros(seconds.size) if few else np.gradient(values, seconds, edge_order=2)
         moved = values + slope * away
-    moved = np.where(np.isfinite(moved), moved, values)  # the slope of huge values is no number
-    # Backwards by distance, so that of two at one instant the nearer is written last.
+    moved = np.where(np.isfinite(moved), moved, values)  # the slope of huge values can overflow
+    # In descending distance, so that the nearer of two samples at one instant is written last.
     order = np.argsort(-np.abs(away), kind="stable")
     order = order[inside[order]]
     samples[nearest[order]] = moved[order]
@@ -217,19 +215,19 @@ def at_nearest(signal: Timed, times: np.ndarray) -> np.ndarray:
 
 
 def at_own_rate(signal: Timed, times: np.ndarray) -> np.ndarray:
-    """A signal of the grid's own rate with other or uneven stamps: at each instant the sample
-    nearest to it, moved there along the slope.
+    """Move the nearest sample to each instant along its slope, at the grid's own rate.
 
-    A straight line between two samples is right to the same order, but averages their noise: white
-    noise comes out with an autocorrelation of up to +0.5 at one sample, which passes for a
-    disturbance.
+    For signals with the grid's rate but different or uneven stamps. Linear interpolation has the
+    same order but averages noise: white noise gets an autocorrelation of up to +0.5 at lag one,
+    which looks like a disturbance.
 
     Args:
+        signal: the signal on its own clock.
         times: (M,) [s], evenly spaced, M >= 2.
 
     Returns:
-        (M,), in the samples' unit; NaN beside a missing sample. Where samples are far apart, on the
-        straight line between them.
+        (M,), in the samples' unit; NaN beside a missing sample. Interpolated where samples are far
+        apart.
     """
     lines, seen = interpolate(signal.seconds, signal.values, times), ~np.isnan(signal.values)
     if np.count_nonzero(seen) < 3:
@@ -243,56 +241,56 @@ def at_own_rate(signal: Timed, times: np.ndarray) -> np.ndarray:
     nearer = times - signal.seconds[after - 1] <= signal.seconds[after] - times
     nearest = np.where(nearer, after - 1, after)
     away = times - signal.seconds[nearest]
-    # Of stamps that are multiples of the grid's step the rest is rounding.
+    # For stamps at multiples of the grid's step, the remainder is rounding.
     away = np.where(np.abs(away) > 1e-6 * step, away, 0.0)
     with np.errstate(over="ignore", invalid="ignore"):
         moved = signal.values[nearest] + whole[nearest] * away
     return np.where(np.isfinite(moved) & (np.abs(away) <= _NEAR * step), moved, lines)
 
 
-# Fewer samples a second, without folding what the new rate cannot hold onto what it can.
+# Fewer samples a second without aliasing.
 #
-# Two steps. Uneven samples become even ones of their own usual rate: the signal of least energy
-# near that rate's Nyquist frequency which goes through them, by least squares (as in Feichtinger
-# and Groechenig, 'Theory and practice of irregular sampling', 1994, with a penalty in place of a
-# hard limit of the band). These pass a low-pass filter, a sinc in a Kaiser window, evaluated at the
-# new times.
+# There are two steps. First, least squares makes even samples at the usual rate. The result is the
+# signal through the samples with the least energy near the Nyquist frequency. This follows
+# Feichtinger and Groechenig, 'Theory and practice of irregular sampling', 1994, with a penalty
+# instead of a hard band limit. Second, a low-pass filter, a sinc in a Kaiser window, is evaluated
+# at the new times.
 #
-# What a signal has near the old Nyquist frequency, as white noise has, cannot be told from what
-# lost samples hide, and a fit through every sample would multiply it. How closely the samples are
-# followed is therefore asked of the signal itself: some of them are hidden, and the closeness is
-# taken that predicts those best, from straight lines between neighbours (noise) to all that the
-# others say (a signal that ends below). Noise then passes as the low-pass filter lets it.
+# White noise has energy near the old Nyquist frequency, which cannot be separated from lost
+# samples. A fit through every sample would amplify it. The ridge, which sets how closely samples
+# are followed, is therefore chosen by cross-validation. It ranges from straight lines between
+# neighbours (noise) to a fit of all samples (a band-limited signal). Noise then passes according to
+# the low-pass filter.
 #
-# At 200 Hz with a fifth of a step of jitter and 5 % of the samples lost, what lies between 26 and
-# 70 Hz of a signal without noise is below -74 dB at 50 Hz. Above 70 % of the old Nyquist frequency
-# lost samples cannot be made up for, and a part folds; even samples have no such limit.
+# Measured at 200 Hz with jitter of a fifth of a step and 5 % of the samples lost: a noise-free
+# signal between 26 and 70 Hz is below -74 dB at 50 Hz. Above 70 % of the old Nyquist frequency,
+# lost samples cannot be restored and a part folds. Even samples have no such limit.
 
 PASSED, STOPPED = 0.4, 0.5
-"""of the new rate: what is slower passes, what is faster is taken away"""
+"""Edges of the pass band and the stop band, relative to the new rate."""
 _REACH = 25
-"""new steps on each side that the low-pass filter sees: 70 dB between the two"""
+"""Reach of the low-pass filter on each side [new steps]: 70 dB between the two edges."""
 _BETA = 7.0
 _TAPS = 32
-"""samples that a sample between two others is a sum of"""
+"""Even samples that contribute to one sample between them."""
 _TAPS_BETA = 8.0
 _PENALTY = 0.1
-"""for what lies in the upper seventh of the old band: a lost sample is what makes it small"""
+"""Weight of the energy in the upper seventh of the old band; it keeps lost samples small."""
 _RIDGES = (1e-9, 1e-5, 1e-3, 3e-2, 1.0)
-"""of the difference from straight lines: the smallest leaves them wherever samples say so"""
+"""Candidate ridges on the difference from straight lines; the smallest follows the samples most
+closely."""
 _HIDDEN, _TRIED = 17, 1 << 12
-"""one sample of so many is hidden, of at most so many, to choose among them"""
+"""One sample in `_HIDDEN`, of at most `_TRIED`, is hidden to choose the ridge."""
 _END, _END_RIDGE = 4, 1e-2
 _BLOCK, _OVERLAP = 1 << 15, 256
 _TABLE = 1 << 16
 _AT_ONCE = 1 << 22
-"""weights in memory"""
+"""Largest number of weights in memory."""
 
 
 def decimate(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """A signal at a lower rate."""
-    # A missing sample is taken out and not set to any value: the fit of even samples knows what to
-    # do where none stands.
+    """Resample a signal to a lower rate."""
+    # A missing sample is removed, not replaced: the fit of even samples handles gaps.
     known = np.isfinite(values)
     if np.count_nonzero(known) < 2:
         return np.full(times.size, np.nan)
@@ -301,8 +299,8 @@ def decimate(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.n
     seconds, values = seconds[known], values[known]
     even_step, even = even_samples(seconds, values, usual)
     filtered = low_pass(even, even_step, times - seconds[0], step)
-    # The stamps on both sides of each time say how wide the gap is in which it lies. Where that is
-    # too wide the fit has drawn a straight line, which is no measurement.
+    # The stamps on both sides of a time give the width of its gap. In a wide gap the fit is a
+    # straight line, which is no measurement.
     behind = np.clip(np.searchsorted(seconds, times, side="right"), 1, seconds.size - 1)
     gap = seconds[behind] - seconds[behind - 1]
     inside = (times >= seconds[0] - usual) & (times <= seconds[-1] + usual)
@@ -310,29 +308,26 @@ def decimate(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.n
 
 
 def even_samples(seconds: np.ndarray, values: np.ndarray, usual: float) -> tuple[float, np.ndarray]:
-    """Samples (K,) at even steps [s] from the first stamp to behind the last, and the step."""
+    """Return the step [s] and samples (K,) at even steps, from the first stamp beyond the last."""
     span = float(seconds[-1] - seconds[0])
-    # Bounded whatever the stamps: four even samples for each that there is.
+    # Bounds the memory: at most four even samples for each sample.
     step = max(usual, span / (4 * seconds.size))
-    # Even but for the rounding of the stamps: the samples are taken as they are, which is exact and
-    # needs no fit.
+    # The stamps are even except for rounding. The samples are then exact without a fit.
     if np.ptp(np.diff(seconds)) < 1e-3 * step:
         return span / (seconds.size - 1), values
     at = (seconds - seconds[0]) / step
     count = int(np.ceil(at[-1])) + 1
     even = np.empty(count)
-    # The last even sample lies behind the last stamp, where the slope goes on.
+    # The last even sample is after the last stamp; the slope continues there.
     slope = (values[-1] - values[-2]) / (at[-1] - at[-2])
     line = np.interp(np.arange(count), np.r_[at, at[-1] + 1], np.r_[values, values[-1] + slope])
     ridge = _best_ridge(at, values)
     for begin in range(0, count, _BLOCK):
         end = min(begin + _BLOCK, count)
-        # A band of equations is solved for each block, so that its memory does not grow with the
-        # log. What is near a block's end lacks its neighbours; the overlap is eight times as long
-        # as the taps, is computed twice and kept once.
+        # Block by block, so that the memory does not grow with the log. Samples near a block's end
+        # lack neighbours; the overlap is eight times the taps, computed twice and kept once.
         first, last = max(begin - _OVERLAP, 0), min(end + _OVERLAP, count)
-        # The small number keeps a stamp that lies on the block's last sample, whatever its
-        # rounding.
+        # The small number keeps a stamp at the block's last sample despite rounding.
         rows = slice(*np.searchsorted(at, [first, last - 1 + 1e-9]))
         block = _fitted(at[rows] - first, values[rows], line[first:last], ridge)
         even[begin:end] = block[begin - first : end - first]
@@ -340,14 +335,14 @@ def even_samples(seconds: np.ndarray, values: np.ndarray, usual: float) -> tuple
 
 
 def _best_ridge(at: np.ndarray, values: np.ndarray) -> float:
-    """The one of `_RIDGES` that predicts hidden samples best."""
-    # From the middle, where the vehicle is most likely at work; the ends are pulled to the line
-    # whatever the ridge.
+    """Return the one of `_RIDGES` that predicts hidden samples best."""
+    # From the middle, where the vehicle is most likely active; the ends are pulled to the line by
+    # any ridge.
     first = max(0, (at.size - _TRIED) // 2)
     at, values = at[first : first + _TRIED], values[first : first + _TRIED]
     at = at - np.floor(at[0])
     hidden = np.zeros(at.size, bool)
-    # Not every so-many-th: a periodic pattern would be blind to motion of that period.
+    # Random, because a periodic pattern would miss motion of that period.
     hidden[np.random.default_rng(0).permutation(at.size)[: at.size // _HIDDEN]] = True
     hidden[: 2 * _END] = hidden[-2 * _END :] = False
     if not hidden.any():
@@ -367,14 +362,14 @@ def _best_ridge(at: np.ndarray, values: np.ndarray) -> float:
 
 
 def _fitted(at: np.ndarray, values: np.ndarray, line: np.ndarray, ridge: float) -> np.ndarray:
-    """Even samples (K,) of the signal through `values` (N,) at `at` (N,) in steps.
+    """Return even samples (K,) of the signal through `values` (N,) at `at` (N,) [steps].
 
-    What is looked for is the difference from straight lines (K,), so that a gap is bridged by one.
+    The unknown is the difference from straight lines (K,), so that a gap is bridged by a line.
     """
     from scipy.linalg import solveh_banded
 
     half = _TAPS // 2
-    # Behind both ends the line goes on, for the taps that reach there.
+    # The line continues beyond both ends for the taps that reach there.
     padded = np.pad(line, half, mode="reflect", reflect_type="odd")
     columns, weights, shared = _equations(np.ascontiguousarray(at).tobytes(), padded.size)
     missing = values - np.sum(weights * padded[columns], axis=1)
@@ -382,35 +377,36 @@ def _fitted(at: np.ndarray, values: np.ndarray, line: np.ndarray, ridge: float) 
     energy = _penalty()
     middle = energy.size // 2
     band = shared.copy()
-    # Within a gap a slow signal costs neither misfit nor penalty, and the matrix would be singular.
-    # The ridge draws the difference from the line to zero.
+    # In a gap a slow signal has neither misfit nor penalty, and the matrix would be singular. The
+    # ridge pulls the difference from the line to zero.
     band[0] += ridge
-    # At the ends samples stand on one side alone, and their noise would grow outward.
+    # The ends have samples on one side only, and their noise would grow outward.
     band[0, : half + _END] += _END_RIDGE
     band[0, -half - _END :] += _END_RIDGE
-    # The penalty is on the signal and not on its difference from the lines, so that of the lines
-    # goes to the right-hand side.
+    # The penalty applies to the signal, not to its difference from the lines. The part of the lines
+    # moves to the right-hand side.
     beyond = np.pad(padded, middle, mode="reflect", reflect_type="odd")
     right -= np.convolve(beyond, energy, mode="valid")
-    # By Cholesky: the ridge has made the matrix positive definite, and the cost is linear in the
+    # Cholesky works because the ridge makes the matrix positive definite; the cost is linear in the
     # samples.
     correction = solveh_banded(band, right, lower=True)
     return (padded + correction)[half : half + line.size]
 
 
-# The channels of a topic have one clock, and each tries several ridges: two sets of stamps, those
-# that choose among them and all, serve them all.
+# Channels of a topic share a clock, and each tries several ridges. Two entries are enough: the
+# stamps for the choice of the ridge, and all stamps.
 @functools.lru_cache(maxsize=2)
 def _equations(stamps: bytes, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the even samples that each sample is a sum of and their weights (N, taps), and the
-    diagonals (taps, size) of the least-squares equations with the penalty.
+    """Return the even samples in each sample's sum and their weights (N, taps), and the band.
+
+    The band (taps, size) has the diagonals of the least-squares equations with the penalty.
     """
     at = np.frombuffer(stamps)
     columns = np.floor(at).astype(np.int64)[:, None] + 1 + np.arange(_TAPS)
     weights = _sinc(at[:, None] + _TAPS // 2 - columns)
-    weights /= weights.sum(1, keepdims=True)  # a constant stays one, to the last digit
-    # Diagonals from the middle down: LAPACK takes ten times as long for those above it.
-    # A sample and another share a weight only within the taps, so the matrix is a band.
+    weights /= weights.sum(1, keepdims=True)  # a constant stays exact
+    # Lower diagonals: LAPACK takes ten times as long for upper ones. Two samples share a weight
+    # only within the taps, so the matrix is a band.
     band = np.zeros((_TAPS, size))
     for lag in range(_TAPS):
         products = weights[:, : _TAPS - lag] * weights[:, lag:]
@@ -427,34 +423,34 @@ def _equations(stamps: bytes, size: int) -> tuple[np.ndarray, np.ndarray, np.nda
 
 @functools.cache
 def _penalty() -> np.ndarray:
-    """The autocorrelation of the filter whose output's energy is held small."""
+    """Return the autocorrelation of the filter whose output energy is penalised."""
     from scipy.signal import firwin
 
-    # Any: the stubs know neither windows with a parameter nor that this one returns one array.
+    # Any: the stubs know neither windows with a parameter nor the single array that is returned.
     taps: Any = firwin(_TAPS - 1, 0.85, pass_zero=False, window=cast(Any, ("kaiser", 6.0)))
     high = _PENALTY * np.asarray(taps)
-    high -= high.mean()  # straight lines, however steep, cost nothing
+    high -= high.mean()  # straight lines, however steep, have no penalty
     return np.convolve(high, high[::-1])
 
 
 def _sinc(x: np.ndarray) -> np.ndarray:
-    """The weight of the sample x steps away, for a signal of the band of these steps."""
+    """Return the weight of a sample x steps away, for a signal limited to the band of the steps."""
     half = _TAPS // 2
     window = np.i0(_TAPS_BETA * np.sqrt(np.clip(1 - (x / half) ** 2, 0, 1))) / np.i0(_TAPS_BETA)
     return np.sinc(x) * window
 
 
 def low_pass(even: np.ndarray, step: float, times: np.ndarray, new_step: float) -> np.ndarray:
-    """Even samples, low-passed, at the times of a slower grid (M,).
+    """Low-pass even samples, at the times of a slower grid (M,).
 
     Args:
-        even: samples (K,), `step` [s] apart from 0 on; they go on as their mirror image.
-        step: between them [s].
+        even: samples (K,), `step` [s] apart from 0 on; they continue as their mirror image.
+        step: step of `even` [s].
         times: (M,) [s].
-        new_step: of the slower grid [s], whose Nyquist frequency nothing passes.
+        new_step: step of the slower grid [s]; its Nyquist frequency is stopped.
     """
     taps = 2 * int(np.ceil(_REACH * new_step / step)) + 2
-    # As the mirror image through each end goes on: value and slope stay.
+    # Odd reflection at each end keeps value and slope.
     padded = np.pad(even, taps, mode="reflect", reflect_type="odd")
     x, kernel = _kernel()
     filtered = np.empty(times.size)
@@ -465,21 +461,21 @@ def low_pass(even: np.ndarray, step: float, times: np.ndarray, new_step: float) 
         away = np.abs(at[:, None] - columns) * (step / (new_step * _REACH))
         weights = np.interp(away, x, kernel, right=0.0)
         samples = padded[np.clip(columns + taps, 0, padded.size - 1)]
-        # Divided by the sum of the weights, so that a constant stays the same whatever part of the
-        # kernel falls between samples.
+        # Divided by the sum of the weights, so that a constant stays exact wherever the kernel is
+        # sampled.
         filtered[begin : begin + at_once] = np.sum(weights * samples, 1) / np.sum(weights, 1)
     return filtered
 
 
 @functools.cache
 def _kernel() -> tuple[np.ndarray, np.ndarray]:
-    """The low-pass filter's kernel at distances from 0 to its reach, which is 1.
+    """Return the low-pass filter's kernel at distances from 0 to its reach, which is 1.
 
-    Tabled and interpolated: the Bessel function of its window would else be computed anew for every
+    It is tabulated, because the Bessel function of the window would otherwise be computed for every
     weight.
     """
     x = np.linspace(0, 1, _TABLE)
     window = np.i0(_BETA * np.sqrt(1 - x**2)) / np.i0(_BETA)
-    # The cutoff is midway between what passes and what is stopped; a sinc of cutoff f has twice f
-    # in its argument, which is the sum of the two.
+    # The cutoff is midway between the pass and the stop edge. A sinc of cutoff f has 2 f in its
+    # argument, the sum of the two edges.
     return x, np.sinc((PASSED + STOPPED) * _REACH * x) * window

@@ -1,7 +1,7 @@
 """Facts of a signal as it was logged: clipped ends, steps, stuck parts.
 
-Taken before any resampling: a low-pass filter rounds off a flat top and fills the steps of a coarse
-log, and what then looks smooth is none the better for it.
+They are found before any resampling: a low-pass filter rounds a clipped top and fills the steps of
+a coarse log, so the faults would be hidden but remain.
 """
 
 from collections.abc import Hashable, Mapping, Sequence
@@ -12,43 +12,44 @@ import numpy as np
 from heli_jax.flights.marks import Strays
 
 _PILE = 5.0
-"""times as many samples at an extreme as at the values beside it, for a rail. A sine logged in
-steps has 3 times as many at its turning points as at the three values before"""
+"""Ratio of samples at an extreme to samples at the values beside it, for a rail. A sine logged in
+steps has a ratio of 3."""
 FEW = 8
-"""distinct values of a signal below which its extremes are no rails: steps between a few levels"""
+"""Fewest distinct values of a signal with rails; the extremes of a step signal are none."""
 _RUN = 3
-"""samples in a row at a rail, once at least"""
+"""Samples in a row at a rail, at least once."""
 _VISITS = 2
-"""times at least that a signal comes to a rail"""
+"""Fewest visits to a rail."""
 RAIL_SHARE = 0.005
-"""part of the samples at a rail from which on it is spoken of"""
+"""Smallest share of samples at a rail that is reported."""
 _LATTICE = 1e-3
-"""of a step, by which differences of values may miss a multiple of it: units are converted"""
+"""Tolerance of multiples of a step [steps], for converted units."""
 _STUCK, STUCK_SECONDS = 20.0, 0.5
-"""times the usual number of equal samples in a row, and time, from which on a signal is stuck"""
+"""Length of a stuck part: ratio to the usual number of equal samples, and time [s]."""
 _AT_REST = 1e-3
-"""of a usual move: what is nearer to a value before it stays there has come to it by itself"""
+"""Largest last move before a rest by itself, relative to the usual move."""
 _OFTEN = 3
-"""times at one value that need last so long together alone"""
+"""Fewest times at one value that count by their total time only."""
 _REGULAR = 0.9
-"""part of the runs of equal samples that are no longer than usual: a slow motion in coarse steps
-has runs of any length"""
+"""Smallest share of runs of equal samples with the usual length. A slow motion in coarse steps has
+runs of any length."""
 _TURNS = 0.3
-"""part of a signal's moves that go back, from which on its noise is as large as its steps"""
+"""Share of a signal's moves that reverse, above which its noise is as large as its steps."""
 _TIMES = 5.0
-"""times the longest usual run of such a signal, from which on it is stuck"""
+"""Ratio to such a signal's longest usual run, above which it is stuck."""
 _DROPS, DROP_SHARE = 5, 0.01
-"""visits of a value, and part of the samples at it, from which on they are dropouts"""
+"""Visits of a value, and share of samples at it, from which on they are dropouts."""
 _TRIFLE = 0.2
-"""of its usual deviation or move, by which another signal has to move while one is stuck"""
+"""Smallest motion of another signal while one is stuck, relative to its usual deviation or move."""
 _RUNS = 20
-"""runs of equal samples, from which on their usual length is known"""
+"""Fewest runs of equal samples from which their usual length is known."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rail:
-    """A value at which a signal is cut off, or to which it drops again and again, and the times
-    (K,) [s] of its samples there; none where an end of its range is no rail.
+    """A value at which a signal is clipped, or to which it drops repeatedly.
+
+    `times` (K,) [s] are those of its samples there; none if an end of the range is no rail.
     """
 
     value: float
@@ -57,7 +58,7 @@ class Rail:
 
 @dataclass(frozen=True)
 class Stuck:
-    """One value, from the time `begin` to `end` [s], of a signal that else changes all along."""
+    """One value, from `begin` to `end` [s], of a signal that otherwise changes all the time."""
 
     begin: float
     end: float
@@ -69,16 +70,16 @@ class SignalFacts:
     """Facts of one signal as it was logged, in SI; times count from the flight's first sample.
 
     Attributes:
-        size: samples that there are.
-        low: the lower end of its range.
-        high: the upper one.
-        step: of which all differences of values are multiples; 0 where there is none.
-        levels: distinct values.
-        moves: part of the samples that differ from the one before.
-        usual: the usual time between samples [s].
+        size: number of samples.
+        low: lower end of its range.
+        high: upper end.
+        step: step of which all differences of values are multiples; 0 if there is none.
+        levels: number of distinct values.
+        moves: share of samples that differ from the previous one.
+        usual: usual time between samples [s].
         stretches: times at one value, of an output while other signals move; the longest first.
-        dropouts: where an output jumps to one value from anywhere.
-        strays: samples that may stand for none, and are kept.
+        dropouts: value to which an output jumps from anywhere.
+        strays: samples that may mean no value, but are kept.
     """
 
     size: int
@@ -109,19 +110,21 @@ class SignalFacts:
         return self.low.times.size / n, self.high.times.size / n
 
     def rounding(self, dt: float) -> float:
-        """The error of rounding, rms, that is left at a step of `dt` [s].
+        """Return the rms error of rounding that remains at a step of `dt` [s].
 
-        Rounding to steps of q adds an error of q / sqrt(12), rms, where the signal moves by more
-        than a step from sample to sample or has noise of that size. It is white then, and the
-        low-pass filter before a lower rate takes its part of it; where a value stays for several
-        samples, their error is one and the same, and nothing is averaged.
+        Rounding to steps of q adds an rms error of q / sqrt(12). The error is white if the signal
+        moves by more than a step between samples, or has noise of that size. The low-pass filter
+        before a lower rate then reduces it. If a value stays for several samples, their errors are
+        equal and do not average out.
         """
         run = self.usual / self.moves if self.moves > 0 else dt
         return self.step / 12**0.5 * min(1.0, (run / dt) ** 0.5)
 
     def within(self, begin: float, end: float) -> "SignalFacts":
-        """Return the facts of the part from `begin` to `end` [s], with times from `begin`;
-        levels and steps stay those of the whole."""
+        """Return the facts of the part from `begin` to `end` [s], with times from `begin`.
+
+        Levels and steps stay those of the whole.
+        """
 
         def cut(rail: Rail) -> Rail:
             times = rail.times[(rail.times >= begin) & (rail.times <= end)]
@@ -148,13 +151,13 @@ class SignalFacts:
 
 
 def signal_facts(seconds: np.ndarray, x: np.ndarray) -> SignalFacts:
-    """The facts of one signal by itself."""
+    """Return the facts of one signal by itself."""
     seen = np.isfinite(x)
     s, y = seconds[seen], x[seen]
     if not y.size:
         none = Rail(float("nan"), np.zeros(0))
         return SignalFacts(0, none, none, 0.0, 0, 0.0, 0.0)
-    # Once for all that is asked: sorting is what takes the time in a long log.
+    # Sorted once for all facts, because sorting takes most of the time in a long log.
     levels, counts = np.unique(y, return_counts=True)
     none = np.zeros(y.shape, bool)
     few = levels.size < FEW
@@ -173,13 +176,13 @@ def signal_facts(seconds: np.ndarray, x: np.ndarray) -> SignalFacts:
 def facts_of_all[K: Hashable](
     signals: Mapping[K, tuple[np.ndarray, np.ndarray]], outputs: frozenset[K]
 ) -> dict[K, SignalFacts]:
-    """The facts of signals that were logged together, stuck outputs among them."""
-    # Differences of huge values overflow, and no more is known of such signals then.
+    """Return the facts of signals that were logged together, with stuck outputs."""
+    # Differences of huge values overflow; fewer facts of such signals are known.
     with np.errstate(over="ignore", invalid="ignore"):
         facts = {key: signal_facts(s, x) for key, (s, x) in signals.items()}
         for key in outputs:
             others = [one for other, one in signals.items() if other != key]
-            # A vehicle that stands on the ground holds everything still, and no sensor is stuck.
+            # A vehicle on the ground holds every signal constant, and no sensor is stuck.
             found = [
                 one
                 for one in _stretches(*signals[key], facts[key])
@@ -192,7 +195,7 @@ def facts_of_all[K: Hashable](
 
 
 def _stretches(seconds: np.ndarray, x: np.ndarray, facts: SignalFacts) -> list[Stuck]:
-    """The times at one value that are out of all proportion."""
+    """Return the times at one value that are unusually long."""
     seen = np.isfinite(x)
     s, y = seconds[seen], x[seen]
     moves = np.diff(y)
@@ -200,7 +203,7 @@ def _stretches(seconds: np.ndarray, x: np.ndarray, facts: SignalFacts) -> list[S
     lengths = np.diff(np.r_[begins, y.size])
     if lengths.size < _RUNS:
         return []
-    # What rests at a rail is told as such.
+    # A rest at a rail is reported as a rail.
     rails = [rail.value for rail in (facts.low, facts.high) if rail.times.size]
     lengths = np.where(np.isin(y[begins], rails), 0, lengths)
     usual = float(np.median(np.abs(moves[moves != 0])))
@@ -210,21 +213,21 @@ def _stretches(seconds: np.ndarray, x: np.ndarray, facts: SignalFacts) -> list[S
         one = Stuck(float(s[first]), float(s[last]), float(y[first]))
         # A simulated signal without noise comes to rest within the last digit.
         rests = first > 0 and abs(moves[first - 1]) < _AT_REST * usual
-        # What has no noise may rest for a while without being stuck.
+        # A signal without noise may rest for a while without being stuck.
         if not rests and (noisy or one.end - one.begin >= STUCK_SECONDS):
             stuck.append(one)
     return stuck
 
 
 def _goes_on(seconds: np.ndarray, x: np.ndarray, begin: float, end: float) -> bool:
-    """True where another signal moves from `begin` to `end` [s] about as it does all along."""
+    """True if another signal moves from `begin` to `end` [s] about as it usually does."""
     seen = np.isfinite(x)
     inside = x[(seconds >= begin) & (seconds <= end) & seen]
     if inside.size < 2:
         return False
     if float(np.std(inside)) >= _TRIFLE * float(np.std(x[seen])):
         return True
-    # Within so short a time a signal goes no way, and its moves from sample to sample count.
+    # In so short a time a signal does not go far, so its moves between samples are compared.
     moves = np.abs(np.diff(x[seen]))
     if end - begin >= STUCK_SECONDS or not moves.any():
         return False
@@ -232,7 +235,7 @@ def _goes_on(seconds: np.ndarray, x: np.ndarray, begin: float, end: float) -> bo
 
 
 def _that_count(stuck: Sequence[Stuck], duration: float) -> tuple[Stuck, ...]:
-    """The longest first of those that last; all, where short ones take a share of a record [s]."""
+    """Return the long stuck parts, longest first; all, if short ones fill a share of a record."""
     total = sum(one.end - one.begin for one in stuck)
     often = len(stuck) >= _OFTEN and total >= max(STUCK_SECONDS, DROP_SHARE * duration)
     counted = [one for one in stuck if often or one.end - one.begin >= STUCK_SECONDS]
@@ -240,29 +243,31 @@ def _that_count(stuck: Sequence[Stuck], duration: float) -> tuple[Stuck, ...]:
 
 
 def _turns(moves: np.ndarray) -> float:
-    """The part of a signal's moves that go back."""
+    """Return the share of a signal's moves that reverse."""
     ways = np.sign(moves[moves != 0])
     return float(np.mean(ways[1:] != ways[:-1])) if ways.size > 1 else 0.0
 
 
 def _longest_by_itself(lengths: np.ndarray, moves: np.ndarray) -> float:
-    """The number of samples in a row from which on a signal does not stay at one value by itself;
-    inf where it may for any time."""
+    """Return the number of equal samples in a row above which a signal is stuck.
+
+    It is inf if the signal may stay at one value for any time.
+    """
     least = _STUCK * float(np.median(lengths))
     if np.mean(lengths <= 1.5 * float(np.median(lengths))) >= _REGULAR:
         return least
-    # A slow motion in coarse steps has runs of any length; noise as large as the steps turns back
-    # at every other one, and ends each run by chance.
+    # A slow motion in coarse steps has runs of any length. Noise as large as the steps reverses
+    # often and ends each run by chance.
     if _turns(moves) < _TURNS:
         return np.inf
-    # The runs in which all but a hundredth of the time is spent, those that are stuck left out.
+    # Runs that contain 99 % of the time, without those that are stuck.
     ordered = np.sort(lengths[lengths < least])
     spent = np.cumsum(ordered) / ordered.sum()
     return max(least, _TIMES * float(ordered[int(np.searchsorted(spent, 0.99))]))
 
 
 def _dropouts(seconds: np.ndarray, x: np.ndarray) -> Rail | None:
-    """The value to which a signal jumps from anywhere, again and again."""
+    """Return the value to which a signal repeatedly jumps from anywhere."""
     seen = np.isfinite(x)
     s, y = seconds[seen], x[seen]
     levels, counts = np.unique(y, return_counts=True)
@@ -275,9 +280,9 @@ def _dropouts(seconds: np.ndarray, x: np.ndarray) -> Rail | None:
     gap = np.min(np.abs(np.diff(levels[max(k - 1, 0) : k + 2])))
     at = y == levels[k]
     into = np.flatnonzero(at[1:] & ~at[:-1])
-    # What comes to a value by itself comes by way of its neighbours.
+    # A motion reaches a value by way of its neighbours.
     jumps = np.abs(y[into] - levels[k])
-    # Once stuck there is no coming back: the longest visit does not count.
+    # The longest visit does not count, because a stuck signal does not return.
     edges = np.flatnonzero(np.diff(np.r_[0, at.astype(int), 0]))
     many = counts[k] - int(np.max(edges[1::2] - edges[::2]))
     often = into.size >= _DROPS and many >= max(DROP_SHARE * y.size, 5.0 * near.max())
@@ -289,12 +294,14 @@ def _dropouts(seconds: np.ndarray, x: np.ndarray) -> Rail | None:
 
 
 def _at_top(x: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return a mask of the samples (N,) at the largest value, where that is a rail; `counts` of
-    each value, the largest first."""
-    # Beside the values next to it also those of all the signal: random steps are held unequally.
+    """Return a mask of the samples (N,) at the largest value, if that is a rail.
+
+    `counts` are those of each value, the largest value first.
+    """
+    # Compared with all values too, because random steps are held for unequal times.
     usual = max(float(counts[1:4].mean()), float(np.median(counts[1:])))
     piled = counts[0] > _PILE * usual and counts[0] >= RAIL_SHARE * x.size
-    # Visits to the end of the range, and not a signal at rest.
+    # A rail has repeated visits to the end of the range, unlike a signal at rest.
     at = x == x.max()
     edges = np.flatnonzero(np.diff(np.r_[0, at.astype(int), 0])).reshape(-1, 2)
     visits = len(edges) >= _VISITS and np.diff(edges).max() >= _RUN and not (at[0] and at[-1])
@@ -302,7 +309,7 @@ def _at_top(x: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
 
 def quantum(x: np.ndarray) -> float:
-    """The step of which all differences of values (N,) are multiples; 0 if there is none."""
+    """Return the step of which all differences of values (N,) are multiples; 0 if there is none."""
     return _lattice(np.unique(x[np.isfinite(x)]))
 
 
@@ -312,7 +319,7 @@ def _lattice(levels: np.ndarray) -> float:
     steps = np.diff(levels)
     # Smaller differences are rounding of one value.
     steps = steps[steps > 1e-9 * (levels[-1] - levels[0])]
-    if not steps.size or not np.isfinite(steps).all():  # of huge values
+    if not steps.size or not np.isfinite(steps).all():  # huge values
         return 0.0
     step = float(steps.min())
     multiples = steps / step

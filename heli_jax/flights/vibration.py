@@ -1,4 +1,4 @@
-"""Lines of vibration in a record: which frequencies, how much of its variance, of what."""
+"""Vibration lines in a record: their frequency, share of the variance and origin."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -6,19 +6,21 @@ from typing import NamedTuple
 import numpy as np
 
 SEGMENT = 4.0
-"""s: lines of a quarter of a hertz, which a rotor's speed keeps to for so long"""
+"""Length of a spectral segment [s]. The resolution is 0.25 Hz; a rotor keeps its speed for that
+long."""
 _STANDS_OUT = 20.0
-"""times the median of its surroundings: noise does so once in a million bins"""
+"""Smallest ratio of a line to the median around it; noise exceeds it once in a million bins."""
 _SURROUNDINGS = 15
-"""bins to either side of which the median is taken"""
+"""Bins on either side over which the median is taken."""
 SMALLEST = 0.01
-"""share of the variance below which a line biases nothing"""
+"""Smallest share of the variance; a smaller line biases nothing."""
 _SLOWEST = 4.0
-"""Hz: below are the vehicle's own motion and the sticks', whose doublets have lines too"""
+"""Lowest frequency of a line [Hz]. Below are the vehicle's motion and the sticks, whose doublets
+have lines too."""
 _HIGHEST = 12
-"""harmonics of the rotor that are looked for"""
+"""Highest harmonic of the rotor in the search."""
 _HIGHEST_FOLDED = 4
-"""those that are looked for where they fold to: of more, one would be near any line"""
+"""Highest harmonic in the search for aliases; with more, one would be near any line."""
 
 
 class Line(NamedTuple):
@@ -26,11 +28,11 @@ class Line(NamedTuple):
 
     hz: float
     share: float
-    """of the variance"""
+    """Share of the variance."""
     harmonic: int = 0
-    """of the rotor; zero where it is none"""
+    """Harmonic of the rotor; zero if it is none."""
     of_hz: float = 0.0
-    """the harmonic's own frequency: another one where it is aliased"""
+    """The harmonic's own frequency, which differs if it is aliased."""
 
     @property
     def aliased(self) -> bool:
@@ -41,12 +43,13 @@ class Line(NamedTuple):
 def lines(
     x: np.ndarray, dt: float, rotor_hz: float | None = None, logged_hz: float | None = None
 ) -> tuple[Line, ...]:
-    """The lines of a record, the strongest first.
+    """Return the vibration lines of a record, the strongest first.
 
     Args:
-        x: samples (N,); NaN where one is missing, which are put on straight lines.
-        dt: time between them [s].
-        logged_hz: rate at which the log took it, where frequencies folded; 1/dt unless given.
+        x: samples (N,); missing ones (NaN) are interpolated.
+        dt: time between samples [s].
+        rotor_hz: speed of the rotor [Hz], if known.
+        logged_hz: rate of the log, where frequencies folded; 1/dt by default.
     """
     from scipy.ndimage import median_filter
     from scipy.signal import detrend, welch
@@ -58,7 +61,7 @@ def lines(
     times = np.arange(x.size)
     x = detrend(np.interp(times, times[there], x[there]))
     hz, power = welch(x, 1.0 / dt, nperseg=n, detrend="linear")
-    # Of the whole record: what is slower than a segment is part of the variance as well.
+    # Of the whole record, because motion slower than a segment is also part of the variance.
     total = float(np.var(x)) / float(hz[1])
     if not total > 0:
         return ()
@@ -68,7 +71,7 @@ def lines(
     rate = 1.0 / dt if logged_hz is None else logged_hz
     result = []
     for i in peaks[hz[peaks] >= _SLOWEST]:
-        # Two bins to either side: as wide as the window makes a line.
+        # Two bins on either side: the width of a line in this window.
         part = slice(max(i - 2, 0), i + 3)
         share = float(np.sum(power[part] - around[part])) / total
         if share >= SMALLEST:
@@ -78,7 +81,7 @@ def lines(
 
 
 def line_words(line: Line, rotor_hz: float | None) -> str:
-    """A line in words: `24.2 Hz has 12 % of its variance (1/rev of the rotor)`."""
+    """Describe a line: `24.2 Hz has 12 % of its variance (1/rev of the rotor)`."""
     share = f"{line.hz:.3g} Hz has {100 * line.share:.2g} % of its variance"
     if line.aliased:
         return f"{share} ({line.harmonic}/rev of the rotor, {line.of_hz:.4g} Hz, aliased)"
@@ -88,8 +91,7 @@ def line_words(line: Line, rotor_hz: float | None) -> str:
 
 
 def _harmonic(hz: float, rate: float, rotor_hz: float | None, width: float) -> tuple[int, float]:
-    """Return the harmonic of the rotor that a line is, and this harmonic's frequency; zeros for
-    none."""
+    """Return the rotor's harmonic at a line, and its frequency; zeros for none."""
     if rotor_hz is None:
         return 0, 0.0
     for k in range(1, _HIGHEST + 1):
@@ -108,20 +110,23 @@ def folded(hz: float, rate: float) -> float:
 
 def settling(frequencies: Sequence[float], q: float) -> float:
     """Return the settling time of notches to 5 % [s]."""
-    # Their free motion decays by exp(-omega t / (2 q)), by 1/20 in three time constants.
+    # Their free response decays by exp(-omega t / (2 q)): to 1/20 in three time constants.
     return 3.0 * q / (np.pi * min(frequencies))
 
 
 def slow_step(x: np.ndarray) -> int:
-    """Return the usual step, in steps of the grid, between samples (N,) of a sensor that is
-    slower than the grid; 1 if it is not slower."""
+    """Return the usual step between samples (N,) of a sensor slower than the grid [grid steps].
+
+    It is 1 if the sensor is not slower.
+    """
     steps = np.diff(np.flatnonzero(np.isfinite(x)))
     return round(float(np.median(steps))) if steps.size else 1
 
 
 def notched_slow(x: np.ndarray, dt: float, frequencies: Sequence[float], q: float) -> np.ndarray:
-    """As `notched`, of a sensor that is slower than the grid: by its own samples, and without the
-    frequencies that it has no more; they are folded, and stay where they are.
+    """Apply notches to a sensor that is slower than the grid, at its own samples.
+
+    Frequencies above its Nyquist frequency are left out: they are folded and remain.
     """
     step = slow_step(x)
     own = [hz for hz in frequencies if hz < 0.5 / (step * dt)]
@@ -136,28 +141,29 @@ def notched_slow(x: np.ndarray, dt: float, frequencies: Sequence[float], q: floa
 
 
 def notched(x: np.ndarray, dt: float, frequencies: Sequence[float], q: float) -> np.ndarray:
-    """A record (N,) without some frequencies: a causal notch for each, settled at the first sample.
+    """Remove frequencies from a record (N,) by causal notches that are settled at the first sample.
 
-    Behind missing samples the notches begin anew, and what they give until they have settled is
-    missing as well.
+    After missing samples the notches start again, and their output is missing until they have
+    settled.
 
     Args:
         x: samples (N,), NaN where one is missing.
-        dt: time between them [s].
+        dt: time between samples [s].
         frequencies: centres of the notches [Hz], below half the rate.
+        q: quality factor of the notches.
     """
     from scipy.signal import iirnotch, lfilter, lfilter_zi
 
     x = np.array(x)
     coefficients = [iirnotch(hz, q, 1.0 / dt) for hz in frequencies]
     unsettled = int(np.ceil(settling(frequencies, q) / dt))
-    # Where samples begin and end to be there: pairs of first and last + 1.
+    # Stretches of present samples: pairs of first and last + 1.
     edges = np.flatnonzero(np.diff(np.concatenate([[False], np.isfinite(x), [False]])))
     for first, last in edges.reshape(-1, 2):
         for b, a in coefficients:
             part = x[first:last]
             x[first:last] = lfilter(b, a, part, zi=lfilter_zi(b, a) * part[0])[0]
-        # At the record's beginning inputs and outputs begin alike.
+        # At the record's beginning inputs and outputs have the same filter state.
         if first:
             x[first : min(first + unsettled, last)] = np.nan
     return x

@@ -8,7 +8,7 @@ import numpy as np
 
 
 def write_table(target: Path | IO[bytes], columns: Mapping[str, Any]) -> None:
-    """Write columns of equal length as CSV, or as Parquet where the name ends so.
+    """Write columns of equal length as CSV, or as Parquet if the name ends so.
 
     A column is an array (N,) or a list of text; None in a list is an empty cell.
     """
@@ -22,14 +22,14 @@ def write_table(target: Path | IO[bytes], columns: Mapping[str, Any]) -> None:
         return
     import pyarrow.csv
 
-    # pyarrow writes numbers with as many digits as give the same float64 back.
+    # pyarrow writes enough digits to restore the same float64.
     pyarrow.csv.write_csv(
         table, target if isinstance(target, Path) else pa.PythonFile(target, mode="w")
     )
 
 
 def stacked(parts: list[dict[str, Any]], names: list[str]) -> dict[str, Any]:
-    """Tables one below the other; a column that a part lacks is empty there.
+    """Stack tables vertically; a column that a part lacks is empty there.
 
     `names` are the columns of the result, in order.
     """

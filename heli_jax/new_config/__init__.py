@@ -1,4 +1,4 @@
-"""`heli-jax new LOG`: a configuration that begins with what a log holds, its guesses marked."""
+"""`heli-jax new LOG`: a configuration made from a log, with its guesses marked."""
 
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -35,7 +35,7 @@ _GRAVITY = ("g", "gravity", "g0")
 
 
 class Written(NamedTuple):
-    """The files, the configuration first, and what the user has to know."""
+    """Written files, the configuration first, and notes for the user."""
 
     paths: tuple[Path, ...]
     notes: tuple[Finding, ...]
@@ -49,17 +49,19 @@ def write_config(
     flight: int | None = None,
     time_rate: float | None = None,
 ) -> Written:
-    """Write a configuration, and for models of a vehicle's geometry a vehicle file to fill in.
+    """Write a configuration and, for models of a vehicle's geometry, a vehicle file to fill in.
 
     Args:
-        out: the configuration's place; what stands there is not replaced.
-        model: as a configuration names it, a linear one by its file's name too; chosen by what
-            moves unless given.
-        flight: of a log that holds several, from 1.
+        log: path of the log.
+        out: path of the configuration; an existing file is not replaced.
+        model: name as in a configuration, or the file name of a linear model; by default chosen
+            from the signals that move.
+        vehicle: path of an existing vehicle file.
+        flight: number of the flight in a log that holds several, from 1.
         time_rate: samples a second [Hz] of a table without times.
 
     Raises:
-        InputError: the log cannot be read, holds nothing of the model, or a file is in the way.
+        InputError: the log cannot be read, holds nothing of the model, or a file exists already.
     """
     if out.exists():
         raise InputError(f"{out}: is there already; expected another place, --out FILE")
@@ -71,7 +73,7 @@ def write_config(
     known = {} if signals is None else signals.known
     paths, constants, place = _vehicle(chosen, out, vehicle, known)
     if paths and signals is not None:
-        # The vehicle file has them.
+        # The vehicle file has these constants.
         signals = signals._replace(known={})
     others = () if model is not None else other_models(chosen.name)
     free = _free(chosen, constants, paths)
@@ -144,8 +146,7 @@ def _outputs(
     log: Log,
     signals: text.Signals | None,
 ) -> Sequence[str]:
-    """The log's channels that the configuration takes for outputs, `asked` of the preset, all
-    unless given; for inputs where it takes none."""
+    """Return the log's channels for outputs (`asked` or all of the preset), else for inputs."""
     if signals is not None:
         taken = signals.outputs or signals.inputs
         return [g.channel for g in taken.values() if g is not None]
@@ -156,14 +157,16 @@ def _outputs(
 
 
 def _seen(channel: Series) -> Series:
-    """The channel without missing samples."""
+    """Return the channel without missing samples."""
     seen = np.isfinite(channel.values)
     return channel._replace(times=channel.times[seen], values=channel.values[seen])
 
 
 def _late(series: Mapping[str, Series], signals: text.Signals | None) -> tuple[str, bool]:
-    """Return, in words, the input that an output precedes (empty if none), and whether feedback is
-    excluded as the cause."""
+    """Return a description of the input that an output precedes, and True if feedback is excluded.
+
+    The description is empty if there is no such input.
+    """
     none = "", False
     if signals is None:
         return none
@@ -194,25 +197,29 @@ def _late(series: Mapping[str, Series], signals: text.Signals | None) -> tuple[s
 
 
 def _rate(log: Log, outputs: Sequence[str]) -> float | None:
-    """The grid's rate [Hz]: of topics with clocks of their own, or of a table whose rows are not
-    the outputs' own; None where the rows themselves are the grid."""
-    # By the outputs: a stick that was logged more slowly is held or interpolated on any grid, and
-    # one that were to follow it would throw samples of the outputs away.
+    """Return the grid's rate [Hz]; None if the rows themselves are the grid.
+
+    It is needed for topics with separate clocks, and for a table whose rows are not the outputs'
+    own.
+    """
+    # From the outputs only: a slow stick can be held or interpolated on any grid, but a grid at its
+    # rate would discard samples of the outputs.
     if log.time is None:
         return common_rate(log.series, outputs)
     return rate_of_outputs(log.series, outputs)
 
 
 def _relative(log: Path, out: Path) -> str:
-    """The log as a configuration in `out` names it."""
-    # Logs beside or below the configuration move with it.
+    """Return the log's path as in a configuration at `out`."""
+    # Relative if the log is beside or below the configuration, so that both can move together.
     folder, path = out.absolute().parent.resolve(), log.absolute().resolve()
     return str(path.relative_to(folder) if path.is_relative_to(folder) else path)
 
 
 def _near(vehicle: Path, out: Path) -> str:
-    """The vehicle file as a configuration in `out` names it."""
-    # Vehicle files often lie in a folder beside that of the configurations: the two move together.
+    """Return the vehicle file's path as in a configuration at `out`."""
+    # Relative too if the vehicle's folder is beside that of the configurations, so that both can
+    # move together.
     folder, path = out.absolute().parent.resolve(), vehicle.absolute().resolve()
     beside = folder.parent != Path(folder.anchor) and path.is_relative_to(folder.parent)
     together = beside or path.is_relative_to(folder)
@@ -225,7 +232,7 @@ def _vehicle(
     vehicle: str | None,
     known: Mapping[str, tuple[str, float]],
 ) -> tuple[dict[Path, str], Mapping[str, float], str | None]:
-    """Further files, the constants that are known, and the vehicle's place in the configuration."""
+    """Return further files, the known constants, and the vehicle's path in the configuration."""
     if chosen.linear and vehicle is None:
         return {}, {}, None
     if vehicle is not None:
@@ -241,8 +248,7 @@ def _vehicle(
 def _free(
     chosen: text.Chosen, constants: Mapping[str, float], written: Mapping[Path, str]
 ) -> dict[str, float | str | None]:
-    """Return the free parameters and their starts; None at the value of the vehicle file that is
-    written."""
+    """Return the free parameters and their starts; None for the value in the new vehicle file."""
     listed = tables.models()
     known = naming.names(chosen.model.Params)
     if not chosen.linear:
@@ -252,13 +258,15 @@ def _free(
     file = chosen.name["linear"]
     own = linear_models.linear_model(file).vehicle().constants
     values = {n: c.value for n, c in own.items()} | dict(constants)
-    # Gravity is known, whatever a model's file calls free.
+    # Gravity is known, even if a model's file lists it as free.
     return {n: values.get(n, EDIT) for n in listed.get(file, known) if n not in _GRAVITY}
 
 
 def _held(chosen: text.Chosen, free: Mapping[str, Any]) -> dict[str, float]:
-    """The parameters of a linear model that stay at another vehicle's values, but for those of what
-    is left out, which are zero."""
+    """Return a linear model's parameters that keep another vehicle's values.
+
+    Parameters of omitted effects are zero and not included.
+    """
     if not chosen.linear:
         return {}
     assert isinstance(chosen.name, dict)
@@ -268,13 +276,13 @@ def _held(chosen: text.Chosen, free: Mapping[str, Any]) -> dict[str, float]:
 
 
 _MOST = 4
-"""columns that are named"""
+"""Most columns named."""
 
 
 def _unread_notes(
     lacking: Collection[str], called: Mapping[str, Sequence[str]], unread: Mapping[str, str]
 ) -> list[Finding]:
-    """Notes on signals that were not found, where a column that cannot be read is called so."""
+    """Return notes on unreadable columns whose names match a missing signal."""
     columns: dict[str, str] = {}
     for signal in lacking:
         for name in guess.by_name(called[signal], list(unread))[:1]:

@@ -1,4 +1,4 @@
-"""Guesses of which channel of a log is which signal and in which unit, each with its reason."""
+"""Guesses of the signal and the unit of each channel, with reasons."""
 
 import re
 import unicodedata
@@ -13,17 +13,17 @@ from heli_jax.new_config.name_units import FILLERS, without_unit
 
 _UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue"})
 _NUMBERED = re.compile(r"(?<=[a-z])(?=[0-9])")
-"""between a word and its number: chan1"""
+"""Boundary between a word and its number: chan1."""
 _STICK_COMMANDS = {"cmd", "command", "commanded"}
 _COMMANDS = _STICK_COMMANDS | {
     *("des", "desired", "sp", "setpoint", "ref", "target", "err", "error"),
 }
-# Words of what is neither a rate, an angle nor a speed, whatever stands behind them: Batt_v.
+# Words of channels that are no rate, angle or speed, whatever follows: Batt_v.
 _OTHER = {
     *("batt", "battery", "bat", "volt", "voltage", "power", "temp"),
     *("temperature", "rssi", "motor", "esc", "servo", "pid", "gain", "quat", "var", "noise"),
 }
-# gyro_roll is no roll, accel_x no speed.
+# gyro_roll is no roll angle, accel_x no speed.
 _CHANGES = {
     *("gyro", "gyr", "rate", "rates", "vel", "acc", "accel", "acceleration"),
     *("vitesse", "taux"),
@@ -35,13 +35,13 @@ _EXCITATIONS = {
 _AXES = {"r": "roll", "p": "pitch", "y": "yaw"}
 _SETPOINTS = {letter + word for letter in _AXES for word in ("des", "out", "tar")}
 _LAGS = 0.5
-"""s by which an output may follow an input"""
+"""Longest delay of an output after an input [s]."""
 _RELATED = 0.4
-"""correlation from which on two signals are taken to have to do with each other"""
+"""Smallest correlation of related signals."""
 
 
 class Series(NamedTuple):
-    """One channel: times and values (N,), and the unit that the log states, empty without one."""
+    """One channel: times and values (N,), and the unit that the log states, or empty."""
 
     times: np.ndarray
     values: np.ndarray
@@ -53,10 +53,10 @@ class Guess(NamedTuple):
 
     Attributes:
         channel: its name in the log.
-        unit: of the scaled numbers.
-        scale: of the log's numbers; `EDIT` where nobody but the user knows it.
-        offset: in the log's own numbers.
-        remarks: what was guessed, in words for a comment.
+        unit: unit of the scaled numbers.
+        scale: factor of the log's numbers; `EDIT` if only the user knows it.
+        offset: offset in the log's own numbers.
+        remarks: guesses, in words for a comment.
     """
 
     channel: str
@@ -67,14 +67,14 @@ class Guess(NamedTuple):
 
 
 def words_of(name: str) -> tuple[str, ...]:
-    """The words of a channel's name in lower case, without its unit.
+    """Return the words of a channel's name in lower case, without its unit.
 
     Args:
         name: such as `gyro.x`, `rollRate_deg/s`, `Roll (deg)`.
     """
     stem = without_unit(name)[0]
     stem = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", stem).translate(_UMLAUTS)
-    # Other accents are left out: of Régime an r would remain, which is a yaw rate's name.
+    # Other accents are removed; otherwise Régime would leave an r, the name of a yaw rate.
     stem = unicodedata.normalize("NFKD", stem)
     stem = "".join(c for c in stem if not unicodedata.combining(c))
     return tuple(w for w in re.split(r"[^a-z0-9]+", stem.lower()) if w)
@@ -83,17 +83,19 @@ def words_of(name: str) -> tuple[str, ...]:
 def by_name(
     called: Sequence[str], names: Sequence[str], commanded: Sequence[str] = ()
 ) -> list[str]:
-    """The channels that may be a signal, the likeliest first.
+    """Return the channels that may be a signal, the likeliest first.
 
     Args:
-        commanded: what else a command of it may name, as `roll` in roll_cmd.
+        called: usual names of the signal.
+        names: names of the channels.
+        commanded: further names of its command, such as `roll` in roll_cmd.
     """
     forms = [tuple(c.split()) for c in called]
     commands = {*forms, *(tuple(c.split()) for c in commanded)} if commanded else set()
     scored = []
     for place, name in enumerate(names):
         words = words_of(name)
-        # Behind the sticks themselves: what a stick commands may have passed through a controller.
+        # Ranked after the sticks: a command may have passed through a controller.
         if commands and _STICK_COMMANDS & set(words):
             left = tuple(w for w in words if w not in _STICK_COMMANDS | FILLERS)
             if left in commands:
@@ -101,11 +103,11 @@ def by_name(
             continue
         if not words or _COMMANDS & set(words):
             continue
-        # The whole name, before a name that ends so, as of a path: log.roll; and either before
-        # those with words behind them that change nothing: ch1_aileron_us.
+        # First the full name, then a name that ends so, such as the path log.roll. Names with
+        # neutral words after them come last: ch1_aileron_us.
         core = _without_fillers(words)
         if words in forms:
-            # P beside p: of letters that differ in size alone the one as the model has it.
+            # P and p: of letters that differ only in case, the model's own is first.
             place = -1 if name in called else place
             scored.append((0, forms.index(words), place, name))
         elif any(len(f) < len(words) and words[-len(f) :] == f for f in forms):
@@ -116,8 +118,10 @@ def by_name(
 
 
 def spelled_out(names: Sequence[str]) -> dict[str, str]:
-    """Names of rates that have a letter for their axis, with the axis in words: ArduPilot's RATE.R,
-    RATE.P and RATE.Y are of roll, pitch and yaw, where rate_p, rate_q and rate_r are p, q and r.
+    """Spell out the axis in names of rates that have a letter for it.
+
+    ArduPilot's RATE.R, RATE.P and RATE.Y are roll, pitch and yaw, but rate_p, rate_q and rate_r are
+    p, q and r.
     """
     groups: dict[tuple[str, ...], dict[str, str]] = {}
     for name in names:
@@ -126,8 +130,7 @@ def spelled_out(names: Sequence[str]) -> dict[str, str]:
             groups.setdefault(tuple(path), {})[last] = name
     spelled = {}
     for group in groups.values():
-        # Which of the two it is shows by the letter that the other has not, or by what
-        # stands beside: RDes.
+        # The two are distinguished by the letter that only one has, or by a neighbour: RDes.
         if "q" not in group and ("y" in group or _SETPOINTS & set(group)):
             spelled |= {
                 group[letter]: f"{group[letter]} {axis} rate"
@@ -138,18 +141,18 @@ def spelled_out(names: Sequence[str]) -> dict[str, str]:
 
 
 def by_number(called: Sequence[str], names: Sequence[str]) -> list[str]:
-    """The channels that a number alone gives away, as `chan1_raw` and `servoRaw.servo1`."""
+    """Return the channels identified by a number, such as `chan1_raw` and `servoRaw.servo1`."""
     forms = {tuple(c.split()) for c in called}
     return [n for n in names if _numbered(n) in forms]
 
 
 def _numbered(name: str) -> tuple[str, ...]:
-    """The last word of a name that is followed by a number, and the number: of rcin_1, rcin1."""
+    """Return the last word of a name before a number, and the number: of rcin_1, rcin1."""
     words = [part for word in words_of(name) for part in _NUMBERED.split(word)]
     words = list(_without_fillers(tuple(words)))
     if len(words) < 2 or not words[-1].isdigit():
         return ()
-    # Of an array's columns the first is number 0.
+    # The first column of an array has number 0.
     return words[-2], str(int(words[-1]) + name.endswith("]"))
 
 
@@ -159,7 +162,7 @@ def _without_fillers(words: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def of_known_unit(names: Sequence[str], log: Mapping[str, Series], si: str) -> str:
-    """The first channel, or one of the same words whose unit is stated: rc_aileron(percent)."""
+    """Return the first channel, or one with the same words and a known unit."""
     words = words_of(names[0])
     alike = [n for n in names if words_of(n) == words]
     known = (n for n in alike if units.fits(log[n].unit or without_unit(n)[1] or "none", si))
@@ -167,12 +170,12 @@ def of_known_unit(names: Sequence[str], log: Mapping[str, Series], si: str) -> s
 
 
 def is_excitation(name: str) -> bool:
-    """True if a channel's name says that it is an excitation that an autopilot added to a stick."""
+    """True if a channel's name means an excitation that an autopilot added to a stick."""
     return bool(_EXCITATIONS & set(words_of(name)))
 
 
 def excitations(called: Sequence[str], names: Sequence[str]) -> list[str]:
-    """The logged excitations of an input, by their names."""
+    """Return the logged excitations of an input, by their names."""
     forms = {tuple(c.split()) for c in called}
     return [
         name
@@ -185,7 +188,7 @@ def excitations(called: Sequence[str], names: Sequence[str]) -> list[str]:
 def may_be(name: str, series: Series, called: Sequence[str], si: str) -> bool:
     """True if a channel's name and unit allow an output of the model."""
     unit = series.unit or without_unit(name)[1]
-    # A model that states no unit takes any.
+    # A model without a unit accepts any.
     if unit and si != "1" and not units.fits(unit, si):
         return False
     words, own = set(words_of(name)), {w for c in called for w in c.split()}
@@ -198,7 +201,7 @@ def may_move(name: str, series: Series, si: str) -> bool:
 
 
 def by_motion(output: Series, channels: Mapping[str, Series]) -> tuple[str, float] | None:
-    """The channel that an output follows, with the correlation; None where it follows none."""
+    """Return the channel that an output follows, with the correlation; None if there is none."""
     best: tuple[str, float] | None = None
     for name, series in channels.items():
         related = _largest_correlation(series, output)
@@ -208,7 +211,7 @@ def by_motion(output: Series, channels: Mapping[str, Series]) -> tuple[str, floa
 
 
 def _largest_correlation(first: Series, second: Series) -> float:
-    """Over the lags by which the second may follow the first."""
+    """Return the largest correlation over the lags by which the second may follow the first."""
     begin = max(first.times[0], second.times[0])
     end = min(first.times[-1], second.times[-1])
     step = float(np.median(np.diff(second.times)))
@@ -232,10 +235,10 @@ def _finite(series: Series) -> tuple[np.ndarray, np.ndarray]:
 
 
 def full_travel(sticks: Mapping[str, Series]) -> float | None:
-    """Return the count of a log's sticks at their stops, if one of them was there; else None."""
+    """Return the count of a log's sticks at their stops, if one reached it; else None."""
     for series in sticks.values():
         values = series.values[np.isfinite(series.values)]
-        # Radios of the EdgeTX family count to 1024, in whole numbers.
+        # EdgeTX radios count to 1024, in integers.
         if values.size and np.max(np.abs(values)) == 1024.0 and are_whole(values):
             return 1024.0
     return None

@@ -1,4 +1,4 @@
-"""A log as `heli-jax new` looks at it, whatever its format."""
+"""View of a log for `heli-jax new`, independent of its format."""
 
 import dataclasses
 import math
@@ -26,42 +26,43 @@ from heli_jax.flights.open_log import chosen_flights, open_flights
 from heli_jax.new_config.guess import Series
 
 _ASSUMED = 100.0
-"""Hz, of rows of which nothing tells how fast they were sampled"""
+"""Assumed rate of rows without any information on their rate [Hz]."""
 _FEWEST = 8
-"""samples of a signal"""
+"""Fewest samples of a signal."""
 
 
 class Log(NamedTuple):
-    """A flight as `new` looks at it."""
+    """A flight for `new`."""
 
     path: str
     format: str
     series: Mapping[str, Series]
     time: Any
-    """`TimeInfo` of a table; None where topics have clocks of their own"""
+    """`TimeInfo` of a table; None if topics have separate clocks."""
     flight: int | None
     several: bool
     notes: Sequence[Finding] = ()
-    """what of the log is not looked at"""
+    """Notes on the parts of the log that are left out."""
     unread: Mapping[str, str] = MappingProxyType({})
-    """columns of a table that cannot be asked for, and why, in words"""
+    """Reasons by column of a table why it cannot be read."""
     autopilot: ChannelLog | None = None
-    """the log itself, with the firmware's settings, where topics have clocks of their own"""
+    """The log itself with the firmware's settings, if topics have separate clocks."""
 
 
 def read_log(path: Path, number: int | None, rate: float | None = None) -> Log:
-    """The channels of a log that hold samples.
+    """Read the channels of a log that hold samples.
 
     Args:
-        number: of the flight, of a log that holds several, from 1.
+        path: path of the log.
+        number: number of the flight in a log that holds several, from 1.
         rate: samples a second [Hz] of a table without times.
 
     Raises:
-        InputError: it cannot be read, or its times are none.
+        InputError: it cannot be read, or its times are invalid.
     """
     opened = chosen_flights(path, open_flights(path), number)
     if not isinstance(opened, tuple):
-        # Arrays may have clocks of their own, by where they stand in the file.
+        # Arrays may have separate clocks, by their place in the file.
         grouped = None
         if isinstance(opened, ArrayTable) and rate is None:
             grouped = by_clocks(opened)
@@ -102,7 +103,7 @@ def _read_table(table: Table, rate: float | None) -> Log:
     time = info.time
     if time is None:
         _require_whole_clock(table, info)
-        # How many samples a second has only the user knows; a guess needs no more than their order.
+        # Only the user knows the number of samples a second; a guess needs only their order.
         time = describe_table(table, None, None, _ASSUMED).time
         assert time is not None
         time = dataclasses.replace(time, counted=math.nan)
@@ -110,15 +111,15 @@ def _read_table(table: Table, rate: float | None) -> Log:
         notes = (note("clock.not-found", words),)
     if time.problem:
         if time.column in table.names:
-            # With its line, and what to do.
+            # This error names the line and the remedy.
             require_increasing(table, time.column, table.numbers([time.column])[time.column])
         problem = "expected a column of increasing times, got none"
         raise wrong(table.path, f"{problem}: {time.problem}")
     clock = time.column
     names = [c.name for c in info.columns if c.kind == "number"]
-    # Of two columns of one name neither can be asked for.
+    # Of two columns with the same name, neither can be selected.
     names = [n for n in names if table.names.count(n) == 1]
-    # Of arrays those that are as long as the clock.
+    # Only arrays with the length of the clock.
     rows = {ROWS: info.n_rows} | {c.name: c.rows for c in info.columns}
     others = [n for n in names if rows[n] != rows[clock]]
     names = [n for n in names if n not in others]
@@ -141,8 +142,10 @@ def _read_table(table: Table, rate: float | None) -> Log:
 
 
 def _require_whole_clock(table: Table, info: LogInfo) -> None:
-    """Refuse a column that is called time and has a few cells of text, such as means and sums below
-    the samples: as rows of a stated rate they would be read as samples."""
+    """Refuse a column of times with a few cells of text, such as means below the samples.
+
+    With a stated rate such rows would be read as samples.
+    """
     for c in info.columns:
         if c.strays and is_called_time(c.name):
             problem = f"column {shown(c.name)}: {c.strays}; expected times: delete such rows"
@@ -150,7 +153,7 @@ def _require_whole_clock(table: Table, info: LogInfo) -> None:
 
 
 def _unread(table: Table, info: LogInfo) -> dict[str, str]:
-    """The columns that hold no numbers, or are there twice, and which it is, in words."""
+    """Return the columns without numbers or with a repeated name, with the reason."""
     reasons = {}
     for c in info.columns:
         if table.names.count(c.name) > 1:
@@ -162,8 +165,10 @@ def _unread(table: Table, info: LogInfo) -> dict[str, str]:
 
 
 def _from_first(stamps: np.ndarray, duration: float) -> np.ndarray:
-    """Stamps (N,) in seconds from the first, which is all that a guess needs of their unit; evenly
-    spread over the duration [s] where they are no clock yet."""
+    """Return stamps (N,) in seconds from the first, evenly spread over `duration` [s] if invalid.
+
+    A guess needs no more of their unit.
+    """
     with np.errstate(over="ignore", invalid="ignore"):
         elapsed = stamps - stamps[0]
         rises = elapsed.size > 1 and bool(np.all(np.diff(elapsed) > 0))
@@ -173,7 +178,7 @@ def _from_first(stamps: np.ndarray, duration: float) -> np.ndarray:
 
 
 def _without_time(info: LogInfo) -> str:
-    """Reason why none of a table's columns is a time."""
+    """Return why none of a table's columns is a time."""
     strays = next((f"; {shown(c.name)}: {c.strays}" for c in info.columns if c.strays), "")
     return f"no column is a time{strays}"
 

@@ -1,4 +1,4 @@
-"""The model that a log is fitted with: the one that is named, or that of the axis that moves."""
+"""Choice of the model for a log: the stated one, or that of the axis that moves."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,36 +20,39 @@ _AXES = {
     "yaw": ("yaw", ("yaw_rate",)),
     "collective": ("heave", ("down_speed",)),
 }
-"""by stick the linear model of its axis, and what has to be logged for it"""
+"""Linear model of the axis by stick, and the signals that must be logged for it."""
 _UNITS = {"roll": "rad", "pitch": "rad", "down_speed": "m/s"} | dict.fromkeys(
     ("roll_rate", "pitch_rate", "yaw_rate"), "rad/s"
 )
 _SHIPS = ("ArduPlane", "ArduRover", "Rover", "Blimp", "ArduSub", "APM:Plane", "APM:Rover")
-"""what firmware of ArduPilot for other vehicles calls itself"""
+"""Names of ArduPilot firmware for other vehicles."""
 _HELICOPTERS = (6, 11, 13)
-"""ArduPilot's FRAME_CLASS: with one rotor, two, and four of variable pitch"""
+"""ArduPilot's FRAME_CLASS of helicopters: one rotor, two, and four with variable pitch."""
 _MAV_TYPES = {1: "a fixed-wing aircraft", 2: "a quadrotor", 7: "an airship", 10: "a rover"}
 _MAV_TYPES |= {11: "a boat", 13: "a hexarotor", 14: "an octorotor", 15: "a tricopter"}
 _MAV_TYPES |= dict.fromkeys(range(19, 26), "a VTOL aircraft")
-"""MAVLink's MAV_TYPE, but for helicopters (3, 4) and what is not known"""
+"""MAVLink's MAV_TYPE, without helicopters (3, 4) and unknown types."""
 _AIRFRAMES = ("a multirotor", "a fixed-wing aircraft", *["a VTOL aircraft"] * 3, *["a rover"] * 2)
 _AIRFRAMES += ("a multirotor", "an airship")
-"""PX4's CA_AIRFRAME from 0 to 8; helicopters have 10 to 12"""
+"""PX4's CA_AIRFRAME from 0 to 8; helicopters have 10 to 12."""
 _TYPES = {2: "a fixed-wing aircraft", 3: "a rover", 4: "an airship"}
-"""PX4's vehicle_status.vehicle_type"""
+"""PX4's vehicle_status.vehicle_type."""
 _OF_ROTORS = ("Betaflight", "Cleanflight", "INAV", "EmuFlight")
-"""firmware of multirotors, which writes the command of each motor"""
+"""Firmware of multirotors, which logs the command of each motor."""
 _FULL_TRAVEL = 1.5
-"""of a stick in parts of it, which radios let exceed 1"""
+"""Largest value of a stick in parts of full travel; radios may exceed 1."""
 
 
 def chosen_model(
     name: str | None, log: Log, path: str, folder: Path
 ) -> tuple[Any, str | dict[str, str], bool]:
-    """The model, what a configuration calls it, and whether it is linear from a file.
+    """Return the model, its name in a configuration, and True if it is linear from a file.
 
     Args:
-        name: as stated; chosen by what moves unless given.
+        name: as stated; by default chosen from the signals that move.
+        log: the log.
+        path: path of the log, for messages.
+        folder: folder of the configuration.
     """
     if name is None:
         vehicle = other_vehicle(log.autopilot)
@@ -58,7 +61,7 @@ def chosen_model(
             remedy = "expected --model NAME; heli-jax new-model makes one of your own"
             raise wrong(path, f"{problem} helicopters; {remedy}")
         name = _by_what_moves(log, path)
-    # Of roll and pitch there are the paper's model and a linear one: the latter by {linear: roll}.
+    # For roll and pitch there are the paper's model and a linear one: {linear: roll} is the latter.
     stated = name.strip().removeprefix("{").removesuffix("}")
     linear = stated.startswith("linear:")
     stated = stated.removeprefix("linear:").strip()
@@ -69,11 +72,12 @@ def chosen_model(
 
 
 def other_vehicle(log: ChannelLog | None) -> str:
-    """Return the vehicle type that an autopilot's log states, and where; empty for a helicopter or
-    an unknown type.
+    """Return the vehicle type that an autopilot's log states, with the setting.
+
+    It is empty for a helicopter or an unknown type.
 
     Args:
-        log: of an autopilot; None of a table.
+        log: log of an autopilot; None for a table.
     """
     if log is None:
         return ""
@@ -109,14 +113,14 @@ def _of_ardupilot(has: Mapping[str, str | int | float], firmware: str) -> str:
         return ""
     if frame:
         return f"a multirotor (FRAME_CLASS {frame:g})"
-    # Before it had classes a frame was told by what there is to set.
+    # Old versions have no frame class; the frame follows from the available settings.
     if has and firmware.startswith("Ardu") and not any(n.startswith("H_") for n in has):
         return f"a multirotor ({firmware}, without parameters of a helicopter's swashplate)"
     return ""
 
 
 def _by_what_moves(log: Log, path: str) -> str:
-    """The linear model of the axis whose stick moves most, of those whose motion is logged."""
+    """Return the linear model of the axis whose stick moves most and whose motion is logged."""
     called = tables.names()
     names = tuple(n for n in log.series if not is_place(n, log.series))
     moving = {}
@@ -137,13 +141,13 @@ def _by_what_moves(log: Log, path: str) -> str:
         remedy = "expected --model and then the signals by hand"
         raise wrong(path, f"{problem} that moves, {remedy}; it holds {listed}")
     most = {model: float(np.nanmax(np.abs(values))) for model, values in moving.items()}
-    # Parts of full travel are compared as they are; of other numbers nobody knows full travel.
+    # Fractions of full travel are compared directly; the full travel of other numbers is unknown.
     alike = max(most.values()) <= _FULL_TRAVEL
     size = {m: np.nanstd(values) / (1.0 if alike else most[m]) for m, values in moving.items()}
     return max(size, key=lambda model: size[model])
 
 
 def other_models(name: str | dict[str, str]) -> tuple[tuple[str, str], ...]:
-    """Other models of the axis of a linear one, with what each is for."""
+    """Return other models of the axis of a linear one, with their purposes."""
     assert isinstance(name, dict)
     return tuple(tables.models()["also"].get(name["linear"], {}).items())

@@ -1,4 +1,4 @@
-"""The unit at the end of a channel's name, as people and autopilots write it."""
+"""Unit at the end of a channel's name, in usual spellings."""
 
 import re
 
@@ -14,19 +14,19 @@ _UNIT_WORDS = {
     "m/s": "m/s", "cm": "cm", "mm": "mm", "kt": "kt", "kn": "kt", "kts": "kt", "knot": "kt",
     "knots": "kt", "fps": "ft/s", "ft/s": "ft/s", "kmh": "km/h", "km/h": "km/h", "volt": "V",
     "volts": "V", "amp": "A", "amps": "A", "degc": "degC", "hz": "Hz",
-    # As autopilots have them: hundredths of degrees, thousandths of radians, centimetres.
+    # Autopilots use hundredths of degrees, thousandths of radians, and centimetres.
     "cdeg": "cdeg", "cd": "cdeg", "centideg": "cdeg", "cdegs": "cdeg/s", "cds": "cdeg/s",
     "cdeg/s": "cdeg/s", "mrads": "mrad/s", "mradps": "mrad/s", "mrad/s": "mrad/s", "cms": "cm/s",
     "cm/s": "cm/s", "mms": "mm/s", "mm/s": "mm/s",
 }  # fmt: skip
-# Where a name has no mark between the unit and what is before it: rollDeg.
+# For names without a separator before the unit: rollDeg.
 _JOINED_UNIT = re.compile(
     r"(.*[a-z0-9XYZ])(Deg|Rad|Dps|Degs|Rads|Radps|Rpm|Mps|Pct|Percent)((?:_?[A-Z]?[a-z]+)?)"
 )
-# As people write them: a small v or a is a speed or an acceleration.
+# Only capitals: a small v or a is a speed or an acceleration.
 _LETTERS = ("V", "A", "%")
 _BRACKETS = re.compile(r"^(.*?)\s*[\[(]([^\[\]()]+)[\])]\s*$")
-# What may stand behind a name and change nothing; roll_rate is no roll.
+# Words after a name that do not change its meaning; roll_rate is no roll angle.
 FILLERS = {
     *("pwm", "us", "raw", "filt", "filtered", "meas", "measured", "value", "values", "data", "adc"),
     *("counts", "norm", "in", "input", "body", "imu", "est", "out1"),
@@ -34,11 +34,11 @@ FILLERS = {
 
 
 def without_unit(name: str) -> tuple[str, str]:
-    """A name without the unit at its end, and this unit, empty where there is none."""
+    """Return a name without the unit at its end, and the unit, or an empty string."""
     match = _BRACKETS.fullmatch(name)
     if match and (unit := _UNIT_WORDS.get(match[2].strip().lower())):
         return match[1], unit
-    # gyroADC[1] is one of several, and no plain number.
+    # gyroADC[1] is an index, not a unit.
     if match and not match[2].strip().isdigit() and units.is_unit(match[2].strip()):
         return match[1], match[2].strip()
     if (rate := rate_at_end(name)) is not None:
@@ -51,10 +51,10 @@ def without_unit(name: str) -> tuple[str, str]:
             if name.lower().endswith(mark + word):
                 return name[: -len(word) - 1], unit
     match = _JOINED_UNIT.fullmatch(name)
-    # rollDegFilt, but not rollDegree: what stands behind has to be a word by itself.
+    # rollDegFilt, but not rollDegree: the rest must be a word.
     if match and match[3].strip("_").lower() in {"", *FILLERS}:
         return match[1], _UNIT_WORDS[match[2].lower()]
-    # q_dps_meas: behind the unit a word that changes nothing.
+    # q_dps_meas: a neutral word follows the unit.
     stem, _, last = name.rpartition("_")
     if stem and last.lower() in FILLERS:
         before, unit = without_unit(stem)

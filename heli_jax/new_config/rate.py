@@ -1,4 +1,4 @@
-"""A rate at which the signals of a log can be brought onto one grid."""
+"""Common rate for the signals of a log."""
 
 from collections.abc import Collection, Mapping
 
@@ -10,13 +10,14 @@ from heli_jax.flights.resample import SLOWER, usual_step
 from heli_jax.new_config.guess import Series
 
 _FASTEST = 100.0
-"""[Hz] a small helicopter's attitude is over below 10 Hz: faster grids cost time alone"""
+"""Fastest grid [Hz]. A small helicopter's attitude dynamics are below 10 Hz, so faster grids only
+cost time."""
 _SLOW = 20.0
-"""[Hz] a channel below is taken as a slower one, at its own samples, where others are faster"""
+"""Rate [Hz] below which a channel is slow and keeps its own samples if others are faster."""
 
 
 def two_digits(rate: float) -> float:
-    """A rate of 99.98 Hz is one of 100.
+    """Round a rate to two digits, such as 99.98 Hz to 100 Hz.
 
     Args:
         rate: [Hz].
@@ -25,15 +26,16 @@ def two_digits(rate: float) -> float:
 
 
 def common_rate(series: Mapping[str, Series], outputs: Collection[str]) -> float | None:
-    """The slowest clock of the outputs that are used [Hz], 100 at most; None of none."""
+    """Return the slowest clock of the used outputs [Hz], at most 100; None without outputs."""
     rates = [1.0 / usual_step(series[n].times) for n in outputs if n in series]
     rates = [rate for rate in rates if rate >= _SLOW] or rates
     return two_digits(min(_FASTEST, *rates)) if rates else None
 
 
 def rate_of_outputs(series: Mapping[str, Series], outputs: Collection[str]) -> float | None:
-    """The rate [Hz] of the fastest output by its own samples, 100 at most, where a table's rows
-    come faster than that since they are those of several topics; else None.
+    """Return the rate [Hz] of the fastest output by its own samples, at most 100.
+
+    It is None unless a table's rows are faster because they belong to several topics.
     """
     rates, rows = [], 0.0
     for times, values, *_ in (series[n] for n in outputs if n in series):
@@ -45,10 +47,10 @@ def rate_of_outputs(series: Mapping[str, Series], outputs: Collection[str]) -> f
 
 
 def channels_of_preset(name: str, series: Collection[str], signals: Collection[str]) -> list[str]:
-    """The log's channels that a preset may take for signals of a model."""
+    """Return the log's channels that a preset may use for signals of a model."""
     inputs, outputs, table = model_inputs(), model_outputs(), preset(name).signals
     meant = [outputs.get(n, inputs[n].command if n in inputs else n) for n in signals]
-    # Of several channels the first that the log has is taken.
+    # Of several channels the first in the log is used.
     channels = []
     for signal in meant:
         for alternative in table.get(signal, ()):

@@ -1,4 +1,4 @@
-"""The unit and the scale of a channel's numbers: as stated, or guessed with the reason."""
+"""Unit and scale of a channel's numbers: as stated, or guessed with a reason."""
 
 import numpy as np
 
@@ -8,34 +8,37 @@ from heli_jax.new_config.name_units import without_unit
 from heli_jax.yaml_file import EDIT
 
 _PULSES = (700.0, 2300.0)
-"""us: what receivers and servos are sent"""
+"""Pulse widths of receivers and servos [us]."""
 _FULL_PULSE = 500.0
-"""us from the middle to the end"""
+"""Pulse width from the middle to the end [us]."""
 _MIDDLE, _TRIM = 1500.0, 150.0
-"""us: a stick's place at rest, and how far from it trims may move that"""
+"""Pulse width of a stick at rest, and largest shift by trims [us]."""
 _SBUS_REST, _SBUS_STOP = 992.0, 819.5
-"""counts of a receiver's serial bus at rest and from there to the end: 172 to 1811"""
+"""Counts of a receiver's serial bus at rest, and from there to the end: 172 to 1811."""
 _LONG = 0.2
-"""part of a record, for which nobody holds a stick away from where it rests"""
+"""Share of a record for which nobody holds a stick away from its rest position."""
 _ROTORS = {"rpm", "omega", "rotor", "headspeed", "head", "nr", "speed"}
 _FULL_COMMAND = 500.0
-"""at the stop of a stick, where firmware commands in steps of pulse widths around the middle"""
+"""Count at a stick's stop in firmware that commands in pulse widths around the middle."""
 _PARTS = 1.5
-"""above which a stick is not logged in parts of its travel"""
+"""Largest value of a stick logged in parts of its travel."""
 _FULL_TILT = np.pi / 4
-"""rad, beyond which no stick tilts a blade or a swashplate"""
+"""Largest tilt of a blade or a swashplate by a stick [rad]."""
 _FASTEST_TURN = 8.0
-"""rad/s, which a small helicopter hardly exceeds in a log for identification"""
+"""Fastest turn [rad/s] of a small helicopter in a log for identification."""
 
 
 def scaled(
     channel: str, series: Series, si: str, full: float | None = None, is_input: bool = False
 ) -> Guess:
-    """A channel with the unit and the scale that its name, the log or its numbers tell.
+    """Return a channel with unit and scale, from its name, the log or its numbers.
 
     Args:
-        full: what the log's sticks count to at their stops, where that is known.
-        is_input: whether it is a stick's or a servo's.
+        channel: name of the channel.
+        series: its samples.
+        si: SI unit of the model's signal.
+        full: count of the log's sticks at their stops, if known.
+        is_input: True for a stick or a servo.
     """
     values = series.values[np.isfinite(series.values)]
     low, high = float(np.min(values)), float(np.max(values))
@@ -51,9 +54,9 @@ def scaled(
     if _are_counts(channel, values, si):
         return _of_counts(channel, values, si)
     if si == "rad":
-        # A heading may count from 0 to a turn; a pitch angle ends at a quarter of it.
+        # A heading may count from 0 to a turn; a pitch angle ends at a quarter turn.
         most = np.pi / 2 if {"pitch", "theta"} & set(words_of(channel)) else 2 * np.pi
-        # Blades and swashplates are tilted by less than half a right angle.
+        # Blades and swashplates tilt by less than half a right angle.
         most = _FULL_TILT if is_input else most
         if is_input and max(-low, high) > np.degrees(_FULL_TILT):
             guess = f"GUESS: {low:.4g} to {high:.4g} is too large for a blade angle; scale: rad per"
@@ -61,9 +64,9 @@ def scaled(
             return Guess(channel, si, EDIT, remarks=(guess,))
         unit = "deg" if max(-low, high) > most else "rad"
     elif si == "rad/s":
-        # A rotor turns faster than a body: of its speed the unit is told by 4000 rpm.
+        # A rotor turns faster than a body; its speed in rpm is obvious at 4000.
         largest = max(-low, high)
-        # Whole numbers of rad/s nobody logs.
+        # Nobody logs whole numbers of rad/s.
         is_coarse = largest >= 2.0 and are_whole(values)
         unit = "deg/s" if largest > _FASTEST_TURN or is_coarse else "rad/s"
     elif si == "1" and stated:
@@ -81,8 +84,10 @@ def scaled(
 
 
 def _is_sbus(channel: str, values: np.ndarray) -> bool:
-    """True if whole numbers are counts of S.BUS: by the name, or by a centre and range that pulses
-    do not have."""
+    """True if whole numbers are counts of S.BUS.
+
+    The criterion is the name, or a centre and range that pulses do not have.
+    """
     low, high = float(np.min(values)), float(np.max(values))
     if not are_whole(values) or abs(low - high) <= 20 or not 0 <= low <= high < 2048:
         return False
@@ -93,8 +98,8 @@ def _is_sbus(channel: str, values: np.ndarray) -> bool:
 
 
 def _of_pulses(channel: str, values: np.ndarray, si: str) -> Guess:
-    # Most records begin with the stick at rest; where this one does not, receivers' middle. One
-    # that begins within a manoeuvre, stick held, does not come back to that place for long.
+    # Most records begin with the stick at rest; otherwise the receivers' middle is assumed. A
+    # record that begins within a manoeuvre does not return to that position for long.
     begin = values[: max(len(values) // 100, 5)]
     first, small = float(np.median(begin)), 0.02 * float(np.ptp(values))
     is_still = np.ptp(begin) < small
@@ -104,8 +109,10 @@ def _of_pulses(channel: str, values: np.ndarray, si: str) -> Guess:
 
 
 def _about(channel: str, si: str, words: tuple[str, str, str], rest: float, stop: float) -> Guess:
-    """Return the scale of numbers that rest at one and end `stop` from it; `words`: what they are,
-    their unit, and one of them."""
+    """Return the scale of numbers with a rest position and a travel of `stop`.
+
+    `words` are their description, their unit, and one of them.
+    """
     what, unit, one = words
     remark = f"GUESS: {what}, {rest:g}{unit} at rest"
     if si == "1":
@@ -118,7 +125,7 @@ def _are_counts(channel: str, values: np.ndarray, si: str) -> bool:
     low, high = float(np.min(values)), float(np.max(values))
     if not are_whole(values) or low < 0.1 * high or _ROTORS & set(words_of(channel)):
         return False
-    # A heading has 360 degrees; nothing turns by more than 100 deg/s all the time.
+    # A heading has 360 degrees; nothing turns faster than 100 deg/s all the time.
     return (si == "rad" and high > 2 * 360.0) or (si == "rad/s" and low > 100.0)
 
 
@@ -130,7 +137,7 @@ def _of_counts(channel: str, values: np.ndarray, si: str) -> Guess:
 
 def _of_stick(channel: str, low: float, high: float, full: float | None) -> Guess:
     largest = max(-low, high)
-    # What pilots command of Betaflight's family counts to 500, its collective to 1000 or so.
+    # Betaflight-type commands count to 500, their collective to about 1000.
     commanded = words_of(channel)[-3:-1] == ("rc", "command") and largest <= _FULL_COMMAND
     travel = _FULL_COMMAND if commanded else full
     if travel and _PARTS < largest <= travel:
@@ -146,7 +153,7 @@ def _of_stick(channel: str, low: float, high: float, full: float | None) -> Gues
 
 
 def rotor_speed(channel: str, series: Series) -> float:
-    """The mean speed of a rotor [rad/s], in rpm above what a rotor turns in rad/s."""
+    """Return the mean speed of a rotor [rad/s]; large numbers are taken as rpm."""
     mean = float(np.nanmean(series.values))
     unit = series.unit or without_unit(channel)[1]
     if unit and units.fits(unit, "rad/s"):

@@ -1,4 +1,4 @@
-"""Channels of a log that may be the inputs and outputs of a model."""
+"""Channels of a log for the inputs and outputs of a model."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,11 +15,11 @@ from heli_jax.new_config.logs import Log
 from heli_jax.numerics.white_noise import wanders, without_noise
 
 _STICKS_TOO = {"roll", "pitch", "yaw"}
-"""names of motions that sticks have as well"""
+"""Names of motions that sticks have as well."""
 
 
 def signals_of(model: Any, log: Log) -> text.Signals:
-    """Channels for inputs and outputs of the model, and which of the log's are left."""
+    """Return channels for inputs and outputs of the model, and the channels left over."""
     called, taken = tables.names(), []
     inputs: dict[str, Guess | None] = {}
     numbered: dict[str, list[str]] = {}
@@ -45,7 +45,8 @@ def signals_of(model: Any, log: Log) -> text.Signals:
         output = _found(log, outputs_called(log, names_of_output(name), unit), unit, taken)
         if output is not None:
             outputs[name] = output
-    # What an output follows is the better reason where one input makes it move.
+    # With several inputs, correlation with an output is the better criterion and comes before
+    # numbers.
     if len(inputs) > 1:
         _by_number(model, log, inputs, numbered, taken)
     _by_correlation(model, log, inputs, outputs, taken)
@@ -65,15 +66,17 @@ def signals_of(model: Any, log: Log) -> text.Signals:
 
 
 def only_turn(model: Any) -> dict[str, str]:
-    """By angle the rate, of a model whose outputs are one axis's rate and angle alone: there the
-    angle says nothing that the rate does not."""
+    """Return the rate by angle, for a model whose only outputs are one axis's rate and angle.
+
+    The angle then adds no information to the rate.
+    """
     pairs = {a.angle: a.rate for a in axes_of(model) if a.angle is not None}
     outputs = set(naming.names(model.Outputs))
     return {angle: rate for angle, rate in pairs.items() if {angle, rate} == outputs}
 
 
 def _wandering(model: Any, log: Log, outputs: Mapping[str, Guess]) -> dict[str, Guess]:
-    """Angles beside their rate whose error is that of an integrated rate, as an autopilot's."""
+    """Return angles with a drift error, as from a rate integrated by an autopilot."""
     return {
         angle: outputs[angle]
         for angle, rate in only_turn(model).items()
@@ -95,7 +98,7 @@ def names_of_input(name: str) -> list[str]:
 
 
 def _stick(name: str) -> str | None:
-    """The stick that moves an input of a model, as the table of names has it; None of others."""
+    """Return the stick of a model's input, as in the table of names; None for other inputs."""
     signal = model_inputs().get(name)
     if signal is None or name == "Omega":
         return None
@@ -108,8 +111,8 @@ def words_of(name: str) -> str:
 
 
 def outputs_called(log: Log, called: Sequence[str], si: str) -> list[str]:
-    """Channels that may be an output, the likeliest first."""
-    # Among all names, since what stands beside a name may say what it means.
+    """Return channels that may be an output, the likeliest first."""
+    # Spelled out among all names, because neighbouring names may decide the meaning.
     spelled = guess.spelled_out(tuple(log.series))
     names = {
         spelled.get(n, n): n
@@ -128,7 +131,7 @@ def _found(
     log: Log, names: Sequence[str], si: str, taken: list[str], is_input: bool = False
 ) -> Guess | None:
     candidates = [n for n in names if n not in taken]
-    # What never moves is a trim, or a channel that is not connected; better than none.
+    # A constant channel is a trim or not connected, but better than none.
     candidates = that_move(log, candidates) or candidates
     if not candidates:
         return None
@@ -153,7 +156,7 @@ def _by_number(
     numbered: Mapping[str, list[str]],
     taken: list[str],
 ) -> None:
-    """Inputs whose channels have numbers for names, in the usual order."""
+    """Assign inputs to channels with numbers as names, in the usual order."""
     for name, input in inputs.items():
         si = naming.unit(model.Inputs, name) or "1"
         names = [n for n in numbered.get(name, ()) if guess.may_move(n, log.series[n], si)]
@@ -170,9 +173,10 @@ def _by_correlation(
     outputs: Mapping[str, Guess | None],
     taken: list[str],
 ) -> None:
-    """Inputs whose names tell nothing, by what an output follows."""
+    """Assign inputs without a matching name to the channel that an output follows."""
     known = [g.channel for g in outputs.values() if g is not None]
-    # What is named as a motion moves with the stick, and more like the output than the stick does.
+    # A channel named as a motion moves with the stick, and correlates better with the output than
+    # the stick does.
     motions = {c for names in tables.names()["outputs"].values() for c in names} - _STICKS_TOO
     moving = guess.by_name(sorted(motions), tuple(log.series))
     measured = {n for n in moving if not names_a_stick(n)}
@@ -200,14 +204,17 @@ def _by_correlation(
 
 _CALLED = {"lat", "lon", "lng", "long", "latitude", "longitude"}
 _STEADY = 50.0
-"""times what a flight goes over, by which a place is away from zero at least"""
+"""Smallest ratio of a position to its range in a flight."""
 _PARTS, _DEGREES, _INTEGERS = 1.5, 180.0, 1e6
-"""of full travel, of half a circle, and of the parts of a degree in which receivers of GPS count"""
+"""Limits of a fraction of full travel, of half a circle [deg], and of a GPS receiver's integer
+counts."""
 
 
 def is_place(name: str, log: Mapping[str, Series]) -> bool:
-    """True if a channel is a latitude or a longitude, by its name and its numbers, or by a `Lng`
-    beside it."""
+    """True if a channel is a latitude or a longitude.
+
+    The criterion is its name and its numbers, or a `Lng` beside it.
+    """
     words = words_in(name)
     if not words or words[-1] not in _CALLED:
         return False

@@ -1,4 +1,4 @@
-"""Tables of `new` on models and names, from the files beside it."""
+"""Tables of models and names for `new`, from the YAML files in this folder."""
 
 from importlib import resources
 from typing import Any
@@ -12,7 +12,7 @@ def names() -> dict[str, Any]:
 
 
 def models() -> dict[str, Any]:
-    """By model what is free in it, and what other models there are of its axis."""
+    """Return the free parameters by model, and other models of its axis."""
     return _file("models.yaml")
 
 

@@ -1,4 +1,4 @@
-"""The words of the files that `heli-jax new` writes."""
+"""Text of the files that `heli-jax new` writes."""
 
 import json
 import math
@@ -19,7 +19,7 @@ from heli_jax.yaml_file import EDIT
 
 _MOST_LISTED = 12
 _UNSET = {"kappa": "a stand without a spring", "zeta": "a stand without damping"}
-"""what a constant's default says where it is not zero for every vehicle"""
+"""Meaning of a default that is not zero for every vehicle."""
 _GUSTS = (
     "  # filter-error models gusts. Without gusts use output-error and remove the section",
     "  # disturbance.",
@@ -32,21 +32,21 @@ _SMOOTH = (
     "  # GUESS: output-error, because the outputs have no sensor noise: the log was smoothed or",
     "  # simulated. filter-error needs unfiltered sensor noise.",
 )
-# Short words of YAML (on, y, null) and numbers are none of these.
+# Excludes YAML's short words (on, y, null) and numbers.
 _PLAIN = re.compile(r"(?!(?i:on|off|yes|no|y|n|true|false|null)\Z)[A-Za-z][\w./%^-]*")
 
 _ROWS_OF_TOPICS = "# Hz; rows of several topics, the outputs slower"
 
 
 class Filtered(NamedTuple):
-    """The channel of an output, and the settings of its filters in words."""
+    """Channel of an output, and the settings of its filters in words."""
 
     signal: Alternative
     settings: str
 
 
 def filter_settings(log: Log, channel: str) -> str:
-    """The settings of constant filters that a channel went through, empty without one."""
+    """Return the settings of a channel's constant filters; empty without any."""
     if log.autopilot is None:
         return ""
     logged = logged_filters(log.autopilot.firmware, log.autopilot.parameters, channel)
@@ -56,10 +56,13 @@ def filter_settings(log: Log, channel: str) -> str:
 def filtered_outputs(
     name: str, model: Any, log: Log, asked: Collection[str]
 ) -> dict[str, Filtered]:
-    """The filtered ones of the outputs that a preset supplies.
+    """Return the filtered outputs among those that a preset supplies.
 
     Args:
-        asked: the outputs to take from the preset; all unless given.
+        name: name of the preset.
+        model: the model.
+        log: the log.
+        asked: outputs to take from the preset; all if empty.
     """
     table, known = preset(name).signals, model_outputs()
     result: dict[str, Filtered] = {}
@@ -72,7 +75,7 @@ def filtered_outputs(
 
 
 class Chosen(NamedTuple):
-    """The model, what a configuration calls it, and whether it is linear from a file."""
+    """The model, its name in a configuration, and True if it is linear from a file."""
 
     model: Any
     name: str | dict[str, str]
@@ -80,23 +83,23 @@ class Chosen(NamedTuple):
 
 
 class Signals(NamedTuple):
-    """Channels by the model's inputs and outputs; None where none was found."""
+    """Channels by the model's inputs and outputs; None if none was found."""
 
     inputs: Mapping[str, Guess | None]
     outputs: Mapping[str, Guess | None]
     known: Mapping[str, tuple[str, float]]
-    """constants of the flight, with the channel that they are the mean of"""
+    """Constants of the flight, each with the channel whose mean it is."""
     rest: Sequence[str]
     excitations: Mapping[str, str] = {}
-    """by input the channel of what an autopilot added to it"""
+    """Channel of the autopilot's added excitation, by input."""
     wandering: Mapping[str, Guess] = {}
-    """angles that are left out, since their error is that of an integrated rate"""
+    """Angles that are left out because of the drift of an integrated rate."""
     smooth: bool = False
-    """whether no output has a sensor's noise"""
+    """True if no output has sensor noise."""
     ranges: Mapping[str, tuple[float, float]] = {}
-    """least and largest number of each channel that is left"""
+    """Smallest and largest number of each unused channel."""
     filtered: Mapping[str, str] = {}
-    """by channel the settings by which the autopilot filtered it"""
+    """Settings of the autopilot's filters, by channel."""
 
 
 def configuration(
@@ -116,16 +119,24 @@ def configuration(
     filtered: Mapping[str, Filtered] = {},
     late: tuple[str, bool] = ("", False),
 ) -> str:
-    """The configuration as text.
+    """Return the configuration as text.
 
     Args:
-        free: starts by parameter; None at the vehicle's value.
-        rate: [Hz] onto which topics with clocks of their own are brought, or a table whose rows are
-            those of several topics.
-        preset_outputs: those to take from the preset; all unless given.
-        late: which input is logged late, in words, empty where none is; and whether nothing else
-            looks like that.
-
+        chosen: the model.
+        log: path of the log.
+        time: clock of a table; None if topics have separate clocks.
+        flight: number of the flight, if there are several.
+        preset: name of the preset, if one fits.
+        signals: channels, without a preset.
+        vehicle: path of the vehicle file, if any.
+        free: starts by parameter; None for the vehicle's value.
+        held: fixed parameters with another vehicle's values.
+        rate: grid rate [Hz] for topics with separate clocks, or for rows of several topics.
+        others: other models of the axis.
+        preset_outputs: outputs to take from the preset; all if empty.
+        filtered: filtered outputs of the preset.
+        late: description of the input that is logged late (empty if none), and True if feedback is
+            excluded.
     """
     lines = [
         f"# Made from {_comment(log)}. Check the lines marked GUESS.",
@@ -179,10 +190,10 @@ def configuration(
 
 
 def vehicle(model: Any, means: Mapping[str, tuple[str, float]]) -> str:
-    """A vehicle file to fill in."""
+    """Return a vehicle file to fill in."""
     lines = ["# Constants of your vehicle, measured or from drawings, with their source."]
     defaults, known = naming.defaults(model.Params), naming.names(model.Params)
-    # Any number stands for one that has to be there: it only shows what the model reads.
+    # Any number replaces required ones: it only shows which constants the model reads.
     params = model.Params(**{n: defaults.get(n, 1.0) for n in known})
     needed = {*(n for n in known if n not in defaults), *needed_but_missing(model, params)}
     for name in known:
@@ -201,9 +212,9 @@ def vehicle(model: Any, means: Mapping[str, tuple[str, float]]) -> str:
 
 
 def _axes(model: Any, logged: Collection[str]) -> tuple[str, ...]:
-    """The axes on which gusts may act: those with a logged output, where outputs are known."""
+    """Return the axes on which gusts may act: those with a logged output, if outputs are known."""
     axes = axes_of(model)
-    # Gusts about an axis of which nothing was logged show in nothing, and cannot be estimated.
+    # Gusts about an axis without a logged output are not identifiable.
     seen = [a.name for a in axes if not {a.rate, a.angle, a.name}.isdisjoint(logged)]
     return tuple(seen or (a.name for a in axes))
 
@@ -268,7 +279,7 @@ def _flight(chosen: Chosen, signals: Signals, time: TimeInfo | None, log: str) -
 
 
 def _time(time: TimeInfo) -> str:
-    """The clock of a table."""
+    """Return the clock of a table."""
     if time.counted is None:
         unit = "" if time.unit == "s" else f", unit: {time.unit}"
         guessed = "   # GUESS: the unit, by its steps" if time.guessed else ""
@@ -305,7 +316,7 @@ def _preset(preset: str, outputs: Sequence[str], filtered: Mapping[str, Filtered
 
 
 def _left_out(wandering: Mapping[str, Guess]) -> list[str]:
-    """Angles that would mislead, each as a comment to put back."""
+    """Return the angles that are left out, as comments."""
     return [
         line
         for name, signal in wandering.items()
@@ -318,7 +329,7 @@ def _left_out(wandering: Mapping[str, Guess]) -> list[str]:
 
 
 def _unknown(model: Any) -> list[str]:
-    """Outputs of which no name tells, for the user to name or to take out."""
+    """Return the outputs without a matching name, for the user to name or to remove."""
     lines = ["        # No name matches an output: delete those that were not logged."]
     for name in naming.names(model.Outputs):
         meaning, unit = naming.meaning(model.Outputs, name), naming.unit(model.Outputs, name) or "1"
@@ -329,7 +340,7 @@ def _unknown(model: Any) -> list[str]:
 
 
 def _ranges(ranges: Mapping[str, tuple[float, float]]) -> list[str]:
-    """Return the ranges of a log's channels, if only their numbers tell."""
+    """Return the ranges of a log's channels, for a choice by numbers."""
     moving = {n: r for n, r in ranges.items() if r[0] < r[1]}
     shown = list(moving.items())[:_MOST_LISTED]
     lines = [f"      #   {_comment(n)}: {low:.4g} to {high:.4g}" for n, (low, high) in shown]
@@ -339,7 +350,7 @@ def _ranges(ranges: Mapping[str, tuple[float, float]]) -> list[str]:
 
 
 def _missing(chosen: Chosen, signals: Signals) -> list[str]:
-    """Outputs that no channel's name tells of."""
+    """Return the outputs without a matching channel name."""
     units = {
         n: naming.unit(chosen.model.Outputs, n) or "1"
         for n in naming.names(chosen.model.Outputs)
@@ -371,7 +382,7 @@ def _signal(name: str, guess: Guess | None, meaning: str, settings: str = "") ->
     if settings:
         words.append(f"        # filtered by the autopilot: {_comment(settings)}")
     if guess is None:
-        # A constant that nobody knows moves nothing: the user says which channel it is.
+        # An unknown input must not become a constant, so the user names its channel.
         stays = "; {constant: 0} if it did not move"
         return [*words, f"        {name}: {{signal: {EDIT}}}   # no channel name matches{stays}"]
     keys = [f"signal: {_value(guess.channel)}", f"unit: {_value(guess.unit)}"]
@@ -393,15 +404,15 @@ def _number(value: float | str) -> str:
 
 
 def _value(value: Any) -> str:
-    """One value as it may stand within {...}."""
+    """Return one value in the form allowed within {...}."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{k}: {_value(v)}" for k, v in value.items()) + "}"
-    # What YAML might read as something else stands in quotes, which are those of JSON too.
+    # Text that YAML might read as something else is quoted as in JSON.
     text = str(value)
     if _PLAIN.fullmatch(text):
         return text
     quoted = json.dumps(text, ensure_ascii=False)
-    # YAML takes such characters as their numbers alone.
+    # YAML accepts such characters only as escapes.
     return "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in quoted)
 
 

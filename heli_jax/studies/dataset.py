@@ -1,4 +1,4 @@
-"""The fits of a study as one Dataset, whose dimensions are the study's axes."""
+"""Fits of a study as one Dataset, whose dimensions are the study's axes."""
 
 import json
 import math
@@ -23,17 +23,20 @@ _ESTIMATE = {
 }
 _NUMBERS = ("n_samples", "steps", "log_likelihood", "aic", "bic")
 
-# Any below: what fit.json holds.
+# Any below: content of fit.json.
 Fits = Sequence[Mapping[str, Any] | None]
 
 
 def dataset(
     study: Study, names: Sequence[str], fits: Fits, versions: Mapping[str, str]
 ) -> xr.Dataset:
-    """The Dataset of a study.
+    """Return the Dataset of a study.
 
     Args:
-        fits: by fit what its fit.json or failed.json holds; None where it has not been run.
+        study: the study.
+        names: directories of the fits.
+        fits: content of fit.json or failed.json by fit; None if it was not run.
+        versions: versions of the packages.
     """
     axes = tuple(study.axes)
     estimates = [_estimates(fit) for fit in fits]
@@ -69,7 +72,7 @@ def dataset(
     outputs = list(dict.fromkeys(o for f in fits for part in _PARTS for o in _metrics(f, part)))
     coordinates["output"] = ("output", np.array(outputs, _TEXT))
     for part, prefix in _PARTS.items():
-        # Seven variables of nothing where no flight is held out.
+        # Without a held-out flight, these variables would be empty.
         if prefix and not any(_metrics(f, part) for f in fits):
             continue
         for field in Metrics._fields:
@@ -99,7 +102,7 @@ _WORDS = {
 
 
 def _coordinate(values: Sequence[Any]) -> np.ndarray:
-    """An axis as numbers where it has nothing else, otherwise as text."""
+    """Return an axis as numbers if it has only numbers, otherwise as text."""
     if all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
         return np.asarray(values, None if all(isinstance(v, int) for v in values) else float)
     return np.array([v if isinstance(v, str) else json.dumps(v) for v in values], _TEXT)
@@ -110,7 +113,7 @@ def _is_fit(fit: Mapping[str, Any] | None) -> TypeGuard[Mapping[str, Any]]:
 
 
 def _estimates(fit: Mapping[str, Any] | None) -> dict[str, Mapping[str, Any]]:
-    """The estimates by name: parameters, and the nuisance parameters that are of no one flight."""
+    """Return the estimates by name: parameters, and nuisance parameters common to all flights."""
     if not _is_fit(fit):
         return {}
     free = {n: e for n, e in fit["parameters"].items() if not e.get("fixed", False)}
@@ -119,7 +122,7 @@ def _estimates(fit: Mapping[str, Any] | None) -> dict[str, Mapping[str, Any]]:
 
 def _of(estimates: Mapping[str, Mapping[str, Any]], parameter: str, key: str) -> float:
     estimate = estimates.get(parameter)
-    # fit.json has the value at which the optimiser stopped even where it is no estimate.
+    # fit.json has the optimiser's last value even if it is no estimate.
     if estimate is None or estimate["sd"] is None:
         return math.nan
     return _number(estimate[key])

@@ -1,4 +1,4 @@
-"""The directory of a study: each fit's own, which appears whole or not at all."""
+"""Directory of a study; each fit's own directory appears complete or not at all."""
 
 import json
 import re
@@ -15,16 +15,16 @@ from heli_jax.sweeps import description
 from heli_jax.yaml_file import as_yaml
 
 FITS = "fits"
-# Without what is being written, whose name begins with a dot.
+# Without unfinished files, whose names begin with a dot.
 FINISHED = f"{FITS}/[!.]*/fit.json"
-"""what there is of every fit that is finished"""
+"""Files that exist for every finished fit."""
 _DESCRIPTION = "study.json"
 _LONGEST_NAME = 80
 _LIMIT_BYTES = 1_000_000_000
 
 
 def create(out: Path, study: Study, described: dict[str, Any], versions: dict[str, str]) -> None:
-    """A new directory without any fit; it appears whole or not at all.
+    """Make a new directory without fits; it appears complete or not at all.
 
     Raises:
         InputError: it cannot be written to.
@@ -39,10 +39,10 @@ def create(out: Path, study: Study, described: dict[str, Any], versions: dict[st
 
 
 def require_same(out: Path, described: dict[str, Any]) -> dict[str, str]:
-    """Refuse the directory of another study; returns the versions that it was begun with.
+    """Refuse the directory of another study; return the versions of its first run.
 
     Raises:
-        InputError: it is of another, or of none.
+        InputError: it belongs to another study, or to none.
     """
     where = f"--out {out}"
     data = read_regular(out / _DESCRIPTION, "the study.json of a study", _LIMIT_BYTES)
@@ -68,7 +68,7 @@ def names(study: Study) -> list[str]:
 
 def _short_keys(keys: list[str]) -> dict[str, str]:
     """Return the shortest unique ends of keys; `Ixx` for its start."""
-    # Of `fit.free.Ixx.start` the last word says less than the one before.
+    # In `fit.free.Ixx.start` the last word is less specific than the one before.
     parts = {key: key.removesuffix(".start").split(".") for key in keys}
     for depth in range(1, max(len(p) for p in parts.values()) + 1):
         short = {key: ".".join(p[-depth:]) for key, p in parts.items()}
@@ -77,7 +77,7 @@ def _short_keys(keys: list[str]) -> dict[str, str]:
     return {key: key for key in keys}
 
 
-# Any: what YAML holds.
+# Any: content of YAML.
 def _word(value: Any) -> str:
     text = Path(value).stem if isinstance(value, str) else json.dumps(value)
     return re.sub(r"[^\w.+]+", "-", text).strip("-")
@@ -104,7 +104,7 @@ def read_fit(place: Path) -> dict[str, Any] | None:
 
 
 def write_fit(place: Path, outcome: Outcome) -> None:
-    """Write a fit's directory, in place of that of one that failed.
+    """Write a fit's directory; it replaces that of a failed fit.
 
     Raises:
         InputError: it cannot be written.
@@ -118,7 +118,7 @@ def write_fit(place: Path, outcome: Outcome) -> None:
 
 
 def remove_remains(out: Path) -> None:
-    """Remove what a process that was killed was writing; only for who holds the lock."""
+    """Remove unfinished files of a killed process; only for the holder of the lock."""
     for folder in (out, out / FITS):
         for path in folder.glob(".*-????????"):
             if path.is_dir() and not path.is_symlink():

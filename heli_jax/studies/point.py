@@ -1,6 +1,6 @@
-"""One fit of a study, from its configuration to its files: what a worker does, here or elsewhere.
+"""One fit of a study, from its configuration to its files: the work of a local or remote worker.
 
-Whoever asked writes the files, so that workers need no disk in common and only one process writes.
+The requesting process writes the files, so workers need no common disk and only one process writes.
 """
 
 import json
@@ -13,43 +13,43 @@ from heli_jax.errors import InputError
 from heli_jax.finding import sentences
 
 _MAPPED = 30_000
-"""Regions of memory above which compiled programs are let go: Linux grants a process 65530, every
-compiled kernel takes some, and past them the process dies."""
+"""Memory regions above which compiled programs are released. Linux grants a process 65530, every
+compiled kernel takes some, and beyond the limit the process dies."""
 
 
 class Task(NamedTuple):
     """Task of a worker, as plain data for JSON."""
 
     path: str
-    """of the configuration, which need not exist there: relative paths begin at its folder"""
+    """Path of the configuration, which need not exist there; relative paths begin at its folder."""
     content: dict[str, Any]
-    """as YAML holds it"""
+    """Content of the YAML file."""
     point: dict[str, Any]
-    """by key of the study its value here"""
+    """Value of each key of the study."""
     reports: bool = False
-    """whether the page and its figures are made, which takes seconds"""
+    """True to make the page and its figures, which takes seconds."""
     command: str = ""
-    """by which the study was asked for: a worker has another of its own"""
+    """Command of the study; a worker's own differs."""
 
 
 class Outcome(NamedTuple):
     """Outcome of a fit."""
 
     files: dict[str, bytes]
-    """by path within its directory"""
+    """Files by path within its directory."""
     sentence: str | None = None
-    """why there is no fit; None where there is one"""
+    """Reason why there is no fit; None if there is one."""
     notes: tuple[str, ...] = ()
-    """what the readers of its logs assumed or did, in sentences"""
+    """Notes of the log readers, in sentences."""
 
 
 def fit_point(task: Task) -> Outcome:
-    """Fit one point of a study. Whatever goes wrong is in the outcome: it costs no other fit."""
+    """Fit one point of a study; any error becomes part of the outcome and affects no other fit."""
     try:
         return _fitted(task)
     except InputError as e:
         return failure(" ".join(str(e).split()), task)
-    except Exception as e:  # a fault of ours, whose traceback a report of it needs
+    except Exception as e:  # a fault of ours, whose traceback a report needs
         sentence = " ".join(f"{type(e).__name__}: {e}".split())
         return failure(sentence, task, traceback.format_exc())
     finally:
@@ -57,14 +57,14 @@ def fit_point(task: Task) -> Outcome:
 
 
 def failure(sentence: str, task: Task, trace: str = "") -> Outcome:
-    """The outcome of a fit that there is not."""
+    """Return the outcome of a failed fit."""
     content = {"sentence": sentence, "point": task.point} | ({"traceback": trace} if trace else {})
     text = json.dumps(content, indent=1)
     return Outcome({"failed.json": text.encode()}, sentence)
 
 
 def _fitted(task: Task) -> Outcome:
-    # Here, since the process that asks and writes needs neither.
+    # Here, because the requesting process needs neither.
     from heli_jax import workflow
     from heli_jax.config.experiment import from_content
     from heli_jax.report.origin import made_for
@@ -88,14 +88,14 @@ def _fitted(task: Task) -> Outcome:
 
 
 def _in_words(point: dict[str, Any]) -> str:
-    """Keys and values, as the Dataset's axes have them."""
+    """Return keys and values, as on the Dataset's axes."""
     texts = {k: v if isinstance(v, str) else json.dumps(v) for k, v in point.items()}
     return ", ".join(f"{key} = {text}" for key, text in texts.items())
 
 
 # Any: a FitRun, whose module takes a second to import.
 def _write_plain(run: Any, place: Path) -> None:
-    """Write what `load_fit` and `heli-jax compare` read, without the page."""
+    """Write the files for `load_fit` and `heli-jax compare`, without the page."""
     import time
 
     from heli_jax.config import resolved

@@ -1,7 +1,7 @@
-"""Fits computed by processes of this machine, each of which fits one after the other.
+"""Fits computed by processes of this computer, one fit after the other in each.
 
-Processes of our own and not `multiprocessing`: that would run a user's script once more in each of
-them, and its pools end as a whole where one process dies.
+Our own processes instead of `multiprocessing`: that would run a user's script again in each of
+them, and its pool ends as a whole if one process dies.
 """
 
 import contextlib
@@ -24,9 +24,9 @@ from heli_jax.studies.point import Outcome, Task, failure
 from heli_jax.studies.worker import SCRATCH, read_outcome
 
 _ATTEMPTS = 2
-"""processes that a fit may end before it is given up: one may have died by lack of memory"""
+"""Processes that a fit may end before it fails: one may have died by lack of memory."""
 _WORDS = 300
-"""characters of a dead process's last line"""
+"""Longest quoted last line of a dead process [characters]."""
 
 
 class _Process:
@@ -39,7 +39,7 @@ class _Process:
             "TMPDIR": self.scratch,
             SCRATCH: self.scratch,
         }
-        # Not a pipe: nobody reads it as long as all goes well, and a full one would stop the fit.
+        # Not a pipe: nobody reads it unless something fails, and a full one would stop the fit.
         self.errors = tempfile.TemporaryFile()  # noqa: SIM115
         self.process = subprocess.Popen(
             [sys.executable, "-P", "-m", "heli_jax.studies.worker"],
@@ -47,12 +47,12 @@ class _Process:
             stdout=subprocess.PIPE,
             stderr=self.errors,
             env=environment,
-            # Ctrl-C is for the one that asked, with which this one ends.
+            # Ctrl-C goes to the main process, with which this one ends.
             process_group=0 if os.name == "posix" else None,
         )
 
     def run(self, task: Task) -> Outcome | None:
-        """The outcome of a fit; None where the process ended over it."""
+        """Return the outcome of a fit; None if the process died."""
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         line = json.dumps(task._asdict()).encode() + b"\n"
@@ -76,7 +76,7 @@ class _Process:
         self.process.kill()
         self.process.wait()
         for stream in (self.process.stdin, self.process.stdout, self.errors):
-            # What was not yet written to a process that is gone.
+            # Buffered data cannot be written to a dead process.
             with contextlib.suppress(OSError):
                 if stream is not None:
                     stream.close()
@@ -84,7 +84,7 @@ class _Process:
 
 
 class _Pool:
-    """Workers of this process, one a thread."""
+    """Workers of this process, one per thread."""
 
     def __init__(self, cache: str) -> None:
         self.cache, self.over = cache, False
@@ -93,7 +93,7 @@ class _Pool:
         self.lock = threading.Lock()
 
     def fit(self, task: Task) -> Outcome:
-        """The outcome of a task by the worker of the thread that calls it."""
+        """Return the outcome of a task by the worker of the calling thread."""
         words = ""
         for _ in range(_ATTEMPTS):
             process = getattr(self.own, "process", None) or self._started()
@@ -113,7 +113,7 @@ class _Pool:
         with self.lock:
             self.own.process = process = _Process(self.cache)
             self.processes.add(process)
-            # Begun as the others were being ended.
+            # It was started while the others were being ended.
             if self.over:
                 process.process.kill()
         return process
@@ -127,7 +127,7 @@ class _Pool:
 
 
 def computed(tasks: Sequence[Task], workers: int) -> Iterator[tuple[int, Outcome]]:
-    """Fit tasks by so many processes; yields the place of each and its outcome, as it is done."""
+    """Fit tasks in `workers` processes; yield the index and outcome of each when it is done."""
     with contextlib.ExitStack() as stack:
         pool, threads = _Pool(_cache(stack)), ThreadPoolExecutor(workers)
         stack.callback(threads.shutdown, cancel_futures=True)
@@ -138,7 +138,7 @@ def computed(tasks: Sequence[Task], workers: int) -> Iterator[tuple[int, Outcome
 
 
 def _cache(stack: contextlib.ExitStack) -> str:
-    """The folder of compiled programs that all workers share, so that each is compiled once."""
+    """Return the folder of compiled programs that all workers share, to compile each only once."""
     folder: Any = jax.config.jax_compilation_cache_dir  # pyright: ignore
     if folder:
         return str(Path(folder).absolute())

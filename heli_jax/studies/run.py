@@ -26,17 +26,17 @@ STORE = "study.zarr"
 
 
 class Options(NamedTuple):
-    """Options of carrying out a study; none changes a number."""
+    """Options for the execution of a study; none changes a number."""
 
     resume: bool = False
-    """go on with what is in the directory; what failed is tried again"""
+    """Continue with an existing directory; failed fits are tried again."""
     workers: int | None = None
-    """processes of this machine: as many as there are cores unless given"""
-    # Any: a dask Client, of an extra that is not installed everywhere.
+    """Number of processes on this computer; by default one per core."""
+    # Any: a dask Client, an optional extra.
     client: Any = None
-    """a dask.distributed Client whose workers fit, in place of processes"""
+    """A dask.distributed Client whose workers fit, instead of processes."""
     reports: bool = False
-    """write each fit's page and figures too, which takes seconds a fit"""
+    """Also write each fit's page and figures, which takes seconds per fit."""
     progress: Callable[[Progress], None] = lambda _: None
     say: Callable[[str], None] = lambda _: None
 
@@ -51,19 +51,19 @@ def run_study(
     """Fit a configuration for every combination of some keys' values.
 
     Args:
-        config: path of the configuration; what its section `study` says comes first.
-        out: a directory for study.zarr and the fits' directories; none is kept unless given.
+        config: path of the configuration; its section `study` comes first.
+        out: a directory for study.zarr and the fits' directories; none is kept by default.
         over: values by key, `{"fit.free.a.start": [4, 5, 6]}`.
-        overrides: values in place of the file's, as of `load_config`.
+        overrides: values that replace those of the file, as in `load_config`.
         **options: fields of `Options`: resume, workers, client, reports, progress, say.
 
     Returns:
-        A Dataset whose dimensions are the axes, with parameter and output. A fit that failed has
-        the status 'failed' and its sentence; it stops no other.
+        A Dataset whose dimensions are the axes, with parameter and output. A failed fit has the
+        status 'failed' and its sentence; it stops no other.
 
     Raises:
-        InputError: something of the configuration is wrong, nothing takes several values, or `out`
-            exists (without `resume`), is of another study, or cannot be written to.
+        InputError: something in the configuration is wrong, nothing takes several values, or `out`
+            exists (without `resume`), belongs to another study, or cannot be written to.
         TypeError: a keyword that is no option.
     """
     study = read_study(config, overrides, over)
@@ -79,7 +79,7 @@ def run_study(
 
 
 def run(study: Study, out: Path, options: Options) -> xr.Dataset:
-    """Carry out a study.
+    """Run a study.
 
     Raises:
         InputError: as `run_study`.
@@ -121,7 +121,7 @@ def _tasks(study: Study, reports: bool) -> list[Task]:
 
 
 def _compute(tasks: Sequence[Task], places: Sequence[Path], options: Options) -> None:
-    """Fit what is not there yet, and write each fit as it is done."""
+    """Compute the missing fits, and write each when it is done."""
     todo = [k for k, place in enumerate(places) if not (place / "fit.json").is_file()]
     if not todo:
         return
@@ -130,7 +130,7 @@ def _compute(tasks: Sequence[Task], places: Sequence[Path], options: Options) ->
     for number, outcome in _outcomes([tasks[k] for k in todo], options):
         place = places[todo[number]]
         directory.write_fit(place, outcome)
-        # Fits of one log share what its reader has to say.
+        # Fits of one log share the notes of its reader.
         for note in outcome.notes:
             if note not in said:
                 options.say(Note(note))
@@ -143,7 +143,7 @@ def _compute(tasks: Sequence[Task], places: Sequence[Path], options: Options) ->
 
 def _outcomes(tasks: Sequence[Task], options: Options) -> Iterator[tuple[int, Outcome]]:
     if options.client is not None:
-        # Here, since dask is an extra that is not installed everywhere.
+        # Here, because dask is an optional extra.
         from heli_jax.sweeps.cluster import mapped
 
         for number, outcome in mapped(options.client, fit_point, tasks):
@@ -156,7 +156,7 @@ def _outcomes(tasks: Sequence[Task], options: Options) -> Iterator[tuple[int, Ou
 
 
 def _write(out: Path, result: xr.Dataset) -> None:
-    """The Dataset in a Zarr store, in place of an earlier one."""
+    """Write the Dataset as a Zarr store, in place of an earlier one."""
     target = out / STORE
     with run_directory.whole(target) as folder:
         result.to_zarr(folder, mode="w", consolidated=False, zarr_format=3)

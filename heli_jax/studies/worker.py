@@ -1,8 +1,8 @@
-"""A process that fits what it is told: `python -m heli_jax.studies.worker`, of `processes`.
+"""Worker process that fits its tasks: `python -m heli_jax.studies.worker`, for `processes`.
 
-A line of JSON on standard input is a `Task`; the answer on standard output is a line of JSON with
-the files' sizes, and then their bytes. It ends when its standard input does, whatever it is doing:
-the process that asked may have been killed.
+A line of JSON on standard input is a `Task`. The result on standard output is a line of JSON with
+the files' sizes, then their bytes. The process ends when its standard input does, whatever it is
+doing, because the requesting process may have been killed.
 """
 
 import json
@@ -18,11 +18,11 @@ from heli_jax import import_path
 from heli_jax.studies.point import Outcome, Task, fit_point
 
 SCRATCH = "HELI_JAX_STUDY_SCRATCH"
-"""environment variable: a folder of this process alone, removed when it ends"""
+"""Environment variable: a folder for this process alone, removed when it ends."""
 
 
 def write_outcome(stream: IO[bytes], outcome: Outcome) -> None:
-    """Write an outcome so that `read_outcome` reads it."""
+    """Write an outcome in the format of `read_outcome`."""
     sizes = {name: len(data) for name, data in outcome.files.items()}
     content = {"sentence": outcome.sentence, "files": sizes, "notes": outcome.notes}
     head = json.dumps(content)
@@ -33,13 +33,13 @@ def write_outcome(stream: IO[bytes], outcome: Outcome) -> None:
 
 
 def read_outcome(stream: IO[bytes]) -> Outcome | None:
-    """The next outcome; None where the other process has ended."""
+    """Read the next outcome; None if the other process has ended."""
     line = stream.readline()
     if not line.endswith(b"\n"):
         return None
     head = json.loads(line)
     files = {name: stream.read(size) for name, size in head["files"].items()}
-    # Cut off where the process died as it wrote.
+    # Incomplete if the process died while writing.
     if any(len(files[name]) < size for name, size in head["files"].items()):
         return None
     return Outcome(files, head["sentence"], tuple(head["notes"]))
@@ -47,7 +47,7 @@ def read_outcome(stream: IO[bytes]) -> Outcome | None:
 
 def main() -> None:
     """Fit until standard input ends."""
-    # What a model of the user's own prints must not be taken for an answer.
+    # Output printed by a user's model must not mix with the results.
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -66,7 +66,7 @@ def main() -> None:
 def _read(tasks: "queue.SimpleQueue[bytes]") -> None:
     for line in sys.stdin.buffer:
         tasks.put(line)
-    # At once: nobody reads the answer any more.
+    # At once: nobody reads the result any more.
     if SCRATCH in os.environ:
         shutil.rmtree(os.environ[SCRATCH], ignore_errors=True)
     os._exit(0)

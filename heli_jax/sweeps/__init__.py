@@ -1,7 +1,7 @@
-"""Sweeps: many runs of one model, reduced to numbers, on disk, in pieces that survive a kill.
+"""Sweeps: many runs of one model, reduced to numbers, stored in chunks that survive a kill.
 
-A design says which values the axes take, element by element; reducers say what is kept of each
-run; `sweep` computes chunks of elements and writes each when it is done.
+A design sets the values of the axes for each element (design point); reducers compute the results
+of each run. `sweep` computes chunks of elements and writes each when it is done.
 """
 
 import importlib
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from heli_jax.sweeps.spec import Trajectories as Trajectories
     from heli_jax.sweeps.spec import Trimmed as Trimmed
 
-# Loaded when they are first used: the store's libraries take a second that other commands spare.
+# Loaded on first use: the store's libraries take a second that other commands do not need.
 _HOMES = {
     **dict.fromkeys(
         ("Design", "Range", "grid", "lhs", "paired", "product", "sobol", "table", "zipped"),

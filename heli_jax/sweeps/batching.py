@@ -1,4 +1,4 @@
-"""Division of a sweep into chunks, and of chunks into elements computed side by side."""
+"""Division of a sweep into chunks, and of chunks into batches of elements."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -12,19 +12,19 @@ from heli_jax.sweeps.spec import Job
 from heli_jax.sweeps.worker import BLOCKS, Split
 
 BACKENDS = ("auto", "xla", "fused")
-# Elements side by side: on a core a few vectors of them, so that their
-# states stay in its cache; on a GPU enough for all its threads.
+# Batch sizes: on a core a few vectors, so that their states stay in its cache; on a GPU enough for
+# all its threads.
 _CPU, _GPU = 64, 1 << 17
-# [s] What a chunk should take, about: a kill costs as much, and writing is to be little of it.
+# [s] Approximate time of a chunk: a kill loses as much, and writing should be a small part of it.
 _CHUNK_S = 2.0
-# [bytes] Results of a chunk: two chunks are held at once, one computed and one written.
+# [bytes] Results of a chunk; two chunks are held at once, one in computation and one being written.
 _CHUNK_BYTES = 64e6
-# Chunks, about, where there are enough elements, so that progress shows; twice as many for each of
-# several processes, so that none waits long for the last one.
+# Approximate number of chunks, if there are enough elements, so that progress is visible. Twice as
+# many for each of several processes, so that none waits long for the last one.
 _CHUNKS = 4
-# [bytes] Whole runs held side by side, where a function of the user's sees them.
+# [bytes] Whole runs held at once, for a user's function.
 _RUN_BYTES = {"cpu": 256e6, "gpu": 8e9}
-# Elements of a chunk at most.
+# Most elements of a chunk.
 _MOST_ELEMENTS = {"cpu": 1 << 16, "gpu": 1 << 18}
 
 
@@ -41,10 +41,16 @@ def split_for(
     """Divide a sweep into chunks that are written at once, and these into batches of the device.
 
     Args:
-        devices: of JAX; those of this process unless given.
+        job: the sweep.
+        devices: devices of JAX; by default those of this process.
+        chunk: elements written at a time; chosen by default.
+        lanes: batch size; chosen by default.
+        backend: one of `BACKENDS`.
+        shares: number of processes that compute chunks.
+        say: function that reports a note.
 
     Raises:
-        ValueError: no such backend, or fused where it cannot be.
+        ValueError: unknown backend, or fused where it is impossible.
     """
     if backend not in BACKENDS:
         raise ValueError(f"backend: expected one of {', '.join(BACKENDS)}, got {backend!r}")
@@ -52,12 +58,13 @@ def split_for(
     kind = "cpu" if devices[0].platform == "cpu" else "gpu"
     share = math.ceil(job.design.size / len(devices))
     if lanes is None:
-        # A small sweep still has BLOCKS blocks a device, or XLA would write other code for it.
+        # A small sweep also has BLOCKS blocks per device, or XLA would generate different code for
+        # it.
         lanes = min(_default(job, kind), _power(share / BLOCKS))
     chosen = "xla" if backend == "xla" else _fused_or_xla(job, devices, lanes, backend, say)
     if chunk is None:
         chunk = _chunk_for(job, kind, len(devices), lanes, shares)
-    # No larger than the sweep: what a chunk lacks in elements is computed all the same.
+    # No larger than the sweep, because missing elements of a chunk are computed all the same.
     step = BLOCKS * lanes * len(devices)
     return Split(min(chunk, math.ceil(job.design.size / step) * step), lanes, chosen)
 
@@ -65,7 +72,7 @@ def split_for(
 def _fused_or_xla(
     job: Job, devices: tuple[Any, ...], lanes: int, backend: str, say: Callable[[str], None]
 ) -> str:
-    # Here, since it loads another compiler.
+    # Here, because it loads another compiler.
     from heli_jax.sweeps.fused_program import refusal
 
     why = refusal(job, devices, lanes)
@@ -79,12 +86,12 @@ def _fused_or_xla(
 
 
 def _chunk_for(job: Job, kind: str, n_devices: int, lanes: int, shares: int) -> int:
-    """Elements of a chunk: whole blocks of all devices, of a few seconds and not much memory."""
+    """Return the elements of a chunk: whole blocks of all devices, limited by time and memory."""
     step = BLOCKS * lanes * n_devices
     each = (jax.tree.leaves(shapes(job, i)) for i in range(len(job.flights)))
     heaviest = max(sum(v.size * v.dtype.itemsize for v in leaves) for leaves in each)
     room = min(_MOST_ELEMENTS[kind], 1 << int(math.log2(max(1.0, _CHUNK_BYTES / heaviest))))
-    # The guess of the time is for a core; a GPU is done with any chunk that fits sooner than that.
+    # The estimate is for a core; a GPU finishes any chunk that fits sooner.
     in_time = room if kind == "gpu" else _power(_CHUNK_S * n_devices / _guess(job))
     chunks = _CHUNKS if shares == 1 else 2 * _CHUNKS * shares
     each = _power(job.design.size / chunks)
@@ -92,23 +99,26 @@ def _chunk_for(job: Job, kind: str, n_devices: int, lanes: int, shares: int) -> 
 
 
 def _power(n: float) -> int:
-    """The power of two at or above n."""
+    """Return the power of two at or above n."""
     return 1 << max(0, math.ceil(math.log2(max(1, n))))
 
 
 def _guess(job: Job) -> float:
-    """Seconds an element takes on a core, within a factor of five: a nanosecond for each state,
-    sample and stage."""
-    # Not timed: a sweep shall be cut in the same way each time, or its last digits would differ
-    # from one day to the next.
+    """Return the estimated seconds per element on a core, within a factor of five.
+
+    It assumes a nanosecond for each state, sample and stage.
+    """
+    # Not measured: a sweep must be divided in the same way each time, or its last digits would
+    # change from day to day.
     samples = sum(f.n_samples for f in job.flights) if job.simulated else 1
-    # The exact step is one product of matrices; the others are taken for Runge-Kutta of order 4.
+    # The exact step is one product of matrices; the others are assumed to be Runge-Kutta of order
+    # 4.
     stages = 1 if job.solver == "exact" else 4 * job.substeps
     return 1e-9 * samples * stages * len(naming.names(job.model.State))
 
 
 def _default(job: Job, kind: str) -> int:
-    """Elements side by side on a device."""
+    """Return the batch size of a device."""
     most = _CPU if kind == "cpu" else _GPU
     if job.streamed:
         return most

@@ -1,7 +1,7 @@
-"""Chunks of a sweep, or fits of a study, by dask.distributed: on more processes or hosts.
+"""Chunks of a sweep, or fits of a study, by dask.distributed: in more processes or on more hosts.
 
-Workers give their results back, and the process that was started writes them: they need no disk in
-common. A worker that dies has its tasks done by another.
+Workers return their results, and the main process writes them, so no common disk is needed. If a
+worker dies, another one does its tasks.
 """
 
 import contextlib
@@ -29,41 +29,42 @@ from heli_jax.sweeps.spec import Job
 from heli_jax.sweeps.worker import Split, Worker
 from heli_jax.versions import versions
 
-_RETRIES = 5  # of a chunk whose task fails; how often workers may die with it dask counts itself
-# Chunks that each thread of a worker has in hand or waiting: with one it would idle while its
-# result travels; all at once, the results of a large sweep would wait in this process's memory.
+_RETRIES = 5  # retries of a failed chunk; dask itself counts dead workers
+# Chunks per worker thread, running or waiting. With one, the thread would idle while its result
+# travels; with all, a large sweep's results would wait in this process's memory.
 _AHEAD = 3
-_CONNECT_S = 20  # [s] without an answer, before an address is taken to be wrong
+_CONNECT_S = 20  # [s] without a reply after which an address counts as wrong
 _ALONE_S = 120.0
-"""[s] without any worker, before those that died are taken not to come back: a nanny starts another
-in seconds, a queue of jobs may take its time"""
+"""Time [s] without any worker after which the run fails. A nanny restarts a worker in seconds; a
+job queue may take longer."""
 _LOOK_S = 2.0
-"""[s] between two looks at whether there are workers"""
+"""Time [s] between two checks for workers."""
 _WAIT_S = 0.02
-"""[s] between two looks at whether a task has ended"""
+"""Time [s] between two checks for finished tasks."""
 _IMPORTS = (
     "expected modules of your own to be there too: begin scheduler and workers with PYTHONPATH set "
     "to their folder"
 )
 
-# In a worker process: what is compiled there, by sweep, and who compiles it. Several threads of one
-# process would otherwise compile the same program at the same time.
+# Compiled programs in a worker process, by sweep, and the lock of their compilation. Without it,
+# several threads of one process would compile the same program at once.
 _workers: dict[str, Worker] = {}
 _building = threading.Lock()
 
 
 class Prepared(WorkerPlugin):
-    """A worker process that computes as the one that asks does."""
+    """Worker process with the settings of the main process."""
 
-    # dask keeps one plugin of a name: a second sweep on the same scheduler replaces the first's.
+    # dask keeps one plugin per name: a second sweep on the same scheduler replaces the first's.
     name: Any = "heli_jax"
 
     def __init__(self, settings: dict[str, Any], folders: tuple[str, ...]) -> None:
         self.settings, self.folders = settings, folders
 
     def setup(self, worker: distributed.Worker) -> None:
-        """Called by dask in every worker, later ones too."""
-        # JAX's settings are of a process and are not sent with the job: float32 would come back.
+        """Set up each worker; dask calls this in later ones too."""
+        # JAX's settings belong to a process and are not sent with the job: results would be
+        # float32.
         for name, value in self.settings.items():
             jax.config.update(name, value)
         import_path.search(self.folders)
@@ -83,15 +84,15 @@ def connected(
     scheduler: str | None = None,
     workers: int | None = None,
 ) -> Iterator[Client]:
-    """A client of a scheduler at an address, or of a cluster on this machine that ends with it.
+    """Yield a client of a scheduler at an address, or of a local cluster that ends with it.
 
     Args:
-        scheduler: address, as tcp://HOST:8786; a cluster of one's own unless given.
-        workers: processes of that cluster; as many as dask thinks fit unless given.
+        scheduler: address, as tcp://HOST:8786; by default a local cluster.
+        workers: processes of that cluster; by default dask's choice.
 
     Raises:
-        InputError: nothing answers there, workers have other versions than this process, or a
-            cluster of one's own cannot be protected.
+        InputError: nothing replies there, workers have other versions than this process, or a local
+            cluster cannot be protected.
     """
     # pyright knows none of JAX's settings by their names.
     settings: dict[str, Any] = {name: getattr(jax.config, name) for name in _SETTINGS}
@@ -105,7 +106,7 @@ def connected(
                     f"--scheduler {scheduler}: no scheduler answers there ({e or type(e).__name__})"
                     ", expected the address that `dask scheduler` printed, as tcp://HOST:8786"
                 ) from e
-            # A folder of this machine; theirs may have none of that name.
+            # A folder on this computer, which others may lack.
             del settings["jax_compilation_cache_dir"]
         else:
             client = stack.enter_context(Client(stack.enter_context(_local_cluster(workers))))
@@ -115,13 +116,13 @@ def connected(
 
 
 def _local_cluster(workers: int | None) -> LocalCluster:
-    """A cluster on this machine that this process alone can use.
+    """Make a local cluster that only this process can use.
 
-    Its ports are open to every user of the machine, and whoever dask listens to can run code: it
-    listens to holders of a certificate made here, which stays in memory.
+    Its ports are open to every local user, and anyone connected to dask can run code. Therefore it
+    requires a certificate made here, which stays in memory.
     """
-    local: Any = LocalCluster  # whose annotations leave out that workers may be None
-    # dask starts its HTTP servers whatever it is told. They have no pages then, and are stopped.
+    local: Any = LocalCluster  # its annotations forbid None for workers
+    # dask always starts its HTTP servers. They have no pages here, and are stopped.
     try:
         security = Security.temporary()
     except ImportError as e:
@@ -133,7 +134,7 @@ def _local_cluster(workers: int | None) -> LocalCluster:
     # pyright knows no `dask.config`, which dask documents.
     settings: Any = dask
     with _ignore_sigint(), settings.config.set(no_pages):
-        # One thread a process: a chunk takes all devices of its process already.
+        # One thread per process: a chunk uses all devices of its process already.
         cluster = local(
             n_workers=workers,
             threads_per_worker=1,
@@ -148,19 +149,18 @@ def _local_cluster(workers: int | None) -> LocalCluster:
 
 
 class _NoHttp(WorkerPlugin):
-    """A worker without the HTTP server that dask gives it."""
+    """Worker without dask's HTTP server."""
 
     def setup(self, worker: distributed.Worker) -> None:
-        """Called by dask as the worker begins."""
+        """Stop the server; dask calls this when the worker begins."""
         worker.http_server.stop()
 
 
 @contextlib.contextmanager
 def _ignore_sigint() -> Iterator[None]:
-    """Processes that are started meanwhile do not hear Ctrl-C: they end with this one, which
-    does."""
-    # A terminal sends it to all of them, and each would print a traceback of its own. They inherit
-    # what is ignored here. Python lets only its main thread change this.
+    """Let processes started meanwhile ignore Ctrl-C; they end with this one."""
+    # A terminal sends it to all of them, and each would print its own traceback. They inherit
+    # ignored signals. Python allows this only in its main thread.
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -173,7 +173,7 @@ def _ignore_sigint() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """The client does not log a lost scheduler at length: `_answering` says it."""
+    """Suppress the client's log of a lost scheduler; `_answering` reports it."""
     logger = logging.getLogger("distributed.client")
     before = logger.level
     logger.setLevel(logging.CRITICAL)
@@ -196,14 +196,14 @@ def _answering() -> Iterator[None]:
     except ImportError as e:
         raise InputError(f"dask: {e} on the scheduler or a worker, {_IMPORTS}") from e
     except RuntimeError as e:
-        # The scheduler's own word for a class that it cannot import; dask has no error for it.
+        # The scheduler's text for a class that it cannot import; dask has no error class for it.
         if "deserialization" not in str(e):
             raise
         raise InputError(f"dask: the scheduler cannot read the sweep, {_IMPORTS}") from e
 
 
 def _versions() -> dict[str, str]:
-    """Return the versions of the packages that compute; those that read and draw may differ."""
+    """Return the versions of the computing packages; those for reading and figures may differ."""
     return {n: v for n, v in versions().items() if n in ("heli_jax", "jax", "jaxlib")}
 
 
@@ -233,15 +233,14 @@ def _check_versions(client: Client, where: str) -> None:
 
 
 def split_there(client: Client, job: Job, **options: Any) -> Split:
-    """Divide a sweep as a worker would, with `options` of `split_for`: its devices may be others
-    than this process's."""
+    """Divide a sweep in a worker, whose devices may differ, with `options` of `split_for`."""
     divide = functools.partial(split_for, shares=_threads(client), **options)
     ((_, split),) = mapped(client, divide, [job])
     return split
 
 
 def _threads(client: Client) -> int:
-    """Threads of all workers; at least one, since workers may come later."""
+    """Return the threads of all workers; at least one, because workers may come later."""
     by_worker: Any = client.nthreads()
     return max(1, sum(by_worker.values()))
 
@@ -249,7 +248,7 @@ def _threads(client: Client) -> int:
 def computed(
     client: Client, job: Job, split: Split, todo: Sequence[int]
 ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-    """The chunks as they are done, in any order.
+    """Yield the chunks in the order in which they finish.
 
     Yields:
         The number of a chunk and its variables, arrays (elements of the chunk, ...).
@@ -258,7 +257,7 @@ def computed(
         InputError: the scheduler or too many workers are gone.
     """
     token = uuid.uuid4().hex
-    # A task and no scattered data: where its copies die with their workers, dask makes it again.
+    # A task, not scattered data: if its copies die with their workers, dask makes it again.
     shipped = client.submit(_received, job, key=f"job-{token}")
     for k, results in mapped(client, _chunk, todo, shipped, split, token):
         yield todo[k], results
@@ -266,14 +265,17 @@ def computed(
 
 # Any: dask's futures and as_completed have no types.
 def _gathered(futures: list[Any]) -> Any:
-    """Futures as they are done and their results are here: to fetch one may wait without end, where
-    the worker that holds it has died."""
+    """Return futures as they finish, with their results already here.
+
+    Fetching a result later may block forever if its worker has died.
+    """
     return as_completed(futures, with_results=True, raise_errors=False)
 
 
 def _as_they_end(client: Client, running: Any) -> Iterator[tuple[Any, Callable[[], Any]]]:
-    """The futures as they end, in any order, each with what gives its result or raises its error;
-    more may be added meanwhile.
+    """Yield the futures as they end, each with a function that returns its result or raises.
+
+    More futures may be added meanwhile.
     """
     seen = looked = time.monotonic()
     while not running.is_empty():
@@ -299,7 +301,7 @@ def _as_they_end(client: Client, running: Any) -> Iterator[tuple[Any, Callable[[
 
 
 def _value(future: Any, result: Any) -> Any:
-    """The result of a future that ended, or its error raised."""
+    """Return the result of a future that ended, or raise its error."""
     if future.status == "error":
         raise result[1]
     if isinstance(result, CancelledError):
@@ -308,7 +310,7 @@ def _value(future: Any, result: Any) -> Any:
 
 
 def _works(worker: Mapping[str, Any]) -> bool:
-    """True if a worker takes tasks or is at one: dask pauses those that are short of memory."""
+    """True if a worker accepts or runs tasks: dask pauses those that are short of memory."""
     counts = worker.get("metrics", {}).get("task_counts", {})
     return worker.get("status") != "paused" or bool(counts.get("executing"))
 
@@ -320,17 +322,17 @@ def mapped(
     *shared: Any,
     may_die: bool = False,
 ) -> Iterator[tuple[int, Any]]:
-    """A function of each item, and of what they share, as they are done, in any order.
+    """Apply a function to each item and shared arguments; yield in the order of completion.
 
     Yields:
-        The place of an item, and what the function gave; None where workers died over it and
-        it `may_die`.
+        The index of an item and the function's result; None if workers died over it and it
+        `may_die`.
 
     Raises:
         InputError: the scheduler or its workers are gone.
     """
-    # Keys of this run alone: a scheduler remembers results by key, and one that still holds those
-    # of an earlier run would give them.
+    # Keys unique to this run: a scheduler caches results by key and could return those of an
+    # earlier run.
     token = uuid.uuid4().hex
     waiting, place = iter(range(len(items))), {}
 
@@ -341,19 +343,19 @@ def mapped(
         place[future.key] = k
         return future
 
-    # A few ahead of those that end.
+    # Submit a few tasks ahead.
     ahead = zip(range(_AHEAD * _threads(client)), waiting, strict=False)
     running = _gathered([submitted(k) for _, k in ahead])
     for future, result in _as_they_end(client, running):
         with _answering():
             try:
                 value = result()
-            # dask counts how many workers died over one task: the others go on.
+            # dask counts the workers that died over one task; the other tasks continue.
             except KilledWorker:
                 if not may_die:
                     raise
                 value = None
-        # Before it is written, or the worker would keep its results for as long.
+        # Before it is written, otherwise the worker would keep its results until then.
         future.release()
         following = next(waiting, None)
         if following is not None:
@@ -362,7 +364,7 @@ def mapped(
 
 
 def _received(job: Job) -> Job:
-    """A task that gives the job, so that each worker gets it once and not with every chunk."""
+    """Return the job as a task, so that each worker gets it once and not with every chunk."""
     return job
 
 
@@ -370,7 +372,7 @@ def _chunk(chunk: int, job: Job, split: Split, token: str) -> dict[str, np.ndarr
     """Compute a chunk in a worker process; the first one compiles the program."""
     with _building:
         if token not in _workers:
-            _workers.clear()  # of an earlier sweep: its programs would stay in memory
+            _workers.clear()  # an earlier sweep's programs would stay in memory
             _workers[token] = Worker(job, split)
         worker = _workers[token]
     return worker.run(chunk)

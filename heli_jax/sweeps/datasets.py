@@ -1,19 +1,18 @@
-"""Datasets of sweeps: as a grid of the axes, and piece by piece so that any size takes little
-memory."""
+"""Datasets of sweeps: as a grid of the axes, and in pieces to limit the memory."""
 
 from collections.abc import Iterator
 
 import numpy as np
 import xarray as xr
 
-# 8 MB of float64: large beside a chunk of the store, small beside the memory of any machine. A
-# chunk of the store that two pieces share is read twice.
+# 8 MB of float64: large compared with a chunk of the store, small compared with any memory. A chunk
+# of the store that two pieces share is read twice.
 _ELEMENTS = 1 << 20
 
 
 def chunks_of(variable: xr.DataArray) -> Iterator[tuple[slice, np.ndarray]]:
-    """Yield elements and the variable's values for them (k, ...), all in turn."""
-    # Others may have stored the elements last; a slice of them is a slice of rows here.
+    """Yield slices of elements and the variable's values for them (k, ...), in order."""
+    # The elements may be stored last; a slice of them is a slice of rows here.
     variable = variable.transpose("element", ...)
     for start in range(0, variable.sizes["element"], _ELEMENTS):
         which = slice(start, min(start + _ELEMENTS, variable.sizes["element"]))
@@ -21,11 +20,11 @@ def chunks_of(variable: xr.DataArray) -> Iterator[tuple[slice, np.ndarray]]:
 
 
 def as_grid(dataset: xr.Dataset) -> xr.Dataset:
-    """A sweep of every combination of its axes' values, with the axes in place of `element`.
+    """Return a sweep over a full grid, with the axes as dimensions instead of `element`.
 
     Args:
-        dataset: of `sweep`, or of a store that xarray has opened; of the design `grid`, or of any
-            other that has each combination once.
+        dataset: result of `sweep`, or a store opened by xarray; of the design `grid`, or any other
+            with each combination once.
 
     Returns:
         The same results and status over the axes, each in ascending order of its values.
@@ -40,7 +39,7 @@ def as_grid(dataset: xr.Dataset) -> xr.Dataset:
         places.append(place.reshape(-1))
     shape = tuple(values.size for values in labels.values())
     size = dataset.sizes["element"]
-    # Each cell once: as many as there are, and none twice.
+    # Each cell exactly once.
     cells = np.ravel_multi_index(tuple(places), shape)
     if np.unique(cells).size != size or size != np.prod(shape, dtype=float):
         counts = " x ".join(map(str, shape))

@@ -1,4 +1,4 @@
-"""A sweep as plain data, so that a resumed one can be told from another."""
+"""Description of a sweep as plain data, for the check of a resumed one."""
 
 import hashlib
 import inspect
@@ -18,10 +18,9 @@ from heli_jax.sweeps.spec import Job, moving_inputs_of
 
 
 def described(job: Job) -> dict[str, Any]:
-    """Return what fixes the numbers of a sweep, as plain data; equal for two jobs with the same
-    numbers."""
-    # Stored with each sweep and compared when it is resumed: another key, or another text for the
-    # same thing, refuses all stores there are. Large arrays stand in it as a digest.
+    """Return the data that define the numbers of a sweep; equal for jobs with equal numbers."""
+    # Stored with each sweep and compared on resumption. A renamed key or another text for the same
+    # thing would refuse all existing stores. Large arrays are stored as a digest.
     model = job.model
     flights = [
         {
@@ -30,7 +29,7 @@ def described(job: Job) -> dict[str, Any]:
             "dt": f.dt,
             "known": dict(f.known),
             "sha256": digest({**f.inputs, **{f"measured {n}": v for n, v in f.outputs.items()}}),
-            # Only where it is so: stores from before inputs could be linear have no such key.
+            # Only if it applies: older stores, from before inputs could be linear, lack this key.
             **{
                 hold: held
                 for hold in ("linear", "mixed")
@@ -43,8 +42,7 @@ def described(job: Job) -> dict[str, Any]:
     return {
         "model": model.name,
         "source": _source(model.vector_field),
-        # A constant that is missing is NaN, which no JSON has and which equals nothing, itself
-        # neither.
+        # A missing constant is NaN, which JSON lacks and which does not equal itself.
         "vehicle": {n: v for n, v in job.params.items() if np.isfinite(v)},
         "flights": flights,
         "design": job.design.description,
@@ -72,7 +70,7 @@ def _reducer(reduce: Reduce) -> dict[str, Any]:
         words: dict[str, Any] = {"how": reducer}
     else:
         function = reducer.update if isinstance(reducer, reducers.Streaming) else reducer
-        # A name and a fingerprint: the repr of a function has its address in memory.
+        # A name and a digest: the repr of a function has its address in memory.
         name = getattr(function, "__qualname__", str(type(function)))
         words = {"how": name, "source": _source(function)}
     words |= {
@@ -82,11 +80,13 @@ def _reducer(reduce: Reduce) -> dict[str, Any]:
 
 
 def _source(function: Callable[..., Any]) -> str:
-    """A fingerprint of the file that a function comes from, where it is not one of ours: another
-    program gives other numbers."""
+    """Return a digest of the file of a user's function: another program gives other numbers.
+
+    It is empty for functions of heli_jax.
+    """
     function = getattr(function, "func", function)  # of a functools.partial
     module = getattr(function, "__module__", "") or ""
-    # Ours change with the version, which is stored; a new comment here shall stop no sweep.
+    # Our own change with the version, which is stored; a new comment must not stop a sweep.
     if module.partition(".")[0] == "heli_jax":
         return ""
     try:
@@ -94,17 +94,17 @@ def _source(function: Callable[..., Any]) -> str:
         data = read_regular(file, "a module in Python", 10**7) if file else b""
         return hashlib.sha256(data).hexdigest() if file else ""
     except (TypeError, OSError, InputError):
-        # Typed into a session, or compiled: there is no file. Then the name alone tells it apart.
+        # Typed into a session, or compiled: there is no file, and only the name identifies it.
         return ""
 
 
 def require_same(old: Mapping[str, Any], new: Mapping[str, Any], where: str) -> None:
-    """Refuse to go on with what was described otherwise.
+    """Refuse to continue with another description.
 
     Raises:
         InputError: naming the first key in which the two differ; `where` begins the sentence.
     """
-    # Through JSON and back, as the stored one went: a tuple is a list there.
+    # Through JSON like the stored one, where a tuple becomes a list.
     changes = _differences(old, json.loads(json.dumps(new)))
     if changes:
         more = f" (and {len(changes) - 1} more)" if len(changes) > 1 else ""
@@ -112,7 +112,7 @@ def require_same(old: Mapping[str, Any], new: Mapping[str, Any], where: str) -> 
 
 
 def _differences(old: Mapping[str, Any], new: Mapping[str, Any], above: str = "") -> list[str]:
-    """The keys in which two descriptions differ, each with what was and what is."""
+    """Return the keys in which two descriptions differ, each with the old and the new value."""
     changes = []
     for key in {**old, **new}:
         a, b = old.get(key), new.get(key)

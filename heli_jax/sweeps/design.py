@@ -1,8 +1,8 @@
-"""Designs: which values the axes of a sweep take, element by element.
+"""Designs of experiments: values of a sweep's axes for each element.
 
-A design gives its values in slices, so that a sweep of any size takes little memory: a grid and a
-Sobol sequence are computed where they are needed (a Latin hypercube and a table are held whole).
-Values are in SI; a configuration's units are converted before.
+A design yields its values in slices, so a sweep of any size takes little memory. A grid and a Sobol
+sequence are computed on demand; a Latin hypercube and a table are held whole. Values are in SI; a
+configuration's units are converted beforehand.
 """
 
 import dataclasses
@@ -16,52 +16,50 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 _MOST_SOBOL = 2**30
-"""points, after which SciPy's sequence would begin again"""
+"""Most points: SciPy's sequence then repeats."""
 _engines = threading.Lock()
 Columns = dict[str, np.ndarray]
 
 
 class Range(NamedTuple):
-    """An axis from `lower` to `upper`, in SI, evenly in the value or in its logarithm."""
+    """An axis from `lower` to `upper`, in SI, with linear or logarithmic spacing."""
 
     lower: float
     upper: float
     scale: Literal["linear", "log"] = "linear"
     n: int | None = None
-    """points, for a grid"""
+    """Number of points, for a grid."""
 
     def at(self, fraction: np.ndarray) -> np.ndarray:
-        """The value at fractions (k,) of the way, 0 to 1; the ends are exact."""
-        # A weighted mean and no difference: that of two huge ends would overflow.
+        """Return the values at fractions (k,) from 0 to 1; the ends are exact."""
+        # A weighted mean, because the difference of two huge ends would overflow.
         low, high = float(self.lower), float(self.upper)
         if self.scale == "log":
-            # Both ends are negative or both positive, which was checked; the logarithm is of their
-            # size.
+            # Both ends have the same sign, which was checked; the logarithm is of their magnitude.
             sign = math.copysign(1.0, low)
             values = sign * np.exp(
                 (1.0 - fraction) * math.log(abs(low)) + fraction * math.log(abs(high))
             )
         else:
             values = (1.0 - fraction) * low + fraction * high
-        # exp(log(0.1)) is not 0.1: who asks for an end gets it to the last bit.
+        # exp(log(0.1)) is not exactly 0.1, but the ends must be.
         return np.where(fraction == 0.0, low, np.where(fraction == 1.0, high, values))
 
 
 def digest(arrays: Mapping[str, np.ndarray]) -> str:
-    """SHA-256 of named arrays, whatever their order."""
+    """Return the SHA-256 of named arrays, in any order."""
     sha = hashlib.sha256()
-    # In order of the names, since two dictionaries with the same arrays may have been filled in
-    # another order.
+    # Sorted by name, because equal dictionaries may have another order.
     for name in sorted(arrays):
         v = np.ascontiguousarray(arrays[name])
-        # Type and shape too: the bytes of two arrays may be equal where their numbers are not.
+        # With type and shape, because arrays with equal bytes may have different numbers.
         sha.update(f"{name}:{v.dtype.str}:{v.shape}:".encode())
         sha.update(v.tobytes())
     return sha.hexdigest()
 
 
 def check_range(name: str, axis: Range) -> None:
-    """Refuse an axis without a beginning below its end.
+    """Refuse an axis unless its lower end is below its upper end.
 
     Raises:
         ValueError: naming the axis.
@@ -89,7 +87,7 @@ def check_axes(axes: Mapping[str, object]) -> None:
 
 
 def axis_values(name: str, axis: Range | Sequence[float] | np.ndarray) -> np.ndarray:
-    """The values (k,) of one axis of a grid or a list.
+    """Return the values (k,) of one axis of a grid or a list.
 
     Raises:
         ValueError: there is none, or they are no numbers.
@@ -108,18 +106,18 @@ def axis_values(name: str, axis: Range | Sequence[float] | np.ndarray) -> np.nda
         raise ValueError(f"axes.{name}: no values, expected at least one")
     if values.dtype.kind not in "iuf":
         raise ValueError(f"axes.{name}: expected numbers, got {values[0]!r:.40}")
-    # Whole numbers stay whole, so that seeds stand as integers in the store.
+    # Integers stay integers, so that seeds are integers in the store.
     return values if values.dtype.kind in "iu" else values.astype(np.float64)
 
 
 def whole_seeds(values: np.ndarray) -> np.ndarray:
-    """Seeds (k,) as whole numbers.
+    """Return seeds (k,) as integers.
 
     Raises:
-        ValueError: one is none.
+        ValueError: one is no valid seed.
     """
-    # Refused and not rounded: 6.999, from a range that was not meant for seeds, would be seed 6.
-    # They reach JAX as uint32, so larger ones would draw what smaller ones do.
+    # Refused, not rounded: 6.999, from a range that was not meant for seeds, would be seed 6. JAX
+    # uses uint32, so larger seeds would repeat smaller ones.
     whole = np.isfinite(values) & (values == np.round(values)) & (values >= 0)
     wrong = values[~(whole & (values < 2**32))]
     if wrong.size:
@@ -131,30 +129,31 @@ def whole_seeds(values: np.ndarray) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Design:
-    """Values that the axes of a sweep take."""
+    """Values of the axes of a sweep."""
 
     names: tuple[str, ...]
-    """the axes"""
+    """Names of the axes."""
     size: int
-    """number of elements"""
+    """Number of elements."""
     values: Callable[[int, int], Columns]
-    """of (start, stop): by axis the values (stop - start,) of these elements"""
+    """Function of (start, stop) that returns the values (stop - start,) of these elements by axis.
+    """
     description: dict[str, Any]
-    """all that fixes the values, as plain data: two designs with the same are the same"""
+    """Plain data that fully define the values; equal descriptions mean equal designs."""
     logarithmic: frozenset[str] = frozenset()
-    """the axes that are even in the logarithm"""
+    """Axes with logarithmic spacing."""
 
 
 @functools.lru_cache(maxsize=8)
 def _sobol_engine(axes: int, seed: int) -> Any:
-    import scipy.stats.qmc  # not before it is needed: slow
+    import scipy.stats.qmc  # imported on demand: slow
 
     return scipy.stats.qmc.Sobol(axes, rng=np.random.default_rng(seed))
 
 
 def _sobol_points(axes: int, seed: int, start: int, stop: int) -> np.ndarray:
-    """Points start to stop (stop - start, axes) of a scrambled sequence in the unit cube."""
-    # One engine goes along with the slices in turn: to come to a point takes as long as to draw all
+    """Return points start to stop (stop - start, axes) of a scrambled sequence in the unit cube."""
+    # One engine advances with the slices, because reaching a point takes as long as drawing all
     # before it.
     with _engines:
         engine = _sobol_engine(axes, seed)
@@ -162,24 +161,24 @@ def _sobol_points(axes: int, seed: int, start: int, stop: int) -> np.ndarray:
             engine.reset()
         if start > engine.num_generated:
             engine.fast_forward(start - engine.num_generated)
-        # SciPy warns of numbers that are no power of two, which is right for a sequence and not for
-        # a slice: the first point alone is 1.
+        # SciPy warns if a count is no power of two, which matters for a sequence but not for a
+        # slice. The first point is drawn alone.
         first = [engine.random(1)] if start == 0 < stop else []
         return np.concatenate([*first, engine.random(stop - start - len(first))])
 
 
 def grid(axes: Mapping[str, Range | Sequence[float]]) -> Design:
-    """Every combination of the axes' values, the last axis fastest.
+    """Return every combination of the axes' values, the last axis fastest.
 
     Raises:
-        ValueError: no axis, one without points, or ends that do not fit.
+        ValueError: no axis, one without points, or invalid ends.
     """
     check_axes(axes)
     points = {n: axis_values(n, a) for n, a in axes.items()}
 
     def values(start: int, stop: int) -> Columns:
-        # An element's number in mixed radix, a digit for each axis, the last one least: no product
-        # of the axes has to be held.
+        # The element's number in mixed radix has a digit for each axis, so the product of the axes
+        # need not be stored.
         k = np.arange(start, stop)
         columns = {}
         for name, v in reversed(points.items()):
@@ -194,7 +193,7 @@ def grid(axes: Mapping[str, Range | Sequence[float]]) -> Design:
 
 
 def _geometric(values: np.ndarray) -> bool:
-    """True if each value is the one before times the same factor."""
+    """True if each value is the previous one times the same factor."""
     if values.size < 3 or not (np.all(values > 0) or np.all(values < 0)):
         return False
     steps = np.diff(np.log(np.abs(values)))
@@ -202,7 +201,7 @@ def _geometric(values: np.ndarray) -> bool:
 
 
 def paired(axes: Mapping[str, Range | Sequence[float]]) -> Design:
-    """The axes' values side by side: element k takes the k-th of each.
+    """Pair the axes' values: element k takes the k-th of each.
 
     Raises:
         ValueError: no axis, one without values, or axes of different length.
@@ -211,7 +210,7 @@ def paired(axes: Mapping[str, Range | Sequence[float]]) -> Design:
 
 
 def table(columns: Mapping[str, np.ndarray]) -> Design:
-    """The rows of a table, a column for each axis; not-a-number is an element that will be flagged.
+    """Return the rows of a table, a column for each axis; an element with NaN will be flagged.
 
     Raises:
         ValueError: no column, no row, or columns of different length.
@@ -220,15 +219,15 @@ def table(columns: Mapping[str, np.ndarray]) -> Design:
 
 
 def _columns(axes: Mapping[str, Any], kind: str) -> Design:
-    """Columns that are held whole, the k-th of each for element k."""
+    """Return a design from stored columns, the k-th value of each for element k."""
     check_axes(axes)
     columns = {n: axis_values(n, a) for n, a in axes.items()}
     if len({v.size for v in columns.values()}) > 1:
-        # Told with all lengths: which of the axes is the wrong one only the user knows.
+        # With all lengths, because only the user knows which axis is wrong.
         words = ", ".join(f"{n} has {v.size}" for n, v in columns.items())
         raise ValueError(f"axes: {words} values, expected the same number in a {kind}")
     size = next(iter(columns.values())).size
-    # A digest in place of the values: a table may be larger than all results.
+    # A digest instead of the values, because a table may be larger than all results.
     description = {"design": kind, "axes": list(columns), "n": size, "sha256": digest(columns)}
 
     def values(start: int, stop: int) -> Columns:
@@ -238,28 +237,29 @@ def _columns(axes: Mapping[str, Any], kind: str) -> Design:
 
 
 def lhs(axes: Mapping[str, Range], n: int, seed: int = 0) -> Design:
-    """A Latin hypercube of n points (`scipy.stats.qmc.LatinHypercube`).
+    """Return a Latin hypercube of n points (`scipy.stats.qmc.LatinHypercube`).
 
     Args:
-        axes: by name, from where to where, SI.
-        seed: of the points; the same one gives the same.
+        axes: ranges by name, SI.
+        n: number of elements.
+        seed: seed of the points; equal seeds give equal points.
 
     Raises:
-        ValueError: no axis, ends that do not fit, or no points.
+        ValueError: no axis, invalid ends, or no points.
     """
     return _sampled(axes, n, seed, "lhs", functools.partial(_hypercube, len(axes), n, seed))
 
 
 def sobol(axes: Mapping[str, Range], n: int, seed: int = 0) -> Design:
-    """The first n points of a scrambled Sobol sequence (`scipy.stats.qmc.Sobol`).
+    """Return the first n points of a scrambled Sobol sequence (`scipy.stats.qmc.Sobol`).
 
     Args:
-        axes: by name, from where to where, SI.
-        n: elements; a power of two is most even.
-        seed: of the scrambling; the same one gives the same points.
+        axes: ranges by name, SI.
+        n: number of elements; powers of two are most uniform.
+        seed: seed of the scrambling; equal seeds give equal points.
 
     Raises:
-        ValueError: no axis, ends that do not fit, or no points.
+        ValueError: no axis, invalid ends, or no points.
     """
     if n > _MOST_SOBOL:
         raise ValueError(f"n must be at most {_MOST_SOBOL} in a Sobol sequence, got {n}")
@@ -273,7 +273,7 @@ def _sampled(
     kind: str,
     points: Callable[[int, int], np.ndarray],
 ) -> Design:
-    """Points (stop - start, axes) of the unit cube, mapped to the axes."""
+    """Map points (stop - start, axes) of the unit cube to the axes."""
     check_axes(axes)
     for name, axis in axes.items():
         if not isinstance(axis, Range):
@@ -294,9 +294,9 @@ def _sampled(
 
 @functools.lru_cache(maxsize=8)
 def _whole_hypercube(axes: int, n: int, seed: int) -> np.ndarray:
-    import scipy.stats.qmc  # not before it is needed: slow
+    import scipy.stats.qmc  # imported on demand: slow
 
-    # Whole, since where a point lies depends on all others: a slice cannot be drawn alone.
+    # Whole, because each point depends on all others: a slice cannot be drawn alone.
     return scipy.stats.qmc.LatinHypercube(axes, rng=np.random.default_rng(seed)).random(n)
 
 
@@ -305,7 +305,7 @@ def _hypercube(axes: int, n: int, seed: int, start: int, stop: int) -> np.ndarra
 
 
 def product(*parts: Design) -> Design:
-    """Every element of each design with every element of the others, the last fastest.
+    """Combine every element of each design with every element of the others, the last fastest.
 
     Raises:
         ValueError: no design, or an axis in two of them.
@@ -317,8 +317,8 @@ def product(*parts: Design) -> Design:
         for part in reversed(parts):
             index = k % part.size
             k = k // part.size
-            # Only the rows of the part that the slice touches: the part may be as large as a sweep.
-            # An empty slice has no least row; it still has its axes, with no values.
+            # Only the rows of the part that the slice touches, because the part may be as large as
+            # a sweep. An empty slice has no smallest row, but it has axes without values.
             low, high = (int(index.min()), int(index.max()) + 1) if index.size else (0, 0)
             rows = part.values(low, high)
             columns = {**{n: v[index - low] for n, v in rows.items()}, **columns}
@@ -328,7 +328,7 @@ def product(*parts: Design) -> Design:
 
 
 def zipped(*parts: Design) -> Design:
-    """Designs of one size side by side.
+    """Pair designs of one size.
 
     Raises:
         ValueError: no design, an axis in two of them, or designs of different sizes.
@@ -347,11 +347,11 @@ def zipped(*parts: Design) -> Design:
 def _combined(
     parts: tuple[Design, ...], size: int, values: Callable[[int, int], Columns], kind: str
 ) -> Design:
-    """Designs that together are one, each with axes of its own."""
+    """Combine designs with different axes into one."""
     if not parts:
         raise ValueError("of: no designs, expected at least one")
     names = tuple(n for part in parts for n in part.names)
-    # Which of two designs sets the axis would depend on their order.
+    # Otherwise the order of the designs would decide the axis.
     if twice := [n for n in names if names.count(n) > 1]:
         raise ValueError(f"the axis {twice[0]!r} is in two designs, expected one")
     description = {"design": kind, "of": [part.description for part in parts]}

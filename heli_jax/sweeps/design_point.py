@@ -1,7 +1,6 @@
 """One element of a sweep: values of the axes in, results and status out; traced by JAX."""
 
-# `Any` below: State, Inputs, Outputs and Params are the user's own classes, and what a function of
-# the user's returns is theirs too.
+# `Any` below: State, Inputs, Outputs, Params and the results of functions are the user's types.
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -23,33 +22,32 @@ from heli_jax.sweeps.reducers import Measured
 from heli_jax.sweeps.spec import Job, Plan
 
 Scalars = dict[str, jax.Array]
-"""numbers () by name"""
+"""Numbers () by name."""
 
-# Accelerations [SI] below which a flight is steady. `trim` asks for 1e-10 and tries from several
-# places; an element of a batch has one try, and may end a little above.
+# Accelerations [SI] below which a flight is steady. `trim` requires 1e-10 and tries several starts;
+# an element of a batch has one try and may end slightly above.
 _TRIMMED = 1e-6
 
 
 class FlightNumbers(NamedTuple):
-    """The numbers of a flight and of the vehicle, in the sweep's precision."""
+    """Numbers of a flight and of the vehicle, in the sweep's precision."""
 
-    # Arguments of the compiled part and no constants in it: another flight of the same length, or
-    # another vehicle, needs no new program.
+    # Arguments of the compiled part, not constants in it. A flight of the same length, or another
+    # vehicle, needs no new program.
 
     base: dict[str, Any]
-    """the vehicle's"""
+    """The vehicle's numbers."""
     dt: Any
     inputs: Any
     known: dict[str, Any]
     measured: dict[str, Measured]
-    """by result, of those that compare with the flight"""
+    """Measured signals by result, for results that compare with the flight."""
     pilot: Any
 
 
 def flight_numbers(job: Job, index: int) -> FlightNumbers:
-    """The numbers of one of the job's flights."""
-    # All numbers are cast here, once: a single float64 among them would make JAX compute in
-    # float64.
+    """Return the numbers of one of the job's flights."""
+    # All numbers are cast here, once: a single float64 would make JAX compute in float64.
     dtype, flight, model = np.dtype(job.precision), job.flights[index], job.model
     inputs = {n: flight.inputs[n].astype(dtype) for n in naming.names(model.Inputs)}
     against = {
@@ -68,47 +66,46 @@ def flight_numbers(job: Job, index: int) -> FlightNumbers:
 
 
 class InitialTrim(NamedTuple):
-    """The steady flight that an element begins in."""
+    """Steady flight in which an element begins."""
 
     state: Any
     sticks: Any
-    """the model's Inputs, added to the flight's"""
+    """The model's Inputs, added to the flight's."""
     sound: Any
-    """whether there is such a flight"""
+    """True if there is such a flight."""
 
 
 def params_of(plan: Plan, numbers: FlightNumbers, values: Scalars) -> tuple[Any, Scalars]:
-    """The element's parameters, and the axes that are not among them."""
+    """Return the element's parameters, and the axes that are not among them."""
     names = naming.names(plan.model.Params)
     swept = {n: v for n, v in values.items() if n in names}
-    # In this order: what a flight knows of its machine goes before the vehicle's, an axis before
-    # both.
+    # In this order: the flight's known values override the vehicle's, and an axis overrides both.
     params = plan.model.Params(**{**numbers.base, **numbers.known, **swept})
     return params, {n: v for n, v in values.items() if n not in names}
 
 
 def steady(plan: Plan, numbers: FlightNumbers, values: Scalars) -> InitialTrim:
-    """The steady flight of one element.
+    """Return the steady flight of one element.
 
     Args:
-        plan: what is compiled; its `trimmed` says which flight.
-        numbers: of the flight and the vehicle, SI.
-        values: of the axes, scalars, SI.
+        plan: compiled plan; its `trimmed` defines the flight.
+        numbers: numbers of the flight and the vehicle, SI.
+        values: values of the axes, scalars, SI.
     """
     assert plan.trimmed is not None
     whole, dtype = plan.trimmed.of or plan.model, numbers.dt.dtype
     params, _ = params_of(plan, numbers, values)
     plain = whole.Params(**{n: getattr(params, n) for n in naming.names(whole.Params)})
-    # In the default precision whatever the sweep's: an iteration in float32 ends at residuals that
-    # are no proof of a steady flight.
+    # In the default precision for any sweep: in float32 the final residuals are too large to prove
+    # a steady flight.
     plain, condition, wind = jax.tree.map(
         lambda v: jnp.asarray(v, jnp.result_type(float)),
         (plain, plan.trimmed.condition, tuple(plan.trimmed.wind)),
     )
-    # Of the model without a disturbance: a steady flight is one in still air or steady wind.
+    # Without a disturbance: a steady flight is in still air or steady wind.
     trim = equilibrium(whole, plain, condition, wind)
     sound = _is_trimmed(trim)
-    # The states of a disturbance have no trim and keep their own beginning.
+    # The states of a disturbance have no trim and keep their own initial values.
     state = naming.replace(plan.model.initial_state(params), **naming.asdict(trim.state))
     share = 1.0 if plan.trimmed.sticks else 0.0
     sticks = jax.tree.map(lambda v: jnp.asarray(share * v, dtype), trim.inputs)
@@ -118,39 +115,39 @@ def steady(plan: Plan, numbers: FlightNumbers, values: Scalars) -> InitialTrim:
 
 def _is_trimmed(trim: Trim) -> jax.Array:
     """True if it is a steady flight within the sticks' travel."""
-    # `trim` raises where there is none; one of a batch can only be flagged.
+    # `trim` raises without a solution; in a batch the element can only be flagged.
     sound = plausible(trim) & (trim.residual < _TRIMMED)
     for name, (low, high) in STICKS.items():
         if not hasattr(trim.inputs, name):
             continue
         stick = getattr(trim.inputs, name)
-        # A governor's stick stands at its end, which rounding may pass.
+        # A governor's stick is at its end, which rounding may exceed.
         sound = sound & (stick >= low - _TRIMMED) & (stick <= high + _TRIMMED)
     return sound
 
 
 _Run = tuple[Scalars, dict[str, jax.Array], Any, list[jax.Array]]
-"""results, trajectories (samples kept,), the last State, and whether each limit was left"""
+"""Results, trajectories (samples kept,), the last State, and whether each limit was left."""
 
 OK, DIVERGED, OUT_OF_RANGE, NOT_RUN = 0, 1, 2, 255
 MEANINGS = {OK: "ok", DIVERGED: "diverged", OUT_OF_RANGE: "out_of_range", NOT_RUN: "not_run"}
-"""The status of an element. Diverged: a state or an axis is not finite, or a state is beyond
-`RUNAWAY`. Out of range: a parameter no helicopter can have, the model's range was left, or there is
-no steady flight to begin with."""
+"""Status of an element. Diverged: a state or an axis is not finite, or a state is beyond `RUNAWAY`.
+Out of range: a parameter is impossible for a helicopter, the model's range was left, or there is no
+steady flight to begin with."""
 
 RUNAWAY = 1e12
-"""Where a state [SI] no longer is that of a helicopter."""
+"""Magnitude [SI] above which a state is not that of a helicopter."""
 
-# Samples per step of the exact solver: fastest where many elements are side by side (see
+# Samples per step of the exact solver: fastest with many elements in parallel (see
 # `SimulationOptions.block`).
 _BLOCK = 4
-# The same for one program a run, where more coefficients a vehicle take longer to make than they
-# save: roll model, AVX2, busy machine, a whole sweep 7.5 and 8.0 us a vehicle with 2, 7.9 with 3,
-# 8.4 with 4 (one or two runs each).
+# The same for one program per run, where more coefficients per vehicle take longer to compute than
+# they save. Measured with the roll model, AVX2, a busy computer, a whole sweep, one or two runs
+# each: 7.5 and 8.0 us a vehicle with 2, 7.9 with 3, 8.4 with 4.
 _FUSED_BLOCK = 2
-# States and inputs beyond which a step is one sample: hybrid-flybarless has 15 of them, and 3000
-# samples of a vehicle took 119 us with 1 and 187 with 2, by XLA 116 and 140 beside them (processor
-# time, AVX2, busy machine, medians of four). Between 5 and 15 nothing was measured.
+# Number of states and inputs above which a step is one sample. hybrid-flybarless has 15: 3000
+# samples of a vehicle took 119 us with 1 and 187 with 2, by XLA 116 and 140 (processor time, AVX2,
+# busy computer, medians of four). Values between 5 and 15 were not measured.
 _FUSED_BLOCK_FITS = 8
 
 
@@ -160,29 +157,29 @@ class ElementResults(NamedTuple):
     results: dict[str, Any]
     trajectories: dict[str, Any]
     matrices: Any
-    """the linearisation where the run begins, if a result needs it"""
+    """Linearisation at the start of the run, if a result needs it."""
     status: Any
 
 
 def design_point(
     plan: Plan, numbers: FlightNumbers, values: Scalars, trim: InitialTrim | None
 ) -> ElementResults:
-    """One element.
+    """Compute one element.
 
     Args:
-        numbers: of the flight and the vehicle, SI.
-        values: of the axes, scalars, SI.
-        trim: the steady flight to begin in; None for the model's initial state.
+        plan: compiled plan.
+        numbers: numbers of the flight and the vehicle, SI.
+        values: values of the axes, scalars, SI.
+        trim: steady flight to begin in; None for the model's initial state.
     """
     params, special = params_of(plan, numbers, values)
     state, inputs = _beginning(plan.model, params, numbers, special, trim)
     if trim is not None and numbers.pilot is not None:
-        # The gains are those for the vehicle as it is given, the flight is this one's own.
+        # The gains are those for the given vehicle; the flight is this element's own.
         numbers = numbers._replace(pilot=numbers.pilot._replace(trimmed=trim.state))
     run = None
     if plan.simulated:
-        # Streamed wherever that is possible: a run is then never held, and a device has room for
-        # more of them.
+        # Streamed if possible: the run is then not stored, and a device has room for more runs.
         if plan.streamed:
             run = _streamed(plan, numbers, params, state, inputs)
         else:
@@ -193,8 +190,7 @@ def design_point(
 def steps_of(
     plan: Plan, numbers: FlightNumbers, values: Scalars, trim: InitialTrim | None
 ) -> Steps:
-    """The run of one element in its steps, for a plan that is streamed; arguments as
-    `design_point` has them."""
+    """Return the run of one element in steps; arguments as in `design_point`, plan streamed."""
     params, special = params_of(plan, numbers, values)
     state, inputs = _beginning(plan.model, params, numbers, special, trim)
     update, start, data = _streaming(plan, numbers)
@@ -219,10 +215,11 @@ def of_steps(
     trim: InitialTrim | None,
     reduced: tuple[Any, Any, dict[str, Any]],
 ) -> ElementResults:
-    """The element of which `steps_of` gave the steps.
+    """Return the results of an element from the steps of `steps_of`.
 
     Args:
-        plan, numbers, values, trim: as `design_point` has them.
+        plan, numbers, values, trim: as in `design_point`.
+        reduced: final value, state and limits of the run.
     """
     return _concluded(plan, numbers, values, trim, _of_reduced(plan, numbers, *reduced))
 
@@ -234,10 +231,9 @@ def _concluded(
     trim: InitialTrim | None,
     run: _Run | None,
 ) -> ElementResults:
-    """Results and status, from what is left of the run."""
+    """Return results and status from the reduced run."""
     model, dtype = plan.model, numbers.dt.dtype
-    # From here on the later question wins, so that the order of these steps is the order of
-    # importance.
+    # A later status overrides an earlier one, so the order of these steps is that of importance.
     status = jnp.asarray(OK)
     results: Scalars = {}
     kept: dict[str, jax.Array] = {}
@@ -245,17 +241,17 @@ def _concluded(
         results, kept, last, outside = run
         for left in outside:
             status = jnp.where(left, OUT_OF_RANGE, status)
-        # NaN is below nothing, so it counts here too. After the range: a run that left it and then
-        # diverged has no number to show.
+        # NaN compares as false, so it counts here too. This follows the range check, because a run
+        # that left the range and then diverged has no valid numbers.
         sound = jnp.stack([jnp.abs(v) < RUNAWAY for v in jax.tree.leaves(last)])
         status = jnp.where(jnp.all(sound), status, DIVERGED)
     if trim is not None:
-        # Last: the NaN that such an element began with would otherwise pass for a divergence.
+        # Last, because such an element begins with NaN, which would look like a divergence.
         status = jnp.where(trim.sound, status, OUT_OF_RANGE)
     matrices = None
     if any(r.how in reducers.LINEAR for _, r in plan.reduce):
-        # Eigenvalues and margins are made of these by NumPy after the chunk, in float64 whatever
-        # the device.
+        # NumPy computes eigenvalues and margins from these after the chunk, in float64 on any
+        # device.
         params, special = params_of(plan, numbers, values)
         state, inputs = _beginning(model, params, numbers, special, trim)
         at_start = jax.tree.map(lambda u: u[0], inputs)
@@ -267,13 +263,13 @@ def _concluded(
 def _beginning(
     model: Model, params: Any, numbers: FlightNumbers, special: Scalars, trim: InitialTrim | None
 ) -> tuple[Any, Any]:
-    """The state at the first sample and the inputs (N,) of an element."""
+    """Return the state at the first sample and the inputs (N,) of an element."""
     inputs = numbers.inputs
     if trim is None:
         dtype = numbers.dt.dtype
         state = jax.tree.map(lambda v: jnp.asarray(v, dtype), model.initial_state(params))
     else:
-        # Without a steady flight there is no run: what would come of it is no result.
+        # Without a steady flight the run is not valid, and NaN marks it.
         state = jax.tree.map(lambda v: jnp.where(trim.sound, v, jnp.nan), trim.state)
         inputs = jax.tree.map(lambda u, stick: u + stick, inputs, trim.sticks)
     initial = {
@@ -283,20 +279,18 @@ def _beginning(
 
 
 def _gained_and_offset(inputs: Any, special: Scalars) -> Any:
-    """The inputs of this element: the flight's times a gain, and an offset."""
+    """Return the element's inputs: the flight's times a gain, plus an offset."""
     changed = {}
     for name, u in naming.asdict(inputs).items():
         gain, offset = special.get(f"gain.{name}"), special.get(f"offset.{name}")
-        # The offset is not multiplied by the gain, so that neither axis changes what the other
-        # means.
+        # The gain does not multiply the offset, so the axes are independent.
         u = u if gain is None else gain * u
         changed[name] = u if offset is None else u + offset
     return type(inputs)(**changed)
 
 
 def _streaming(plan: Plan, numbers: FlightNumbers) -> tuple[Any, dict[str, Any], dict[str, Any]]:
-    """Return the streaming reducers' step at a sample, their first values, and the measured signals
-    (N,) to compare with."""
+    """Return the streaming reducers' update, their first values, and the measured signals (N,)."""
     dtype = numbers.dt.dtype
     signals = {n: r.signal for n, r in plan.reduce}
     streams = {n: s for n, r in plan.reduce if (s := reducers.streaming(r)) is not None}
@@ -310,7 +304,7 @@ def _streaming(plan: Plan, numbers: FlightNumbers) -> tuple[Any, dict[str, Any],
         return numbers.measured[name]._replace(values=now[name][0], seen=now[name][1])
 
     def update(value: dict[str, Any], outputs: Any, now: dict[str, Any]) -> dict[str, Any]:
-        """The running values with one sample more."""
+        """Return the running values after one more sample."""
         new = {}
         for name, stream in streams.items():
             y = outputs if (signal := signals[name]) is None else getattr(outputs, signal)
@@ -321,7 +315,7 @@ def _streaming(plan: Plan, numbers: FlightNumbers) -> tuple[Any, dict[str, Any],
 
 
 def _finished(plan: Plan, numbers: FlightNumbers, value: dict[str, Any], n: int) -> Scalars:
-    """The results of the streaming reducers after n samples, by name."""
+    """Return the results of the streaming reducers after n samples, by name."""
     results: Scalars = {}
     count = jnp.asarray(n, numbers.dt.dtype)
     for name, reducer in plan.reduce:
@@ -338,7 +332,7 @@ def _of_function(name: str, function: Callable[[Trajectory], Any], run: Trajecto
     try:
         results = {n: jnp.asarray(v) for n, v in _named(name, function(run)).items()}
     except Exception as e:  # whatever the function raises
-        # JAX's own sentences go on for pages.
+        # JAX's messages are pages long.
         first = str(e).partition("\n")[0]
         raise ValueError(
             f"reduce.{name}: {called} cannot be computed ({type(e).__name__}: {first:.200}), "
@@ -356,14 +350,14 @@ def _of_function(name: str, function: Callable[[Trajectory], Any], run: Trajecto
 
 
 def _named(name: str, result: Any) -> dict[str, Any]:
-    """A result by name; several of one function by name and key."""
+    """Return a result by name; several of one function by name and key."""
     if isinstance(result, dict):
         return {f"{name}_{key}": v for key, v in result.items()}
     return {name: result}
 
 
 def _streamed(plan: Plan, numbers: FlightNumbers, params: Any, state: Any, inputs: Any) -> _Run:
-    """The run reduced while it goes on."""
+    """Return the run, reduced during the simulation."""
     update, start, data = _streaming(plan, numbers)
     options = _streamed_options(plan, numbers, state, _BLOCK)
     reduced = accumulated(
@@ -389,7 +383,7 @@ def _streamed_options(
 def _of_reduced(
     plan: Plan, numbers: FlightNumbers, value: Any, state: Any, outside: dict[str, Any]
 ) -> _Run:
-    """Return the results of a run that was not kept."""
+    """Return the results of a run that was not stored."""
     n = jax.tree.leaves(numbers.inputs)[0].shape[0]
     return _finished(plan, numbers, value, n), {}, state, list(outside.values())
 
@@ -397,7 +391,7 @@ def _of_reduced(
 def _whole(
     plan: Plan, numbers: FlightNumbers, params: Any, state: Any, inputs: Any, special: Scalars
 ) -> _Run:
-    """The whole run, for functions of it and for trajectories to keep."""
+    """Return the stored run, for functions of it and for trajectories to keep."""
     options = plan.simulation(
         dt=numbers.dt,
         initial_state=state,
@@ -407,7 +401,7 @@ def _whole(
     )
     run: Trajectory = simulate(plan.model, params, inputs, options)
     update, start, data = _streaming(plan, numbers)
-    # Sample by sample here too, so that each result has one definition however the run is made.
+    # Sample by sample here too, so that each result has one definition for any kind of run.
     value, _ = jax.lax.scan(lambda v, now: (update(v, *now), None), start, (run.outputs, data))
     n = run.times.shape[0]
     results = _finished(plan, numbers, value, n)

@@ -1,4 +1,4 @@
-"""A chunk whose runs are one program of machine code, with XLA before and behind it."""
+"""Chunks whose runs are one program of machine code, with XLA before and after it."""
 
 import functools
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ from heli_jax.sweeps.program import arguments, filled_up, spread, trims_of
 from heli_jax.sweeps.spec import Job, Plan
 
 _SOLVERS = ("exact", "rk4", "Euler")
-"""those with a translation: the others of diffrax's are made with operations of their own"""
+"""Solvers with a translation; other solvers of diffrax use operations of their own."""
 
 # `Any` below: trees of arrays, jaxprs, the functions that JAX compiles and its devices.
 
@@ -35,17 +35,17 @@ class _Parts(NamedTuple):
     kernel: Kernel
     run: Traced
     begin: Any
-    """of (numbers, (values, trim)): what an element begins with, `Traced.own`"""
+    """Function of (numbers, (values, trim)): initial values of an element, `Traced.own`."""
     common: Any
-    """of (numbers, values, trim) of any element: what stays and is the same for all"""
+    """Function of (numbers, values, trim) of any element: constants common to all."""
     conclude: Any
-    """of (numbers, (values, trim, reduced)): the results"""
+    """Function of (numbers, (values, trim, reduced)): the results."""
     split: Any
     trims: Any
 
 
 def refusal(job: Job, devices: Sequence[Any], lanes: int) -> str | None:
-    """Reason why the job's runs cannot be one program each; None if they can."""
+    """Return why the job's runs cannot be fused; None if they can."""
     if devices[0].platform != "cpu":
         return "it is for CPUs alone"
     if not job.streamed or not job.simulated:
@@ -53,7 +53,7 @@ def refusal(job: Job, devices: Sequence[Any], lanes: int) -> str | None:
     if job.solver not in _SOLVERS:
         return f"there is no translation of the solver {job.solver}"
     try:
-        # What it compiles is remembered, for the sweep that follows.
+        # The compiled program is cached for the sweep that follows.
         for index in range(len(job.flights)):
             FusedProgram(job, index, devices, lanes)
     except UnsupportedError as e:
@@ -62,7 +62,7 @@ def refusal(job: Job, devices: Sequence[Any], lanes: int) -> str | None:
 
 
 class FusedProgram:
-    """The compiled part for one flight; a chunk is cut among threads, as many as devices."""
+    """Compiled part for one flight; a chunk is divided among threads, one per device."""
 
     def __init__(self, job: Job, index: int, devices: Sequence[Any], lanes: int) -> None:
         plan, numbers, values, trim = _example(job, index)
@@ -70,11 +70,11 @@ class FusedProgram:
         leaves, structure = jax.tree.flatten((numbers, values, trim))
         kinds = tuple((np.shape(v), np.asarray(v).dtype) for v in leaves)
         self._parts = _compiled(plan, structure, kinds, tuple(devices), lanes)
-        # Whole blocks of the kernel too: both are powers of two, unless lanes were asked for.
+        # Whole blocks of the kernel too; both are powers of two, unless lanes were requested.
         self._step = int(np.lcm(lanes * len(devices), self._parts.kernel.lanes))
 
     def __call__(self, values: dict[str, np.ndarray], size: int) -> ElementResults:
-        """A chunk of values (k,), filled up to `size` elements; arrays (size,)."""
+        """Compute a chunk of values (k,), padded to `size` elements; arrays (size,)."""
         parts, numbers = self._parts, self._numbers
         filled = filled_up(values, size, self._step)
         trims = None if parts.trims is None else parts.trims(numbers, filled)
@@ -100,7 +100,7 @@ def _with(numbers: FlightNumbers, records: Any) -> FlightNumbers:
 
 
 def _without(numbers: FlightNumbers) -> FlightNumbers:
-    """The numbers of a flight that are no records."""
+    """Return the numbers of a flight without its records."""
     return _with(numbers, (None, dict.fromkeys(numbers.measured, (None, None))))
 
 
@@ -116,7 +116,7 @@ def _example(job: Job, index: int) -> tuple[Plan, FlightNumbers, Scalars, Any]:
 
 
 class _Elements(NamedTuple):
-    """An element's run in steps whose results are what `of_steps` takes."""
+    """An element's run in steps, with results in the form for `of_steps`."""
 
     of: Steps
 
@@ -152,7 +152,7 @@ def _compiled(
     devices: tuple[Any, ...],
     lanes: int,
 ) -> _Parts:
-    """The program, remembered as `program` does it."""
+    """Compile the program; cached as in `program`."""
     example = jax.tree.unflatten(structure, [np.zeros(*kind) for kind in kinds])
     run = _traced(plan, *example)
 

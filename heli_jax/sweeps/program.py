@@ -1,7 +1,7 @@
-"""The compiled part of a sweep: `design_point` over the elements of a chunk, on all devices."""
+"""Compiled part of a sweep: `design_point` over the elements of a chunk, on all devices."""
 
 # `Any` below: a tree of arrays that JAX maps over, the functions that it compiles, and its devices,
-# whose class type checkers do not take for one.
+# whose class type checkers reject.
 
 import functools
 from collections.abc import Callable, Sequence
@@ -23,17 +23,16 @@ from heli_jax.sweeps.design_point import (
 )
 from heli_jax.sweeps.spec import Job, Plan
 
-# XLA stays at 256 bits unless it is told, where elements side by side gain most from the widest
-# vectors there are: roll model, 64 lanes, two cores: 1.5 times as fast. Without AVX-512 nothing
-# changes.
+# XLA uses 256 bits by default, but parallel elements gain from the widest vectors: 1.5 times as
+# fast for the roll model, 64 lanes, two cores. Without AVX-512 nothing changes.
 _CPU_OPTIONS = {"xla_cpu_prefer_vector_width": 512}
 
 
 def arguments(job: Job, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The axes' values as the compiled part takes them."""
+    """Return the axes' values in the form for the compiled part."""
     dtype = np.dtype(job.precision)
-    # A seed in float32 would lose its last digits beyond 2^24. One that is not a number gets some
-    # number, and its element is flagged afterwards.
+    # A seed in float32 would lose its last digits beyond 2^24. A NaN seed gets some number, and its
+    # element is flagged afterwards.
     whole = {"seed"} - set(naming.names(job.model.Params))
     return {
         n: np.nan_to_num(v).astype(np.uint32) if n in whole else v.astype(dtype)
@@ -42,11 +41,11 @@ def arguments(job: Job, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]
 
 
 def shapes(job: Job, index: int) -> ElementResults:
-    """The shapes of what `design_point` gives for one of the job's flights."""
+    """Return the shapes of the results of `design_point` for one of the job's flights."""
     columns = arguments(job, job.design.values(0, 1))
     example = (flight_numbers(job, index), {n: v[0] for n, v in columns.items()})
     leaves, structure = jax.tree.flatten(example)
-    # Arrays cannot be a key of what is remembered; their shapes can.
+    # Arrays cannot be a cache key; their shapes can.
     return _shapes(job.plan(index), structure, tuple((v.shape, v.dtype) for v in leaves))
 
 
@@ -63,35 +62,38 @@ def _shapes(
 
 @functools.lru_cache(maxsize=32)
 def _compiled(plan: Plan, devices: tuple[Any, ...], lanes: int) -> tuple[Any, Any, Any]:
-    """The functions that compute steady flights and elements on some devices, and how what is
-    mapped is shared among these."""
-    # Remembered, since every flight of a sweep and every sweep of the same plan asks for it.
+    """Return the functions for steady flights and elements, and the sharding of mapped arrays."""
+    # Cached, because every flight of a sweep and every sweep of the same plan uses it.
     run, split = spread(functools.partial(design_point, plan), devices, lanes)
     return trims_of(plan, lanes), run, split
 
 
 def trims_of(plan: Plan, lanes: int) -> Any:
-    """The function of (numbers, values of the axes) that gives the steady flights in which elements
-    begin; None where they do not."""
+    """Return the function that computes the elements' initial steady flights; None without them.
+
+    Its arguments are the numbers and the values of the axes.
+    """
 
     def starts(numbers: FlightNumbers, values: Scalars) -> InitialTrim:
         return _batched(functools.partial(steady, plan, numbers), values, lanes)
 
-    # Apart, since lineax does not work within shard_map.
+    # Separate, because lineax does not work within shard_map.
     return None if plan.trimmed is None else jax.jit(starts)
 
 
 def spread(
     function: Callable[..., Any], devices: tuple[Any, ...], lanes: int
 ) -> tuple[Any, jax.sharding.NamedSharding]:
-    """A function of elements, compiled for many of them.
+    """Compile a function of elements for many of them.
 
     Args:
-        function: of the numbers of a flight and of what an element has of its own.
+        function: function of the numbers of a flight and of an element's own data.
+        devices: devices of JAX.
+        lanes: batch size.
 
     Returns:
-        The function of the numbers and of a tuple of arrays with an element a row, and how those
-        rows lie on the devices.
+        The function of the numbers and of a tuple of arrays with one row per element, and the
+        sharding of those rows.
     """
     mesh = jax.sharding.Mesh(np.asarray(devices), ("device",))
     split = PartitionSpec("device")
@@ -100,8 +102,8 @@ def spread(
         return _batched(lambda m: function(numbers, *m), mapped, lanes)
 
     options = _CPU_OPTIONS if devices[0].platform == "cpu" else None
-    # Each device runs the program of its own part, as it would alone: how many there are changes no
-    # digit, where a jit over sharded arrays leaves to XLA how it cuts them.
+    # Each device runs the program of its own part alone, so the number of devices changes no digit.
+    # With a jit over sharded arrays, XLA would decide the division.
     run = jax.jit(
         jax.shard_map(
             part, mesh=mesh, in_specs=(PartitionSpec(), split), out_specs=split, check_vma=False
@@ -112,7 +114,7 @@ def spread(
 
 
 class Program:
-    """The compiled part for one flight on some devices; a chunk is cut among them."""
+    """Compiled part for one flight on some devices; a chunk is divided among them."""
 
     def __init__(self, job: Job, index: int, devices: Sequence[Any], lanes: int) -> None:
         self._step = lanes * len(devices)
@@ -120,23 +122,25 @@ class Program:
         self._trims, self._run, self._split = _compiled(job.plan(index), tuple(devices), lanes)
 
     def __call__(self, values: dict[str, np.ndarray], size: int) -> ElementResults:
-        """Begin to compute a chunk of values (k,), filled up to `size` elements; arrays (size,)
-        that JAX may still be computing."""
+        """Start to compute a chunk of values (k,), padded to `size` elements.
+
+        It returns arrays (size,) that JAX may still be computing.
+        """
         filled = filled_up(values, size, self._step)
         trims = None if self._trims is None else self._trims(self._numbers, filled)
         return self._run(self._numbers, jax.device_put((filled, trims), self._split))
 
 
 def filled_up(values: dict[str, np.ndarray], size: int, step: int) -> dict[str, np.ndarray]:
-    """The values of a chunk, as many as whole steps of it have."""
-    # The last chunk of a sweep is filled up with its last element: a program of its own size
-    # would be compiled for it alone, and might give other digits.
+    """Pad the values of a chunk to whole steps."""
+    # The last chunk is padded with its last element. A program of its own size would be compiled
+    # for it alone, and might give other digits.
     size = -(-size // step) * step
     return {n: np.pad(v, (0, size - v.size), mode="edge") for n, v in values.items()}
 
 
 def _batched(function: Callable[[Any], Any], mapped: Any, lanes: int) -> Any:
-    """A function of each row of what is mapped, `lanes` rows side by side."""
+    """Apply a function to each row of the mapped arrays, `lanes` rows in parallel."""
     if jax.tree.leaves(mapped)[0].shape[0] <= lanes:
         return jax.vmap(function)(mapped)
     return jax.lax.map(function, mapped, batch_size=lanes)

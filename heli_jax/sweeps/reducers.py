@@ -1,12 +1,12 @@
-"""Reducers: numbers that are gathered from each run of a sweep while it goes on.
+"""Reducers: numbers computed from each run of a sweep during the simulation.
 
-A reducer starts with some running values, updates them at every sample, and turns them into its
-result at the end, so that nothing of the run is stored. A function of a whole run may take its
-place; the runs of one block are then held while it works.
+A reducer starts with running values, updates them at every sample, and computes its result at the
+end. No part of the run is stored. A function of a whole run may replace it; the runs of one block
+are then stored for it.
 """
 
-# `Any` below: the running values of a Streaming of the user's are any pytree, and without a signal
-# it gets the model's Outputs. Those here have scalars, ().
+# `Any` below: the running values of a user's Streaming are any pytree, and without a signal it gets
+# the model's Outputs. Those here have scalars, ().
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -19,60 +19,60 @@ from heli_jax.errors import nearest
 
 
 class Measured(NamedTuple):
-    """A measured signal, with zeros where nothing was measured, and its moments."""
+    """A measured signal, with zeros where it is missing, and its moments."""
 
     values: Any
-    """(N,), or the value at one sample"""
+    """Values (N,), or the value at one sample."""
     seen: Any
-    """(N,), 1 where something was measured, else 0; or that at one sample; None: everywhere"""
+    """Mask (N,), 1 where measured, else 0, or its value at one sample; None if all are measured."""
     count: Any
     total_squares: Any
-    """sum of squares about the mean, as R^2 has it"""
+    """Sum of squares about the mean, as in R^2."""
     power: Any
-    """sum of squares"""
+    """Sum of squares."""
 
 
 class Streaming(NamedTuple):
-    """A reducer that goes along with a run.
+    """A reducer that is updated during a run.
 
-    `start` is a pytree of numbers; value = update(value, y, measured) at each sample, with the
-    signal's value there and, where the flight has it, a Measured of it (else None);
-    finish(value, n, measured) is the result after n samples. A Streaming of one's own without a
-    signal gets the whole Outputs for y, and no measured signal.
+    `start` is a pytree of numbers. value = update(value, y, measured) is called at each sample,
+    with the signal's value and its Measured, or None if the flight lacks it. finish(value, n,
+    measured) returns the result after n samples. A user's Streaming without a signal gets the whole
+    Outputs for y, and no measured signal.
     """
 
     start: Any
     update: Callable[[Any, Any, Any], Any]
     finish: Callable[[Any, Any, Any], Any]
     against_flight: bool = False
-    """whether it compares with what the flight measured"""
+    """True if it compares with the flight's measurement."""
     unit: str | None = None
-    """of the result; None: that of the signal"""
+    """Unit of the result; None for that of the signal."""
 
 
 class Reduce(NamedTuple):
-    """A named result of a sweep: `how`, of which signal."""
+    """A named result of a sweep: a reducer and its signal."""
 
     how: str | Callable[[Any], Any] | Streaming
-    """a name of `REDUCERS` or of `LINEAR`, a function of a Trajectory, or a Streaming"""
+    """A name in `REDUCERS` or `LINEAR`, a function of a Trajectory, or a Streaming."""
     signal: str | None = None
-    """an output of the model"""
+    """An output of the model."""
     input: str | None = None
-    """the input at which margins break the loop"""
+    """Input at which margins break the loop."""
     gain: float = 1.0
-    """of the loop that the margins are of: the input is -gain times the signal"""
+    """Gain of the loop for margins: the input is -gain times the signal."""
 
 
 def measured(values: np.ndarray, dtype: np.dtype) -> Measured:
-    """A measured signal (N,), NaN where one is missing, for the reducers."""
+    """Return a measured signal (N,), NaN where one is missing, in the form for reducers."""
     seen = np.isfinite(values)
     known = values[seen]
-    # In float64 and about the mean, once: sums that are gathered along the run would lose digits.
+    # Computed once in float64 and about the mean: sums accumulated along the run would lose digits.
     total_squares = float(np.sum((known - known.mean()) ** 2)) if known.size else 0.0
     return Measured(
-        # Zeros and a mask: one NaN would make every sum NaN, since 0 times NaN is NaN.
+        # Zeros and a mask, because 0 times NaN is NaN and would spoil every sum.
         np.where(seen, values, 0.0).astype(dtype),
-        # Where all is there, no mask: a product less in each sample.
+        # Without missing samples no mask, which saves a product per sample.
         None if seen.all() else seen.astype(dtype),
         np.asarray(known.size, dtype),
         np.asarray(total_squares, dtype),
@@ -81,7 +81,7 @@ def measured(values: np.ndarray, dtype: np.dtype) -> Measured:
 
 
 def _seen(v: Array, m: Measured) -> Array:
-    """Zero where nothing was measured."""
+    """Return the value, or zero where nothing was measured."""
     return v if m.seen is None else v * m.seen
 
 
@@ -123,9 +123,9 @@ def _same(v: Array, n: Array, m: Measured | None) -> Array:
 REDUCERS: dict[str, Streaming] = {
     "rms": Streaming(0.0, lambda v, y, m: v + y * y, lambda v, n, m: jnp.sqrt(v / n)),
     "mean": Streaming(0.0, lambda v, y, m: v + y, lambda v, n, m: v / n),
-    # A magnitude is never below zero, so zero is no candidate that could win.
+    # A magnitude is never negative, so zero is a valid start.
     "peak": Streaming(0.0, lambda v, y, m: jnp.maximum(v, jnp.abs(y)), _same),
-    # Beginning at infinity, so that the first sample is taken whatever it is.
+    # Starts at infinity, so that the first sample always replaces it.
     "max": Streaming(-np.inf, lambda v, y, m: jnp.maximum(v, y), _same),
     "min": Streaming(np.inf, lambda v, y, m: jnp.minimum(v, y), _same),
     "final": Streaming(0.0, lambda v, y, m: y, _same),
@@ -136,29 +136,31 @@ REDUCERS: dict[str, Streaming] = {
     "vaf": Streaming((0.0, 0.0), _squares_and_sum, _vaf, True, "1"),
     "tic": Streaming((0.0, 0.0), _squares_and_power, _theil, True, "1"),
 }
-"""Of one signal: root mean square, mean, largest magnitude, largest, smallest and last value; and
-against the flight: root mean square error, that over the measured signal's spread (nrmse, 0 is
-perfect), 100 (1 - nrmse) (fit), variance accounted for, Theil inequality coefficient."""
+"""Reducers of one signal: root mean square, mean, largest magnitude, largest, smallest and last
+value. Against the flight: root mean square error, the same over the measured signal's spread
+(nrmse, 0 is perfect), 100 (1 - nrmse) (fit), variance accounted for, Theil inequality coefficient.
+"""
 
 LINEAR = ("modes", "margins")
-"""Of the model linearised where the run begins: eigenvalues; gain and phase margin of a loop."""
+"""Results of the model linearised at the start of the run: eigenvalues; gain and phase margin of a
+loop."""
 
 
 def check(name: str, reduce: Reduce, outputs: tuple[str, ...], inputs: tuple[str, ...]) -> None:
     """Refuse a reducer that the model cannot have.
 
     Args:
-        name: of the result.
-        reduce: what it is.
+        name: name of the result.
+        reduce: the result.
         outputs: names of the model's outputs.
         inputs: names of its inputs.
 
     Raises:
         ValueError: an unknown `how`, an output or input that the model lacks, or none where one is
-            needed.
+            required.
     """
     where, reducer = f"reduce.{name}", reduce.how
-    # Here and not at the first run: a sweep of hours shall not end with a misspelt name.
+    # Checked before the first run, so that a misspelt name does not end a sweep of hours.
     if isinstance(reducer, str) and reducer not in (*REDUCERS, *LINEAR):
         known = [*REDUCERS, *LINEAR]
         raise ValueError(f"{where}.how: unknown reducer {reducer!r}{nearest(reducer, known)}")
@@ -167,7 +169,7 @@ def check(name: str, reduce: Reduce, outputs: tuple[str, ...], inputs: tuple[str
 
 
 def _check_signal(where: str, reduce: Reduce, outputs: tuple[str, ...]) -> None:
-    """Refuse a signal that is missing, unknown or of no use."""
+    """Refuse a signal that is missing, unknown or unused."""
     reducer, signal = reduce.how, reduce.signal
     if (reducer == "margins" or reducer in REDUCERS) and signal is None:
         raise ValueError(f"{where}.signal: missing, expected one of {', '.join(outputs)}")
@@ -175,8 +177,8 @@ def _check_signal(where: str, reduce: Reduce, outputs: tuple[str, ...]) -> None:
         raise ValueError(
             f"{where}.signal: the model has no output {signal!r}{nearest(signal, outputs)}"
         )
-    # A signal that would be ignored is refused too: a result of one output and of all of them look
-    # alike in a table.
+    # An unused signal is refused too, because results of one output and of all look alike in a
+    # table.
     whole = callable(reducer) and not isinstance(reducer, Streaming)
     if signal is not None and (whole or reducer == "modes"):
         what = "modes are" if reducer == "modes" else "a function of a Trajectory is"
@@ -194,16 +196,16 @@ def _check_loop(where: str, reduce: Reduce, inputs: tuple[str, ...]) -> None:
         )
     if reduce.input is not None and not margins:
         raise ValueError(f"{where}.input: only margins take one, got {reduce.input!r}")
-    # Said and not ignored: who gives a gain believes that it acts.
+    # Refused, not ignored: a user expects a stated gain to act.
     if reduce.gain != 1.0 and not margins:
         raise ValueError(f"{where}.gain: only margins take one, got {reduce.gain}")
-    # A gain of zero is no loop: its margins would be infinite whatever the vehicle.
+    # A gain of zero is no loop: its margins would be infinite for any vehicle.
     if margins and not (np.isfinite(reduce.gain) and reduce.gain != 0):
         raise ValueError(f"{where}.gain: expected a number that is not zero, got {reduce.gain}")
 
 
 def streaming(reduce: Reduce) -> Streaming | None:
-    """The reducer itself, or None where it is none that goes along with a run."""
+    """Return the streaming reducer of a result, or None if it has none."""
     if isinstance(reduce.how, Streaming):
         return reduce.how
     return REDUCERS.get(reduce.how) if isinstance(reduce.how, str) else None

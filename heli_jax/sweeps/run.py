@@ -26,37 +26,36 @@ from heli_jax.sweeps.summary import write_summary
 from heli_jax.sweeps.worker import Split, Worker
 from heli_jax.versions import changed_since, versions
 
-# `Any` below: Params of the user's own class, what may stand in JSON, and a dask Client, which is
-# not imported where no worker is asked for.
+# `Any` below: Params of the user's own class, JSON content, and a dask Client, which is imported
+# only if workers are used.
 
-_SAMPLED = 64  # elements on which float32 is compared with float64: enough to see its size
+_SAMPLED = 64  # elements for the comparison of float32 with float64: enough to show its magnitude
 
 
 class Progress(NamedTuple):
     """Progress of a sweep."""
 
     done: int
-    """elements finished, those of earlier runs too"""
+    """Finished elements, those of earlier runs included."""
     total: int
     rate: float
-    """elements per second of this run; NaN while the first chunk is all there is, since that
-    waited to be compiled"""
+    """Elements per second of this run; NaN after the first chunk, which included compilation."""
     remaining: float
-    """[s]; NaN likewise"""
+    """Remaining time [s]; NaN likewise."""
 
 
 class Pace:
-    """Counts what is done as steps of the stage under way, and calls `progress` with it."""
+    """Counter of finished work, as steps of the current stage; it calls `progress`."""
 
     def __init__(self, total: int, progress: Callable[[Progress], None]) -> None:
         self.total, self.progress = total, progress
         self.first: tuple[float, int] | None = None
 
     def __call__(self, done: int) -> None:
-        """So many are done."""
+        """Report the number of finished elements."""
         stages.reach(done)
-        # The first waited for imports and the compiler: counted, it would make the time that is
-        # left look ten times as long.
+        # The first chunk waited for imports and the compiler. With it, the remaining time would
+        # look ten times as long.
         now, rate = time.perf_counter(), math.nan
         if self.first is None:
             self.first = now, done
@@ -66,21 +65,20 @@ class Pace:
 
 
 class Options(NamedTuple):
-    """Options of carrying out a sweep; none changes its numbers, but the division may change the
-    last digit."""
+    """Options for the execution of a sweep; only the division may change the last digit."""
 
     resume: bool = False
     chunk: int | None = None
-    """elements written at a time; chosen unless given"""
+    """Elements written at a time; chosen automatically by default."""
     lanes: int | None = None
-    """elements computed side by side on a device; chosen unless given"""
+    """Batch size: elements computed in parallel on a device; chosen automatically by default."""
     backend: str = "auto"
-    """what computes a run over time: "xla" step by step, "fused" as one program of machine code (on
-    CPUs), or "auto", fused where it can be"""
+    """Backend of the simulation: "xla" step by step, "fused" as one program of machine code (on
+    CPUs), or "auto", fused if possible."""
     devices: Sequence[Any] | None = None
-    """of this process: all unless given"""
+    """Devices of this process; all by default."""
     client: Any = None
-    """a dask.distributed Client whose workers compute the chunks"""
+    """A dask.distributed Client whose workers compute the chunks."""
     progress: Callable[[Progress], None] = lambda _: None
     say: Callable[[str], None] = lambda _: None
 
@@ -98,18 +96,17 @@ def sweep(
     """Run a model once for every element of a design, and keep numbers of each run.
 
     Args:
-        model: what is simulated.
-        params: the model's Params, SI; the axes of the design take the place of theirs.
-        flights: what the model flies: inputs, and where results compare with them, outputs. With
-            several each result has a dimension `flight`.
-        design: which values the axes take, from `heli_jax.sweeps`: grid, paired, lhs, sobol, table,
-            product or zipped. An axis is a parameter of the model, or `initial.STATE`,
-            `gain.INPUT`, `offset.INPUT`, `delay` [s] or `seed` (of the model's noise).
-        reduce: by name, what is kept of each run.
-        out: a directory for sweep.zarr and summary.json; in memory unless given.
+        model: the model to simulate.
+        params: the model's Params, SI; the axes of the design override them.
+        flights: inputs of the runs, and outputs for results that compare with them. With several
+            flights each result has a dimension `flight`.
+        design: values of the axes, from `heli_jax.sweeps`: grid, paired, lhs, sobol, table, product
+            or zipped. An axis is a parameter of the model, or `initial.STATE`, `gain.INPUT`,
+            `offset.INPUT`, `delay` [s] or `seed` (of the model's noise).
+        reduce: results of each run by name.
+        out: a directory for sweep.zarr and summary.json; in memory by default.
         **options: fields of `RunOptions`: solver, substeps, precision, trajectories, trimmed,
-            pilot; and of `Options`: resume, chunk, lanes, backend, devices, client,
-            progress.
+        pilot; and of `Options`: resume, chunk, lanes, backend, devices, client, progress.
 
     Returns:
         A Dataset over `element`, with axes and `status` as coordinates.
@@ -117,7 +114,7 @@ def sweep(
     Raises:
         ValueError: the model cannot have an axis or a result.
         TypeError: a keyword that is no option.
-        InputError: the directory exists (without `resume`), is of another sweep, or cannot be
+        InputError: the directory exists (without `resume`), belongs to another sweep, or cannot be
             written to.
     """
     runs = {n: options.pop(n) for n in RunOptions._fields if n in options}
@@ -137,24 +134,24 @@ def run_sweep(
     """Run a checked sweep.
 
     Args:
-        job: what is computed.
+        job: the checked sweep.
         out: a directory for the store, or None for one in memory.
-        options: how it is carried out.
-        files: by name, texts that are written beside the store when it is made.
-        attributes: kept with the store; `seed` is 0 unless given.
-        notes: said and kept.
+        options: options for the execution.
+        files: texts by name, written beside the store when it is made.
+        attributes: attributes of the store; `seed` is 0 by default.
+        notes: notes to report and to store.
 
     Raises:
         InputError: as `sweep`.
     """
-    # The notes are kept too: who opens the store a year later has not seen what was printed.
+    # The notes are stored too, for later readers who did not see the output.
     notes = [*notes, *_notes(job)]
     for found in notes:
         options.say(Note(found.sentence))
     kept = {"seed": 0, **(attributes or {}), "versions": versions()}
     kept["notes"] = [as_data(f) for f in notes]
     if out is None:
-        # The same store as on disk, so that a sweep in memory goes through the same code.
+        # The same store as on disk, so that a sweep in memory uses the same code.
         store = stores.create(None, job, *_cut(job, options, kept), "the sweep")
         _compute(job, store, store.done(), options)
         return store.dataset().load()
@@ -189,20 +186,19 @@ def _notes(job: Job) -> list[Finding]:
 
 
 def _resume(job: Job, out: Path, options: Options) -> xr.Dataset:
-    """Compute what is missing in a store on disk, and write its summary."""
+    """Compute the missing chunks of a store on disk, and write its summary."""
     where = f"--out {out}"
     stores.require_files(out, where)
     with stores.only_writer(out, where):
-        # A new store too is read as if it were an old one: it may have been made by a process that
-        # was killed, or by one that came first.
+        # A new store is opened like an old one, because it may come from a killed process or from a
+        # concurrent one.
         store = stores.reopen(out / "sweep.zarr", job, where)
-        # With the lock held, so that no other process finishes a chunk between this question and
-        # the answer.
+        # With the lock held, so that no other process finishes a chunk between check and use.
         done = store.whole()
         if damaged := int(np.count_nonzero(store.done() & ~done)):
             options.say(Note(f"{where}: damaged chunks that are computed again: {damaged}"))
         _same_cut(store, job, options, where)
-        # Said and not refused: to begin anew for a digit in the fifteenth place helps nobody.
+        # Reported, not refused: a difference in the fifteenth digit does not justify a new start.
         if changed := changed_since(store.attributes.get("versions", {})):
             options.say(Note(f"{where}: {changed}"))
         timing = _compute(job, store, done, options)
@@ -227,18 +223,17 @@ def _cut(job: Job, options: Options, words: dict[str, Any]) -> tuple[Split, dict
         split = split_there(options.client, job, **asked)
     else:
         split = split_for(job, devices=options.devices, say=options.say, **asked)
-    # Once, when the store is made: a resumed sweep shall not tell another error than the one that
-    # it began with.
+    # Once, when the store is made, so that a resumed sweep keeps the error from its start.
     if job.precision == "float32":
         words = {**words, "float32_error": float32_error(job)}
     return split, words
 
 
 def _same_cut(store: stores.Store, job: Job, options: Options, where: str) -> None:
-    """Refuse numbers other than those a store was begun with: its last digits depend on them."""
+    """Refuse a division other than the store's, because the last digits depend on it."""
     for name in ("chunk", "lanes"):
         number, kept = getattr(options, name), getattr(store.split, name)
-        # More than there are elements were cut down as the store was begun.
+        # A number above the count of elements was reduced when the store was made.
         if number not in (None, kept) and not number > kept >= job.design.size:
             raise InputError(
                 f"{where}: was begun with {name} {kept}, expected the same, got {number}"
@@ -251,14 +246,14 @@ def _same_cut(store: stores.Store, job: Job, options: Options, where: str) -> No
 
 
 def _compute(job: Job, store: stores.Store, done: np.ndarray, options: Options) -> dict[str, Any]:
-    """Compute the chunks that are not done; returns what it took."""
-    # Workers may give them in any order: what counts is each chunk's own status in the store.
+    """Compute the missing chunks; return timing statistics."""
+    # Workers may finish in any order; each chunk's own status in the store counts.
     todo = [int(k) for k in np.flatnonzero(~done)]
     total, size = job.design.size, store.split.chunk
     before = sum(min(size, total - int(k) * size) for k in np.flatnonzero(done))
     begin, now, pace = time.perf_counter(), before, Pace(total, options.progress)
     if options.client is not None:
-        # Here, since dask is an extra that is not installed everywhere.
+        # Here, because dask is an optional extra.
         from heli_jax.sweeps.cluster import computed
 
         source: Iterable[Any] = computed(options.client, job, store.split, todo)
@@ -282,12 +277,12 @@ def _compute(job: Job, store: stores.Store, done: np.ndarray, options: Options) 
 def _local(
     job: Job, split: Split, todo: list[int], devices: Sequence[Any] | None
 ) -> Iterable[tuple[int, dict[str, np.ndarray]]]:
-    """Chunks computed here; while one is written the devices work on the next."""
+    """Yield chunks computed here; while one is written, the devices work on the next."""
     if not todo:
         return
     worker = Worker(job, split, devices)
-    # JAX returns before it has computed: one chunk ahead is enough to keep the devices busy, and
-    # more would only take memory.
+    # JAX returns before it has computed. One chunk ahead keeps the devices busy; more would only
+    # take memory.
     begun = worker.begin(todo[0])
     for chunk, following in zip(todo, [*todo[1:], None], strict=True):
         pending = begun
@@ -297,8 +292,10 @@ def _local(
 
 
 def float32_error(job: Job) -> dict[str, float | str]:
-    """Return the error of float32 against float64, relative to the largest of each result, on
-    elements from all over the design."""
+    """Return the error of float32 against float64, relative to the largest value of each result.
+
+    It is measured on elements spread over the design.
+    """
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         return {"note": "not measured: float64 is switched off in JAX"}
     n = job.design.size
@@ -306,7 +303,7 @@ def float32_error(job: Job) -> dict[str, float | str]:
     columns = [job.design.values(int(k), int(k) + 1) for k in chosen]
     some = table({name: np.concatenate([c[name] for c in columns]) for name in columns[0]})
     split = Split(len(chosen), len(chosen))
-    # One device: for 64 elements the others would be compiled for in vain.
+    # One device: compiling for others would not pay for 64 elements.
     devices = jax.local_devices()[:1]
     single = Worker(job._replace(design=some), split, devices).run(0)
     double = Worker(job._replace(design=some, precision="float64"), split, devices).run(0)
@@ -316,7 +313,8 @@ def float32_error(job: Job) -> dict[str, float | str]:
             continue
         off = np.abs(single[name] - exact)
         off, size = off[np.isfinite(off)], np.abs(exact[np.isfinite(exact)])
-        # Of the largest and not of each value: one that is zero but for rounding has no digits.
+        # Relative to the largest value, not to each value: one that is zero up to rounding has no
+        # valid digits.
         largest = size.max(initial=0.0)
         errors[name] = float(off.max(initial=0.0) / largest) if largest > 0 else 0.0
     return errors

@@ -1,4 +1,4 @@
-"""A sweep as it was asked for, checked, and described so that another can be told from it."""
+"""Specification of a sweep: checked options and the parts that workers need."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple
@@ -30,46 +30,46 @@ class Trajectories(NamedTuple):
     """Runs to keep, thinned."""
 
     signals: tuple[str, ...]
-    """outputs of the model"""
+    """Outputs of the model."""
     every: int = 1
-    """samples from one kept to the next"""
+    """Samples between two kept ones."""
 
 
 class Trimmed(NamedTuple):
-    """Each element of a whole helicopter begins in a steady flight of its own."""
+    """Each element of a full helicopter begins in its own steady flight."""
 
     condition: Condition = Condition()
     wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sticks: bool = True
-    """whether its sticks are added to the flight's; a logged flight has them already"""
+    """True to add its sticks to the flight's; a logged flight already includes them."""
     of: Model | None = None
-    """what is trimmed, where the sweep's model is that with a disturbance"""
+    """Model to trim, if the sweep's model has a disturbance."""
 
 
 class RunOptions(NamedTuple):
     """Options of each run of a sweep; each field is also a keyword of `sweep`."""
 
     solver: str | None = None
-    """"exact" (linear models, the default there), "rk4", or a diffrax solver's name; steps are
-    fixed"""
+    """Solver with fixed steps: "exact" (linear models, their default), "rk4", or a diffrax solver's
+    name."""
     substeps: int | None = None
-    """steps a sample; enough for 5 ms unless given"""
+    """Steps per sample; by default enough for steps of 5 ms."""
     precision: Precision = "float64"
-    """float32 is faster on some devices; how far off its results are is measured on 64 elements and
-    stands in the attributes"""
+    """Precision. float32 is faster on some devices; its error is measured on 64 elements and stored
+    in the attributes."""
     trajectories: Trajectories | None = None
-    """outputs to keep, thinned"""
+    """Outputs to keep, thinned."""
     trimmed: Trimmed | None = None
-    """a full nonlinear model begins in a steady flight of its own"""
+    """Steady flight in which a full nonlinear model begins."""
     pilot: Pilot | None = None
-    """who holds the attitude"""
+    """Pilot that holds the attitude."""
 
 
 class Plan(NamedTuple):
-    """Compiled part of a sweep; sweeps of the same plan share the program."""
+    """Compiled part of a sweep; sweeps with the same plan share the program."""
 
-    # The key under which `program` remembers what it compiled: every field can be hashed, and no
-    # number of a vehicle or a flight is among them.
+    # The cache key of `program`: every field is hashable, and none is a number of a vehicle or a
+    # flight.
 
     model: Model
     reduce: tuple[tuple[str, Reduce], ...]
@@ -81,11 +81,10 @@ class Plan(NamedTuple):
     streamed: bool
     simulated: bool
     moving: tuple[tuple[str, str], ...] = ()
-    """inputs that are linear or mixed between samples, with their holds; the others are held"""
+    """Inputs that are linear or mixed between samples, with their holds; the others are held."""
 
     def simulation(self, **numbers: Any) -> SimulationOptions:  # fields of several types
-        """Return the simulation options of a run; `numbers` are the fields that differ between
-        elements."""
+        """Return the simulation options of a run; `numbers` are the fields that vary by element."""
         return SimulationOptions(
             solver=solver_named(self.solver),
             substeps=self.substeps,
@@ -98,14 +97,14 @@ class Plan(NamedTuple):
 
 
 DEFAULT = RunOptions()
-_MOST = 10**10  # elements: more take months, and are a slip of the pen in one of the axes
+_MOST = 10**10  # elements: more take months, and indicate a slip in one of the axes
 _LOOKED_AT = 1 << 16  # elements whose seeds are checked: all of 10^10 would take minutes
 
 
 class Job(NamedTuple):
-    """All that a chunk of a sweep needs."""
+    """All data that a chunk of a sweep needs."""
 
-    # It travels to workers on other machines: what is in it must be pickled, the functions by name.
+    # Sent to workers on other computers: its content must be picklable, functions by name.
 
     model: Model
     params: dict[str, float]
@@ -120,7 +119,7 @@ class Job(NamedTuple):
     pilot: Pilot | None
 
     def plan(self, index: int) -> Plan:
-        """The part of it that is compiled for one of its flights."""
+        """Return the compiled part for one of its flights."""
         return Plan(
             self.model,
             tuple(self.reduce.items()),
@@ -136,11 +135,11 @@ class Job(NamedTuple):
 
     @property
     def streamed(self) -> bool:
-        """True if every run is reduced while it goes on and none is kept."""
+        """True if every run is reduced during the simulation and none is stored."""
         how = [r.how for r in self.reduce.values()]
         whole = any(callable(h) and not isinstance(h, reducers.Streaming) for h in how)
-        # `accumulate` has no delay, no noise and no feedback, which `simulate` has: such runs are
-        # simulated whole and reduced then.
+        # `accumulate` lacks delay, noise and feedback, which `simulate` has. Such runs are stored
+        # whole and reduced afterwards.
         drawn_or_late = {"delay", "seed"} & set(special_axes(self.model, self.design))
         kept = self.trajectories is not None
         return not whole and not drawn_or_late and not kept and self.pilot is None
@@ -153,13 +152,13 @@ class Job(NamedTuple):
 
 
 def moving_inputs_of(model: Model, flight: Flight) -> tuple[tuple[str, str], ...]:
-    """The model's inputs that are not held between this flight's samples, with their holds."""
+    """Return the inputs that are not held between this flight's samples, with their holds."""
     holds = ((n, flight.hold.get(n, "zero-order")) for n in naming.names(model.Inputs))
     return tuple((n, hold) for n, hold in holds if hold != "zero-order")
 
 
 def special_axes(model: Model, design: Design) -> list[str]:
-    """The axes that are no parameters of the model."""
+    """Return the axes that are no parameters of the model."""
     return [n for n in design.names if n not in naming.names(model.Params)]
 
 
@@ -179,18 +178,23 @@ def job(
     reduce: Mapping[str, Reduce],
     options: RunOptions = DEFAULT,
 ) -> Job:
-    """Check a sweep and lay it out.
+    """Check a sweep and prepare it.
 
     Args:
-        params: the model's Params, SI; the axes of the design take the place of theirs.
+        model: the model.
+        params: the model's Params, SI; the axes of the design override them.
+        flights: flights with the inputs.
+        design: the design of experiments.
+        reduce: results by name.
+        options: options of the runs.
 
     Raises:
-        ValueError: an axis or a result that the model or the flights cannot have, a vehicle that
-            lacks something, an unknown solver or precision, float64 while JAX has it switched off.
+        ValueError: an axis or a result that the model or the flights cannot have; an incomplete
+            vehicle; an unknown solver or precision; float64 while JAX has it switched off.
         TypeError: a design or a result of another kind.
     """
-    # The model first: the other checks ask for its names, and a wrong one would fail in them far
-    # from its cause.
+    # The model first: the other checks use its names, and a wrong model would fail there far from
+    # its cause.
     check_model(model)
     flights = (flights,) if isinstance(flights, Flight) else tuple(flights)
     if not flights:
@@ -204,13 +208,13 @@ def job(
     _check_inputs(model, flights)
     _check_results(model, design, reduce, flights, options.trajectories)
     _check_precision(model, options.precision)
-    # A linear model has an exact step, so that no error of a solver stands in its results.
+    # The exact step of a linear model leaves no solver error in the results.
     solver = options.solver or ("exact" if model.linear else "rk4")
     if solver == "exact" and not model.linear:
         raise ValueError(f"solver: model {model.name!r} is not linear, expected rk4")
-    # Asked for now, so that an unknown name is refused before anything is compiled.
+    # Checked here, so that an unknown name is refused before anything is compiled.
     solver_named(solver)
-    # Every flight has to know it: one that does not would be computed with NaN.
+    # All flights must state it; a flight without it would be computed with NaN.
     known = set.intersection(*(set(f.known) for f in flights))
     require_constants(model, params, known.union(design.names))
     require_linear(model, params)
@@ -221,11 +225,11 @@ def job(
         )
     substeps = options.substeps
     if substeps is None:
-        # One program serves all flights alike, so the slowest rate says how many steps it needs.
+        # One program serves all flights, so the slowest rate decides the number of steps.
         substeps = substeps_for(max(f.dt for f in flights), model.fastest)
     if substeps < 1:
         raise ValueError(f"substeps must be at least 1, got {substeps}")
-    # Plain numbers and no arrays: they are compared with those that a store remembers, as JSON.
+    # Plain numbers, not arrays: they are compared with the store's JSON.
     numbers = {n: float(v) for n, v in naming.asdict(params).items()}
     checked = options._replace(solver=solver, substeps=substeps)
     return Job(model, numbers, flights, design, dict(reduce), **checked._asdict())
@@ -234,7 +238,7 @@ def job(
 def _check_precision(model: Model, precision: str) -> None:
     if precision not in ("float64", "float32"):
         raise ValueError(f"precision: expected float64 or float32, got {precision!r}")
-    # JAX would compute in float32 without a word, under the heading float64.
+    # Otherwise JAX would silently compute in float32.
     if precision == "float64" and not jax.config.jax_enable_x64:  # pyright: ignore
         raise ValueError(
             "precision: float64 is switched off in JAX, expected "
@@ -245,8 +249,10 @@ def _check_precision(model: Model, precision: str) -> None:
 
 
 def _check_single(model: Model) -> None:
-    """Refuse a model that makes float64 of float32, as with a table of NumPy's: what is carried
-    from one sample to the next would change its type."""
+    """Refuse a model that converts float32 to float64, for example by a NumPy table.
+
+    The type of the carried state would change from one sample to the next.
+    """
 
     def computed(p: Any, s: Any, u: Any) -> tuple[dict[str, Any], dict[str, Any]]:
         arguments = model.Params(**p), model.State(**s), model.Inputs(**u)
@@ -276,13 +282,13 @@ def _check_axes(model: Model, design: Design, flights: tuple[Flight, ...]) -> No
         if name in params:
             for flight in flights:
                 if name in flight.known:
-                    # The axis would win, and what the flight says of the machine be lost unseen.
+                    # The axis would silently override the flight's known value.
                     raise ValueError(
                         f"axes.{name}: the flight {flight.name!r} states it as known, expected "
                         "one of the two"
                     )
         elif name not in special:
-            # 'gain.x_rol' is a slip in the input's name: no parameter is suggested for it.
+            # 'gain.x_rol' is a slip in the input's name, so no parameter is suggested.
             kind = name.partition(".")[0]
             among = [n for n in special if n.startswith(f"{kind}.")] or [*params, *special]
             raise ValueError(
@@ -308,7 +314,7 @@ def _check_inputs(model: Model, flights: tuple[Flight, ...]) -> None:
                 raise ValueError(
                     f"flight {flight.name!r} has no input {name!r}, which {model.name} needs"
                 )
-        # One sample has no step, and what an input does behind it is nothing to simulate.
+        # One sample has no step, so there is nothing to simulate.
         if flight.n_samples < 2:
             raise ValueError(f"flight {flight.name!r}: expected at least two samples, got one")
 
@@ -325,7 +331,8 @@ def _check_results(
         raise ValueError("reduce: nothing is to be kept, expected a result or trajectories")
     for name, reducer in reduce.items():
         reducers.check(name, reducer, outputs, inputs)
-        # Of the store's own; names that its format cannot have are refused where it is laid out.
+        # Reserved names of the store; names that its format cannot have are refused where it is
+        # created.
         if name in design.names or name in ("status", "element"):
             raise ValueError(f"reduce.{name}: the name is taken, expected another")
         stream = reducers.streaming(reducer)
@@ -361,7 +368,7 @@ def _check_trajectories(
 
 
 def axis_unit(model: Model, name: str) -> str | None:
-    """The SI unit of an axis; None where it has none, as a seed, or there is no such axis."""
+    """Return the SI unit of an axis; None for a seed or an unknown axis."""
     kind, _, of = name.partition(".")
     if name in naming.names(model.Params):
         return naming.unit(model.Params, name)
@@ -373,19 +380,19 @@ def axis_unit(model: Model, name: str) -> str | None:
 
 
 def unread(job: Job) -> list[str]:
-    """The axes that are parameters which the model does not read, so that no run depends on them.
+    """Return the axes that are parameters the model does not read.
 
-    Tried at one point of the states and inputs; a model that reads a parameter elsewhere alone has
-    it here by mistake.
+    They are found at one point of the states and inputs. A model that reads a parameter only
+    elsewhere is reported by mistake.
     """
     model = job.model
     params = model.Params(**job.params)
     axes = [n for n in job.design.names if n in naming.names(model.Params)]
-    # The size of a disturbance is read by its noise alone, and only where noise is drawn.
+    # Only the noise reads the size of a disturbance, and only if noise is drawn.
     drawn = model.noise_intensity if "seed" in job.design.names else None
 
     def read_elsewhere(name: str) -> bool:
-        # What is computed from NaN is NaN: whatever reads the parameter shows it.
+        # NaN propagates to everything that reads the parameter.
         missing = plain(params, **{name: np.nan})
         with np.errstate(all="ignore"):
             parts = (model.initial_state(missing), None if drawn is None else drawn(missing))

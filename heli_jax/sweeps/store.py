@@ -1,7 +1,7 @@
-"""The Zarr store of a sweep: labelled variables over the elements, written chunk by chunk.
+"""Zarr store of a sweep: labelled variables over the elements, written chunk by chunk.
 
-The status of a chunk is written last, so a chunk whose status is there is whole. Zarr replaces
-files in one step, so a killed process leaves each of them as it was or as it should be.
+The status of a chunk is written last, so a chunk with a status is complete. Zarr replaces files in
+one step, so a killed process leaves each file either old or new.
 """
 
 import contextlib
@@ -27,53 +27,51 @@ from heli_jax.sweeps.spec import Job
 from heli_jax.sweeps.worker import Split, Variable, variables
 
 FINISHED = "sweep.zarr/status/c/*"
-"""what there is in a sweep's directory of every chunk that is finished"""
-# What stands where nothing was written: not a number, and for the status (unsigned) 'not run', by
-# which an unfinished chunk is known. Seeds (signed) are written before it and need no such
-# mark.
+"""Files that exist for every finished chunk."""
+# Fill values of missing data: NaN, and for the status (unsigned) 'not run', which marks an
+# unfinished chunk. Seeds (signed) are written before the status and need no mark.
 _FILL = {"f": np.nan, "u": NOT_RUN, "i": 0}
 
 
 class Store:
-    """A sweep's results, in a directory or in memory."""
+    """Results of a sweep, in a directory or in memory."""
 
     def __init__(self, group: zarr.Group, where: str) -> None:
         self.group, self.where = group, where
         attributes: dict[str, Any] = dict(group.attrs)
-        # As the store has it and not as it would be chosen today: another cut would compute other
-        # last digits.
+        # The store's division, not today's choice: another one would change the last digits.
         self.split = Split(**attributes["split"])
         self.attributes = attributes
         self._results: list[str] = list(attributes["results"])
-        # An all-NaN chunk is a result too: its file tells it from one that was taken away.
+        # An all-NaN chunk is a result too: its file distinguishes it from a removed one.
         with zarr.config.set({"array.write_empty_chunks": True}):
-            # Looked up once: it takes as long as a write.
+            # Looked up once, because it takes as long as a write.
             self._arrays: dict[str, Any] = dict(group.arrays())
 
     @property
     def names(self) -> set[str]:
-        """The variables it has."""
+        """Names of the variables."""
         return set(self._arrays)
 
     def done(self) -> np.ndarray:
-        """Finished chunks, (number of chunks,)."""
-        # The first element of each tells: the status of a chunk is one file, which is there as a
-        # whole or not at all.
+        """Return a mask of finished chunks, (number of chunks,)."""
+        # The first element of each is enough: the status of a chunk is one file, which is complete
+        # or absent.
         status = self._arrays["status"]
         count = self.split.chunks(status.shape[0])
         firsts = [status[k * self.split.chunk] for k in range(count)]
         return np.asarray(firsts).reshape(-1) != NOT_RUN
 
     def whole(self) -> np.ndarray:
-        """Return finished chunks as `done`, of which no file is missing or unreadable.
+        """Return finished chunks as `done`, except those with unreadable files.
 
         Raises:
-            InputError: one is, or the store cannot be read.
+            InputError: a file is missing, or the store cannot be read.
         """
         with readable(self.where):
             done = self.done()
             finished = int(np.count_nonzero(done))
-            # Zarr reads a file that is not there as its fill value: NaN that nobody computed.
+            # Zarr reads a missing file as its fill value: NaN that was never computed.
             for name in self._results:
                 there = self._arrays[name].nchunks_initialized
                 if there < finished:
@@ -103,15 +101,14 @@ class Store:
             for name, values in results.items():
                 if name != "status":
                     self._arrays[name][start:stop] = values
-            # Last, since it is what says that the chunk is whole. A kill before it costs the chunk
-            # and no more.
+            # Last, because it marks the chunk as complete. A kill before it loses only this chunk.
             self._arrays["status"][start:stop] = results["status"]
 
     def dataset(self) -> xr.Dataset:
-        """The store as an xarray Dataset, read as it is used."""
-        # chunks=None: no dask arrays, which would need dask where nobody asked for it.
+        """Return the store as an xarray Dataset, read on demand."""
+        # chunks=None: dask arrays would require dask.
         dataset = xr.open_zarr(self.group.store, consolidated=False, chunks=None)
-        # In the order asked for: that of files in a directory is none.
+        # In the requested order; files in a directory have none.
         return dataset[self.attributes["results"]]
 
 
@@ -135,7 +132,7 @@ def _words(where: str) -> Iterator[None]:
     try:
         yield
     except OSError as e:
-        # No room, no quota, or a file too large for the file system: for these there is a remedy.
+        # No space, no quota, or a file too large for the file system: these have a remedy.
         full = e.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
         hint = ", expected room for the rest" if full else ""
         raise InputError(
@@ -146,10 +143,14 @@ def _words(where: str) -> Iterator[None]:
 def create(
     path: Path | None, job: Job, split: Split, attributes: Mapping[str, Any], where: str
 ) -> Store:
-    """A new store, without any element.
+    """Create a new store without elements.
 
     Args:
-        path: where it is made; None for one in memory.
+        path: path of the store; None for one in memory.
+        job: the sweep.
+        split: its division.
+        attributes: attributes of the store.
+        where: place for messages.
 
     Raises:
         OSError: the place cannot be written to.
@@ -175,7 +176,7 @@ def create(
             "results": [n for n, v in laid_out.items() if not v.axis and n != "status"],
             "split": split._asdict(),
             "description": json.dumps(described(job), sort_keys=True),
-            # xarray makes coordinates of what is named here.
+            # xarray makes these names coordinates.
             "coordinates": " ".join([*job.design.names, "status"]),
         }
     )
@@ -183,8 +184,8 @@ def create(
 
 
 def _label(job: Job, i: int) -> str:
-    """The flight's name; with its place where another has the same."""
-    # As a label it has to be one flight's alone: xarray's sel() would give both.
+    """Return the flight's name, with its number if another has the same."""
+    # A label must be unique, because xarray's sel() would return both.
     name = job.flights[i].name
     if not name:
         return f"flight {i + 1}"
@@ -197,10 +198,10 @@ def _array(group: zarr.Group, name: str, variable: Variable, size: int, split: S
     group.create_array(
         name,
         shape=(size, *variable.shape),
-        # Zarr's chunks are those of the sweep: a chunk is written without reading what lies beside.
+        # Zarr's chunks are those of the sweep, so that a chunk is written without reading others.
         chunks=(split.chunk, *variable.shape),
         dtype=dtype,
-        # Of a file that was damaged later it is known that it was.
+        # A checksum detects later damage of a file.
         compressors=[ZstdCodec(level=0, checksum=True)],
         fill_value=_FILL[dtype.kind],
         dimension_names=variable.dims,
@@ -222,7 +223,7 @@ def _labels(
 
 
 def reopen(path: Path, job: Job, where: str) -> Store:
-    """The store of the same sweep, to go on with.
+    """Open the store of the same sweep, to continue it.
 
     Raises:
         InputError: it is no store of a sweep, or one of another sweep.
@@ -233,26 +234,27 @@ def reopen(path: Path, job: Job, where: str) -> Store:
     except (OSError, KeyError, ValueError, TypeError) as e:
         raise InputError(f"{where}: {path} is no store of a sweep ({e})") from e
     require_same(old, described(job), f"{where}: {path} is of another sweep")
-    # A variable's folder may have been taken away since the store was made.
+    # A variable's folder may have been removed since the store was made.
     missing = sorted(variables(job).keys() - store.names)
     if missing:
         raise InputError(f"{where}: {path} is no whole store of a sweep, it lacks {missing[0]}")
     return store
 
 
-# [bytes] of a file in a store: Zarr reads each as a whole.
+# [bytes] of a file in a store; Zarr reads each as a whole.
 _LARGEST_METADATA = 10**8
 _LARGEST_CHUNK = 4 * 10**9
 
 
 def require_files(directory: Path, where: str) -> None:
-    """Refuse a sweep's directory in which what is read and written is no regular file: Zarr would
-    wait for a pipe, and read a device or a sparse file until the memory is full.
+    """Refuse a sweep's directory that contains irregular files.
+
+    Zarr would wait for a pipe, and read a device or a sparse file until the memory is full.
 
     Raises:
         InputError: naming the file.
     """
-    # Before the lock is taken: opening a pipe in its place would wait for ever.
+    # Before the lock is taken: opening a pipe in its place would block forever.
     beside = (directory / ".lock", directory / "summary.json")
     for path in beside:
         if os.path.lexists(path):
@@ -265,7 +267,7 @@ def require_files(directory: Path, where: str) -> None:
         except OSError as e:
             raise InputError(f"{where}: {folder} is no store of a sweep ({e.strerror})") from e
         for entry in entries:
-            # Links to folders are not followed: one may lead back here, for ever.
+            # Links to folders are not followed, because one may lead back here.
             if entry.is_dir(follow_symlinks=False):
                 folders.append(Path(entry.path))
                 continue
@@ -282,12 +284,12 @@ def _require_file(path: str | Path, at_most: int, where: str) -> None:
 
 @contextlib.contextmanager
 def only_writer(directory: Path, where: str) -> Iterator[None]:
-    """Hold the directory's lock; the system lets go of it when the process ends, however it does.
+    """Hold the directory's lock; the system releases it when the process ends in any way.
 
     Raises:
         InputError: another process holds it, or the directory cannot be written to.
     """
-    # Refused at once: the other process may go on for hours.
+    # Refused at once: the other process may run for hours.
     lock = filelock.FileLock(directory / ".lock", timeout=0)
     with _words(where):
         try:

@@ -1,4 +1,4 @@
-"""Summary of a sweep, a page of JSON."""
+"""Summary of a sweep, as JSON."""
 
 import contextlib
 import functools
@@ -16,40 +16,38 @@ from heli_jax.sweeps.datasets import chunks_of
 from heli_jax.sweeps.design_point import MEANINGS, OK
 from heli_jax.sweeps.spec import Job
 
-_WORST_COUNT = 5  # elements of each result: as many as the figure of them has dashes
+_WORST_COUNT = 5  # elements of each result, as many as dashes in its figure
 _SMALL_IS_BAD = ("fit", "vaf")  # 100 % and 1 are perfect, and there is no lower end
 
 
 def write_summary(
     path: Path, dataset: xr.Dataset, job: Job, timing: dict[str, Any], where: str
 ) -> None:
-    """Write summary.json, which appears whole or not at all.
+    """Write summary.json, which appears complete or not at all.
 
     Raises:
         InputError: it cannot be written.
     """
     content = summary(dataset, job, timing)
     if not timing["computed_chunks"] and path.exists():
-        # Resumed when it was finished: what it took stays.
+        # The sweep was already finished, so its timing stays.
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
             content["timing"] = json.loads(path.read_text(encoding="utf-8"))["timing"]
-    # NaN is no JSON, though Python writes it: other programs could not read the file.
+    # NaN is no valid JSON, though Python writes it: other programs could not read the file.
     text = json.dumps(content, indent=1, allow_nan=False)
     with run_directory.whole_file(path, f"{where}: summary.json") as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
 
 
 def summary(dataset: xr.Dataset, job: Job, timing: dict[str, Any]) -> dict[str, Any]:
-    """Counts by status, quantiles of every result over the elements that are ok, the worst and the
-    best.
-    """
-    # The status of all elements is held, a byte each; results are read in pieces.
+    """Return counts by status, and quantiles, the worst and the best valid elements by result."""
+    # The status takes a byte per element and is held; results are read in pieces.
     status = dataset["status"].values
     fine = status == OK
     results = {
         str(name): _quantiles(dataset[name], fine)
         for name in dataset.data_vars
-        # Quantiles over times and elements together would say nothing of any run.
+        # Quantiles over times and elements together have no meaning for a run.
         if not str(name).startswith("trajectory_")
     }
     content = {
@@ -66,7 +64,7 @@ def summary(dataset: xr.Dataset, job: Job, timing: dict[str, Any]) -> dict[str, 
         "timing": timing,
         "versions": dataset.attrs["versions"],
         "seed": dataset.attrs["seed"],
-        # A store of an earlier version has sentences alone.
+        # A store of an earlier version has only sentences.
         "notes": [
             n if isinstance(n, dict) else as_data(note("sweep.note", n))
             for n in dataset.attrs.get("notes", [])
@@ -86,7 +84,7 @@ def _unit(variable: xr.DataArray) -> dict[str, str]:
 
 
 def _ends(variable: xr.DataArray) -> dict[str, Any]:
-    """The least and the largest finite value; nothing where there is none."""
+    """Return the smallest and the largest finite value; empty if there is none."""
     parts = [part for _, values in chunks_of(variable) if (part := _finite(values)).size]
     if not parts:
         return {}
@@ -95,13 +93,12 @@ def _ends(variable: xr.DataArray) -> dict[str, Any]:
 
 
 def _quantiles(variable: xr.DataArray, fine: np.ndarray) -> dict[str, Any]:
-    """Return quantiles of the finite values of the elements that are ok, and the number of values
-    that are not finite.
+    """Return quantiles of the finite values of the valid elements, and the count of other values.
 
-    Over flights and modes too, where a result has them.
+    Flights and modes are included if a result has them.
     """
-    # The values are held once: the partition for the quantiles is made where they are. A list of
-    # parts that are joined would take twice the memory, of a million elements that counts.
+    # The values are stored once, and the partition for the quantiles is made in place. Joining a
+    # list of parts would double the memory, which matters for a million elements.
     values, n = np.empty(np.count_nonzero(fine) * (variable.size // max(1, fine.size))), 0
     infinite = nan = 0
     for which, part in chunks_of(variable):
@@ -121,14 +118,16 @@ def _quantiles(variable: xr.DataArray, fine: np.ndarray) -> dict[str, Any]:
 
 
 def worst(dataset: xr.Dataset, job: Job, sign: float = 1.0) -> dict[str, np.ndarray]:
-    """By result, the elements that are ok and worst in it, worst first, `_WORST_COUNT` at most: the
-    largest, or for what agrees with a flight the smallest; of several flights the worst one counts.
-    With a `sign` of -1 the best, best first."""
+    """Return the worst valid elements by result, worst first, at most `_WORST_COUNT`.
+
+    The worst are the largest, or the smallest for a measure of agreement with a flight; of several
+    flights the worst one counts. A `sign` of -1 returns the best, best first.
+    """
     fine = dataset["status"].values == OK
     by_result = {}
     for name, reduce in job.reduce.items():
-        # Modes, margins and functions of several numbers have no variable of their own name, and
-        # which of theirs should be small is not known.
+        # Modes, margins and functions with several numbers have no variable of their own name, and
+        # which numbers should be small is unknown.
         if name not in dataset.data_vars:
             continue
         badness = functools.partial(_badness, small_is_bad=reduce.how in _SMALL_IS_BAD, sign=sign)
@@ -139,11 +138,10 @@ def worst(dataset: xr.Dataset, job: Job, sign: float = 1.0) -> dict[str, np.ndar
 
 
 def _badness(part: np.ndarray, *, small_is_bad: bool, sign: float) -> np.ndarray:
-    """Return the measure (elements,) by which a result (elements, ...) is worst where it is
-    large."""
+    """Return the measure (elements,) of a result (elements, ...), large for the worst."""
     values = part.astype(np.float64)  # a bool or an integer has no minus
     bad = -values if small_is_bad else np.abs(values)
-    # The worst flight first, whichever end is looked for.
+    # The worst flight first, for either sign.
     return sign * bad.reshape(len(values), -1).max(axis=1)
 
 
@@ -153,22 +151,23 @@ def _worst(
     badness_of: Callable[[np.ndarray], np.ndarray],
     count: int,
 ) -> np.ndarray:
-    """The elements that are fine and worst in a variable, worst first, (count,) or fewer."""
+    """Return the worst valid elements of a variable, worst first, (count,) or fewer."""
     badness, element = np.empty(0), np.empty(0, np.int64)
     for which, part in chunks_of(variable):
         bad = badness_of(part)
         usable = np.flatnonzero(fine[which] & np.isfinite(bad))
         most = min(count, usable.size)
-        # Of each part the worst few, and of those the worst: all are never sorted, nor held.
+        # The worst few of each part, then of those the worst: all elements are never sorted or
+        # stored.
         top = usable[np.argpartition(bad[usable], -most)[-most:]] if most else usable
         badness = np.concatenate([badness, bad[top]])
         element = np.concatenate([element, top + which.start])
-    # Equal ones by their place, so that the order does not depend on how it was read.
+    # Ties are sorted by position, so that the order does not depend on the reading.
     return element[np.lexsort((element, -badness))[:count]]
 
 
 def _rows(dataset: xr.Dataset, job: Job, name: str, elements: np.ndarray) -> list[dict[str, Any]]:
-    """Elements with their value of a result and their axes, as JSON has it."""
+    """Return elements with their value of a result and their axes, as plain data for JSON."""
     few = dataset.isel(element=elements)
     values = few[name].transpose("element", ...).values.tolist()
     axes = {n: few[n].values.astype(np.float64) for n in job.design.names}

@@ -1,4 +1,4 @@
-"""Chunks of a sweep, computed: what one process does, here or on another machine."""
+"""Computation of a sweep's chunks in one process, here or on another computer."""
 
 import functools
 import re
@@ -17,16 +17,16 @@ from heli_jax.sweeps.program import Program, arguments, shapes
 from heli_jax.sweeps.spec import Job, axis_unit
 from heli_jax.vehicle import of_helicopter, possible
 
-# Blocks that a device has at least, unless it is alone: XLA writes other code for one block than
-# for several, and how many devices there are shall change no digit.
+# Fewest blocks per device, unless it is alone: XLA generates different code for a single block, and
+# the number of devices must not change any digit.
 BLOCKS = 2
 
-# Of a result, which is a folder of the store: no path, nothing hidden, and nothing that Zarr keeps
-# for itself.
+# Allowed names of a result, which is a folder of the store: no path, nothing hidden, and no name
+# reserved by Zarr.
 _NAME = re.compile(r"(?!\.|__)[^/\\\x00-\x1f]+")
-# Dimensions, which xarray would take the result for, and Zarr's own file.
+# Names of dimensions, which xarray would confuse with the result, and of Zarr's own file.
 _TAKEN = ("element", "flight", "time", "mode", "zarr.json")
-# Of the status, as the CF conventions name them: xarray and others decode the words.
+# Attributes of the status by the CF conventions: xarray and others decode the words.
 _FLAGS = {
     "flag_values": list(MEANINGS),
     "flag_meanings": " ".join(MEANINGS.values()),
@@ -38,25 +38,24 @@ class Variable(NamedTuple):
     """A variable of the store over the elements."""
 
     dims: tuple[str, ...]
-    """of which the first is element"""
+    """Names of the dimensions, element first."""
     shape: tuple[int, ...]
-    """without the elements"""
+    """Shape without the elements."""
     dtype: str
     attributes: dict[str, Any]
     axis: bool = False
 
 
 class Split(NamedTuple):
-    """Division of a sweep; the store remembers a part of it, so that a resumed sweep computes each
-    element in the same batch."""
+    """Division of a sweep; the store keeps it, so that a resumed sweep uses the same batches."""
 
     chunk: int
-    """elements written at a time"""
+    """Elements written at a time."""
     lanes: int
-    """elements computed side by side on a device"""
+    """Batch size: elements computed in parallel on a device."""
     backend: str = "xla"
-    """what computes a run over time: "xla", or "fused", one program of machine code for the whole
-    run"""
+    """Backend of the simulation: "xla", or "fused", one program of machine code for the whole run.
+    """
 
     def chunks(self, size: int) -> int:
         """Return the number of chunks of a sweep of `size` elements."""
@@ -64,7 +63,7 @@ class Split(NamedTuple):
 
 
 def variables(job: Job) -> dict[str, Variable]:
-    """The variables of the job's store, without the coordinates of their other dimensions.
+    """Return the variables of the job's store, without the coordinates of other dimensions.
 
     Raises:
         ValueError: a result that is no number, or a name that a store cannot have.
@@ -76,8 +75,7 @@ def variables(job: Job) -> dict[str, Variable]:
     laid_out["status"] = Variable(("element",), (), "uint8", dict(_FLAGS))
     flights = (("flight", len(job.flights)),) if len(job.flights) > 1 else ()
     for name, (dims, kind, words) in _result_variables(job):
-        # A single flight makes no dimension of length one, which every plot would have to take out
-        # again.
+        # A single flight makes no dimension of length one, which every plot would have to remove.
         dims = (*flights, *dims)
         _check_name(name, laid_out)
         laid_out[name] = Variable(
@@ -87,7 +85,7 @@ def variables(job: Job) -> dict[str, Variable]:
 
 
 def _check_name(name: str, laid_out: Mapping[str, Variable]) -> None:
-    """Refuse a name that a store cannot have, or has already."""
+    """Refuse a name that is invalid or already used."""
     if not _NAME.fullmatch(name) or name in _TAKEN:
         raise ValueError(
             f"reduce: a result would be called {name!r}, expected another name: not "
@@ -98,14 +96,14 @@ def _check_name(name: str, laid_out: Mapping[str, Variable]) -> None:
 
 
 _Sized = tuple[tuple[tuple[str, int], ...], str, dict[str, Any]]
-"""dimensions with their lengths, beyond elements and flights; data type; attributes"""
+"""Dimensions with their lengths, beyond elements and flights; data type; attributes."""
 
 
 def _result_variables(job: Job) -> Iterator[tuple[str, _Sized]]:
-    """By name, the variables of results and trajectories of one flight, in the order asked for."""
-    # All flights give the same ones; where lengths differ trajectories are refused before.
+    """Yield the variables of results and trajectories of one flight, in the requested order."""
+    # All flights have the same variables; different lengths of trajectories were refused before.
     shape, order = shapes(job, 0), list(job.reduce)
-    # JAX sorts dictionaries by key, so the order of the results has to be found again.
+    # JAX sorts dictionaries by key, so the order of the results is restored.
     for name, result in sorted(shape.results.items(), key=lambda r: _place(r[0], order)):
         if result.shape:
             raise ValueError(
@@ -115,8 +113,8 @@ def _result_variables(job: Job) -> Iterator[tuple[str, _Sized]]:
     for name, reduce in job.reduce.items():
         if reduce.how == "modes":
             n = len(naming.names(job.model.State))
-            # In two variables, since neither Zarr nor NetCDF has complex numbers that every reader
-            # knows.
+            # In two variables, because not every reader of Zarr and NetCDF supports complex
+            # numbers.
             for part in ("real", "imag"):
                 words = {"units": "1/s", "long_name": f"eigenvalues, {part} part, slowest first"}
                 yield f"{name}_{part}", ((("mode", n),), "float64", words)
@@ -136,21 +134,21 @@ def _margin_variables(name: str, loop: str) -> Iterator[tuple[str, _Sized]]:
 
 
 def _place(name: str, order: list[str]) -> int:
-    """Return the place of a result: at its reducer, named alike or before a key."""
-    # A function of several numbers gives NAME_KEY.
+    """Return the position of a result: at its reducer, by equal name or by its prefix."""
+    # A function with several numbers has results NAME_KEY.
     if name in order:
         return order.index(name)
     return next((i for i, n in enumerate(order) if name.startswith(f"{n}_")), len(order))
 
 
 def _words(unit: str | None, meaning: str) -> dict[str, Any]:
-    """Attributes as the CF conventions name them, which xarray labels its plots by."""
+    """Return attributes by the CF conventions, which xarray uses as plot labels."""
     words = {"units": unit} if unit is not None else {}
     return words | ({"long_name": meaning} if meaning else {})
 
 
 def _axis_words(job: Job, name: str) -> dict[str, Any]:
-    """Unit and meaning of an axis, and whether it is even in the logarithm."""
+    """Return unit and meaning of an axis, and a mark for logarithmic spacing."""
     kind, _, of = name.partition(".")
     if name in naming.names(job.model.Params):
         meaning = naming.meaning(job.model.Params, name)
@@ -167,7 +165,7 @@ def _axis_words(job: Job, name: str) -> dict[str, Any]:
 
 
 def _result_words(job: Job, name: str) -> dict[str, Any]:
-    """Unit and meaning of a result, as far as they are known: not of a function of the user's."""
+    """Return unit and meaning of a result, if known; a user's function has none."""
     reduce = job.reduce.get(name)
     stream = None if reduce is None else reducers.streaming(reduce)
     if reduce is None or not isinstance(reduce.how, str) or reduce.signal is None or stream is None:
@@ -179,14 +177,14 @@ def _result_words(job: Job, name: str) -> dict[str, Any]:
 
 
 class Pending(NamedTuple):
-    """A chunk that devices compute."""
+    """A chunk in computation."""
 
     start: int
     stop: int
     columns: dict[str, np.ndarray]
-    """values of the axes, (stop - start,)"""
+    """Values of the axes, (stop - start,)."""
     by_flight: tuple[Callable[[], ElementResults], ...]
-    """what gives arrays with the filled chunk's size, which JAX may still be computing"""
+    """Functions that return arrays of the padded chunk's size, which JAX may still be computing."""
 
 
 class Worker:
@@ -195,12 +193,12 @@ class Worker:
     def __init__(self, job: Job, split: Split, devices: Sequence[Any] | None = None) -> None:
         self.job, self.split = job, split
         devices = jax.local_devices() if devices is None else devices
-        # Fewer where a chunk has no BLOCKS blocks for each: the others would compute copies.
+        # Fewer if a chunk has less than BLOCKS blocks for each: the others would compute copies.
         used = max(1, min(len(devices), split.chunk // (BLOCKS * split.lanes)))
         self.devices = tuple(devices[:used])
         kind = Program
         if split.backend == "fused":
-            # Here, since XLA alone needs no other compiler.
+            # Here, because XLA alone needs no other compiler.
             from heli_jax.sweeps.fused_program import FusedProgram
 
             kind = FusedProgram
@@ -208,20 +206,20 @@ class Worker:
         self._beside = ThreadPoolExecutor(1)
 
     def begin(self, chunk: int) -> Pending:
-        """Set the devices to work on a chunk; `finish` waits for it."""
-        # Axes stay in float64 for the store, whatever the sweep's precision.
+        """Start the computation of a chunk; `finish` waits for it."""
+        # Axes stay in float64 for the store, in any precision of the sweep.
         start = chunk * self.split.chunk
         stop = min(start + self.split.chunk, self.job.design.size)
         columns = self.job.design.values(start, stop)
         values = arguments(self.job, columns)
-        # In a thread beside: JAX returns before it has computed, other programs do not.
+        # In a parallel thread: JAX returns before it has computed, other programs do not.
         begun = [self._beside.submit(p, values, self.split.chunk) for p in self._programs]
         return Pending(start, stop, columns, tuple(f.result for f in begun))
 
     def finish(self, pending: Pending) -> dict[str, np.ndarray]:
-        """The chunk's variables, arrays (stop - start, ...)."""
+        """Return the chunk's variables, arrays (stop - start, ...)."""
         count = pending.stop - pending.start
-        # Without the elements that the last chunk was filled up with.
+        # Without the padding of the last chunk.
         computed = [result() for result in pending.by_flight]
         by_flight = jax.tree.map(lambda v: np.asarray(v)[:count], computed)
         parts = [self._results(of_flight) for of_flight in by_flight]
@@ -230,9 +228,9 @@ class Worker:
             results = {n: np.stack([p[n] for p in parts], axis=1) for n in results}
         impossible = self._impossible(pending.columns)
         status = _status(by_flight, pending.columns, impossible)
-        # What a run that diverged or a vehicle that cannot be left behind is no result.
+        # A diverged run or an impossible vehicle has no valid results.
         lost = impossible | (status == DIVERGED)
-        # Modes and margins stay: they are of where the run begins, and NaN if that is.
+        # Modes and margins stay: they belong to the start of the run, and are NaN if that is.
         first = by_flight[0]
         names = (*first.results, *(f"trajectory_{n}" for n in first.trajectories))
         for name in names if lost.any() else ():
@@ -244,11 +242,11 @@ class Worker:
         return {**columns, **results, "status": status}
 
     def run(self, chunk: int) -> dict[str, np.ndarray]:
-        """A chunk from beginning to end."""
+        """Compute a chunk and return it."""
         return self.finish(self.begin(chunk))
 
     def _results(self, computed: ElementResults) -> dict[str, np.ndarray]:
-        """The variables of one flight's results, (elements, ...)."""
+        """Return the variables of one flight's results, (elements, ...)."""
         results = dict(computed.results)
         results |= {f"trajectory_{n}": v for n, v in computed.trajectories.items()}
         model = self.job.model
@@ -268,13 +266,13 @@ class Worker:
     def _impossible(self, columns: dict[str, np.ndarray]) -> np.ndarray:
         """Return the elements whose parameters are impossible."""
         count = len(next(iter(columns.values())))
-        # A model of one's own says itself what has to be positive; what a helicopter can be is
+        # A user's model states which parameters must be positive; the limits of a helicopter are
         # known here.
         if not of_helicopter(self.job.model.Params):
             positive = [columns[n] for n in self.job.model.positive if n in columns]
             return np.any([~(v > 0) for v in positive], axis=0) | np.zeros(count, bool)
         swept = {n: columns[n] for n in columns if n in self.job.params}
-        # The ends of the paddle are judged together.
+        # The two ends of the paddle are checked together.
         both = {n: self.job.params[n] for n in ("R1", "R2") if swept.keys() & {"R1", "R2"}}
         return ~np.broadcast_to(possible({**both, **swept}), count)
 
@@ -282,31 +280,31 @@ class Worker:
 def _status(
     by_flight: Sequence[ElementResults], columns: dict[str, np.ndarray], impossible: np.ndarray
 ) -> np.ndarray:
-    """The status (elements,) of a chunk's elements over all flights."""
+    """Return the status (elements,) of a chunk's elements over all flights."""
     status = functools.reduce(_worst, [computed.status for computed in by_flight])
     finite = functools.reduce(np.logical_and, [np.isfinite(v) for v in columns.values()])
-    # A vehicle that cannot be is out of range even where its run diverged: that is why it did. An
-    # axis that is no number says nothing of the vehicle, and goes before.
+    # An impossible vehicle is out of range even if its run diverged, because it is the cause. An
+    # axis without a number has priority.
     status = np.where(impossible, OUT_OF_RANGE, status)
     return np.where(finite, status, DIVERGED).astype(np.uint8)
 
 
 def _worst(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Diverged before out of range before ok."""
-    # By hand, since diverged is the lesser number of the two.
+    """Return the worse status: diverged, then out of range, then ok."""
+    # Explicitly, because diverged is the smaller number.
     both = (a == DIVERGED) | (b == DIVERGED)
     return np.where(both, DIVERGED, np.maximum(a, b)).astype(np.uint8)
 
 
 def _blanked(values: np.ndarray, lost: np.ndarray) -> np.ndarray:
-    """Values (elements, ...) with NaN for some elements (elements,)."""
+    """Return values (elements, ...) with NaN for some elements (elements,)."""
     lost = lost.reshape(-1, *(1,) * (values.ndim - 1))
     return np.where(lost, np.asarray(np.nan, values.dtype), values)
 
 
 def _eigenvalues(A: np.ndarray) -> np.ndarray:
-    """(k, n), slowest first, the lower one of a pair first; NaN where A is not finite."""
-    # NumPy raises where one matrix has NaN, and then no element of the chunk had eigenvalues.
+    """Return eigenvalues (k, n), slowest first, lower of a pair first; NaN unless A is finite."""
+    # NumPy raises if one matrix has NaN, and then no element of the chunk would have eigenvalues.
     finite = np.all(np.isfinite(A), axis=(1, 2))
     values = np.linalg.eigvals(np.where(finite[:, None, None], A, 0.0)).astype(np.complex128)
     order = np.lexsort((values.imag, np.abs(values)), axis=1)

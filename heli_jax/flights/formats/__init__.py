@@ -1,1 +1,1 @@
-"""Readers of logs, one file a format: each opens a path and returns a `Table` or `ChannelLog`s."""
+"""Readers of logs, one file per format; each returns a `Table` or `ChannelLog`s."""

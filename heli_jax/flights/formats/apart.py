@@ -1,8 +1,8 @@
-"""Reading with a library in a process of its own, within limits of time and memory.
+"""Reading with a library in a separate process, within limits of time and memory.
 
-Over a damaged file a library may loop, crash or fill the memory, and it hears no Ctrl-C meanwhile.
-So this module starts itself as a program: it calls one reader, writes a line of JSON and the
-arrays behind it, as bytes, to standard output, and ends.
+With a damaged file a library may loop, crash or fill the memory, and it does not react to Ctrl-C.
+Therefore this module starts itself as a program. It calls one reader, writes a line of JSON and
+then the arrays as bytes to standard output, and ends.
 """
 
 import contextlib
@@ -26,18 +26,17 @@ from heli_jax.finding import Finding, note
 from heli_jax.flights.log import Budget, wrong
 
 _SECONDS, _RATE = 20, 10**6
-"""processor time [s] that a file may take, and bytes for which it has a second more"""
+"""Processor time [s] for any file, and the number of bytes that add one second."""
 _PATIENCE = 10
-"""times as long by the clock"""
+"""Ratio of the wall-clock limit to the processor time."""
 _BESIDE = 10**9
-"""bytes for Python and its libraries"""
+"""Memory for Python and its libraries [bytes]."""
 _COPIES = 4
-"""times that numbers may be in memory while they are unpacked"""
+"""Copies of the numbers in memory during unpacking."""
 
 
 class Content(NamedTuple):
-    """Result of a reader: facts that JSON can hold, vectors in an order that these state, and
-    notes."""
+    """Result of a reader: facts for JSON, vectors in the order that the facts state, and notes."""
 
     facts: dict[str, Any]
     arrays: Sequence[np.ndarray]
@@ -48,15 +47,16 @@ type Reader = Callable[[Path, Budget], Content]
 
 
 def read_apart(path: Path, reader: Reader, what: str, size: int) -> Content:
-    """Return what a reader makes of a file.
+    """Return the result of a reader on a file, from a separate process.
 
     Args:
+        path: path of the file.
         reader: a function of a module in this package.
-        what: the kind of file in words, without an article.
-        size: of the file [bytes].
+        what: kind of the file in words, without an article.
+        size: size of the file [bytes].
 
     Raises:
-        InputError: as the reader raises, or that the file is no whole one of its kind.
+        InputError: as the reader raises, or the file is incomplete or damaged.
     """
     seconds = _SECONDS + size // _RATE
     arguments = (reader.__module__, reader.__name__, str(path), what, str(size), str(seconds))
@@ -67,7 +67,7 @@ def read_apart(path: Path, reader: Reader, what: str, size: int) -> Content:
         stderr=subprocess.DEVNULL,
         env=import_path.environment() | {"OPENBLAS_NUM_THREADS": "1"},
     )
-    # Where the system sets no limit to its processor time.
+    # For systems that cannot limit processor time.
     watch = threading.Timer(_PATIENCE * seconds, process.kill)
     watch.daemon = True
     watch.start()
@@ -91,12 +91,12 @@ def read_apart(path: Path, reader: Reader, what: str, size: int) -> Content:
 
 
 def guarded[T](path: Path, what: str, read: Callable[[], T]) -> T:
-    """Read with a library; any exception over a damaged file becomes an error of that file."""
+    """Read with a library; any exception on a damaged file becomes an `InputError`."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return read()
-    # Each library raises what its parser stumbles over: KeyError, TypeError, zlib.error, ...
+    # Each library raises its parser's own errors: KeyError, TypeError, zlib.error, ...
     except (Exception, MemoryError) as e:
         if isinstance(e, InputError):
             raise
@@ -104,8 +104,10 @@ def guarded[T](path: Path, what: str, read: Callable[[], T]) -> T:
 
 
 def main() -> None:
-    """Call the reader that the arguments name: module, function, the file's path, kind and size
-    [bytes], and a limit [s]."""
+    """Call the reader that the arguments name.
+
+    The arguments are module, function, the file's path, kind and size [bytes], and a limit [s].
+    """
     module, function, where, what, size, seconds = sys.argv[1:]
     path, budget = Path(where), Budget(where, int(size))
     # Libraries print warnings.
@@ -133,7 +135,7 @@ def main() -> None:
     for x in arrays:
         out.write(np.ascontiguousarray(x).data)
     out.flush()
-    # Without the libraries' own ends, which may crash after a damaged file.
+    # Skips the libraries' exit handlers, which may crash after a damaged file.
     os._exit(0)
 
 

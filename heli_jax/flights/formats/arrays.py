@@ -1,7 +1,7 @@
-"""Named arrays as a table: packed numbers, stacked runs, clocks of their own.
+"""Named arrays as a table: packed numbers, stacked runs, separate clocks.
 
-The readers of MATLAB, NetCDF, HDF5, NumPy and JSON files collect `DataSets`; an array's name is its
-path, `log.roll.data` in MATLAB's structures, `log/roll` in HDF5.
+The readers of MATLAB, NetCDF, HDF5, NumPy and JSON files collect `DataSets`. An array's name is its
+path: `log.roll.data` in MATLAB's structures, `log/roll` in HDF5.
 
 Sources of the packing: the CF conventions 1.11, sections 2.5.1 and 8.1, and the attribute
 conventions of the NetCDF User's Guide.
@@ -32,23 +32,23 @@ from heli_jax.flights.log import (
 )
 
 LARGEST = 10**9
-"""bytes of a file"""
+"""Largest file [bytes]."""
 MOST_ELEMENTS = 100
-"""columns of a matrix, or elements of a list: more are data of another shape than a log's"""
+"""Most columns of a matrix, or elements of a list; more do not belong to a log."""
 PACKING = ("scale_factor", "add_offset", "_FillValue", "missing_value", "_Unsigned")
-"""attributes that say how numbers are packed"""
+"""Attributes that describe the packing of numbers."""
 UNIT_ATTRIBUTES = ("units", "unit", "Units", "Unit")
 SEGMENT = "segment"
-"""name of the column that numbers stacked runs, from 1"""
+"""Name of the column that numbers stacked runs, from 1."""
 _DEEPEST = 3
-"""dimensions of an array that may be a stack of runs"""
+"""Most dimensions of an array: those of a stack of runs."""
 _FEWEST = 10
-"""samples of a run, below which matrices of a few numbers are no stack"""
+"""Fewest samples of a run; below it, small matrices are no stack."""
 _LEVEL = re.compile(r"[./]")
 
 
 class ArrayTable:
-    """A `Table` on arrays, each (N,); those asked for together have to be of one length."""
+    """`Table` of arrays, each (N,); arrays requested together must have one length."""
 
     def __init__(
         self,
@@ -68,10 +68,10 @@ class ArrayTable:
         require_few_columns(path, len(arrays))
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """The arrays as float64 (N,)."""
+        """Return the arrays as float64 (N,)."""
         require_columns(self.path, self.names, names)
         arrays = {name: np.asarray(self._arrays[name], np.float64) for name in names}
-        # A summary of two numbers beside a log does no harm unless it is asked for.
+        # A summary of two numbers beside a log matters only if it is requested.
         first = next(iter(names))
         other = next((n for n in names if arrays[n].size != arrays[first].size), None)
         if other is not None:
@@ -80,27 +80,27 @@ class ArrayTable:
         return arrays
 
     def survey(self) -> list[Survey]:
-        """Every array, in the file's order."""
+        """Survey every array, in the file's order."""
         return [
             Survey(name, np.asarray(values, np.float64), values.size)
             for name, values in self._arrays.items()
         ]
 
     def place(self, row: int) -> str:
-        """`row 1` is the first."""
+        """Return the place of a row; `row 1` is the first."""
         return f"row {row + 1}"
 
     def cell_text(self, name: str, row: int) -> str:
-        """Text of a cell."""
+        """Return the text of a cell."""
         return repr(self._arrays[name][row].item())[:40]
 
     def time_unit(self, name: str) -> str | None:
-        """The unit that the file states, where it is one of time."""
+        """Return the unit that the file states, if it is one of time."""
         return time_unit(self.units.get(name, ""))
 
 
 class DataSets:
-    """Arrays, texts and attributes as a file has them, by path."""
+    """Arrays, texts and attributes of a file, by path."""
 
     def __init__(self, budget: Budget) -> None:
         self.budget = budget
@@ -117,11 +117,11 @@ class DataSets:
 
     @property
     def longest(self) -> int:
-        """Numbers of the largest data set."""
+        """Size of the largest data set."""
         return max((x.size for x in self._stored.values()), default=0)
 
     def add(self, name: str, stored: np.ndarray, attributes: Mapping[str, Any]) -> None:
-        """Add one data set, unpacked; `attributes` are all that it has, or those that count."""
+        """Add one data set, unpacked; `attributes` are all or the relevant ones."""
         self.budget.take_numbers(stored.size, stored.nbytes)
         if stored.dtype.kind == "c":
             self._left_out[name] = "which is complex"
@@ -140,16 +140,16 @@ class DataSets:
         self._stored[name], self._units[name] = values, text_of(stated)
 
     def leave_out(self, name: str, kind: np.dtype, shape: tuple[int, ...] | None) -> None:
-        """Note numbers that are not read, where they are of too many dimensions to be a log's."""
+        """Note numbers that are left out because they have too many dimensions for a log."""
         if shape and kind.kind in "biuf":
             self._left_out[name] = f"which has {len(shape)} dimensions"
 
     def table(self, path: str, kind: str, data: bytes) -> ArrayTable:
-        """All of them."""
+        """Return all data sets as a table."""
         return ArrayTable(path, kind, data, *self.vectors())
 
     def vectors(self) -> tuple[dict[str, np.ndarray], dict[str, str], tuple[Finding, ...]]:
-        """Arrays (N,) and units by name, and notes."""
+        """Return arrays (N,) and units by name, and notes."""
         notes = list(self.notes)
         if self._missing:
             each = listed(f"{shown(name)} ({n})" for name, n in self._missing.items())
@@ -170,11 +170,11 @@ class DataSets:
 def _vectors(name: str, value: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
     if value.dtype.kind not in "biuf" or value.ndim > 2 or not value.size:
         return
-    # MATLAB knows no vector: what it calls one is a matrix of a single row or column.
+    # MATLAB has no vectors, only matrices of a single row or column.
     if value.ndim < 2 or 1 in value.shape:
         yield name, value.ravel()
         return
-    # Samples run along the longer side.
+    # Samples are along the longer side.
     table = value if value.shape[0] >= value.shape[1] else value.T
     for i in range(min(table.shape[1], MOST_ELEMENTS)):
         yield f"{name}[{i}]", table[:, i]
@@ -188,12 +188,11 @@ def holds_numbers(kind: np.dtype, dimensions: int) -> bool:
 
 
 class Packing(ValueError):
-    """An attribute that says how numbers are packed cannot be understood; in words which."""
+    """Reason why a packing attribute cannot be understood."""
 
 
 def unpack(stored: np.ndarray, attributes: Mapping[str, object]) -> tuple[np.ndarray, int]:
-    """Unpack stored numbers; return them with NaN for fills and invalid values, and the number
-    missing.
+    """Unpack stored numbers; return them, NaN if missing or invalid, and the count missing.
 
     Raises:
         Packing: a scale or an offset is no number.
@@ -202,13 +201,13 @@ def unpack(stored: np.ndarray, attributes: Mapping[str, object]) -> tuple[np.nda
         return stored, 0
     kind = {"true": "u", "false": "i"}.get(text_of(attributes.get("_Unsigned")).lower())
     if kind and stored.dtype.kind in "iu":
-        # NetCDF 3 has no unsigned numbers, and notes it.
+        # NetCDF 3 has no unsigned numbers and marks them by an attribute.
         stored = stored.view(stored.dtype.str.replace(stored.dtype.kind, kind))
     missing = np.zeros(stored.shape, bool)
     for name in ("_FillValue", "missing_value"):
         for mark in _numbers(attributes.get(name, ())):
-            # In the stored type: as float64, -9999.9 is none of a float32's numbers, and of an
-            # unsigned byte the mark is often written with a sign.
+            # Compared in the stored type: no float32 equals the float64 -9999.9, and the mark of an
+            # unsigned byte often has a sign.
             with np.errstate(all="ignore"):
                 same = np.asarray(mark).astype(stored.dtype)
                 whole = bool(mark == np.rint(mark)) and abs(mark) < 2.0 ** (8 * same.itemsize)
@@ -223,7 +222,7 @@ def unpack(stored: np.ndarray, attributes: Mapping[str, object]) -> tuple[np.nda
 
 
 def text_of(attribute: object) -> str:
-    """The text of an attribute, which may be bytes or an array of one; empty of any other."""
+    """Return the text of an attribute, also from bytes or an array of one; empty for any other."""
     if isinstance(attribute, np.ndarray) and attribute.size == 1:
         attribute = attribute.ravel()[0]
     if isinstance(attribute, bytes):
@@ -242,8 +241,7 @@ def _one(attributes: Mapping[str, object], name: str, otherwise: float) -> float
 
 
 def _numbers(attribute: object) -> np.ndarray:
-    """The numbers of an attribute (n,); empty where it holds none. Some writers put them in a
-    text."""
+    """Return the numbers of an attribute (n,), which may be a text; empty if it has none."""
     if text := text_of(attribute):
         try:
             return np.array([float(text)])
@@ -253,20 +251,22 @@ def _numbers(attribute: object) -> np.ndarray:
     return numbers if numbers.dtype.kind in "biuf" else np.empty(0)
 
 
-# Runs that a file has as a stack, (segment, sample, channel), as data sets for learning do.
+# Runs stored as a stack, (segment, sample, channel), as in data sets for learning.
 
 
 def _unstacked(
     arrays: Mapping[str, np.ndarray],
 ) -> tuple[Mapping[str, np.ndarray], tuple[Finding, ...]]:
-    """Arrays of at most two dimensions, stacks as matrices (segment times sample, channel) with a
-    column that numbers the segments; and notes."""
+    """Return arrays of at most two dimensions, and notes.
+
+    Stacks become matrices (segment times sample, channel), and a column numbers the segments.
+    """
     cubes = {n: x for n, x in arrays.items() if x.ndim == _DEEPEST and x.size}
     if not cubes:
         return arrays, ()
     shape = next(iter(cubes.values())).shape[:2]
     clocks = {n: x for n, x in arrays.items() if is_called_time(n) and x.ndim < _DEEPEST}
-    # Images and rotation matrices, (sample, row, column), stand beside times of other lengths.
+    # Images and rotation matrices, (sample, row, column), have times of other lengths.
     if (
         shape[1] < _FEWEST
         or any(x.shape[:2] != shape for x in cubes.values())
@@ -291,20 +291,22 @@ def _unstacked(
     return made, (note("channels.stacked", words, *cubes, value=shape[0]),)
 
 
-# Arrays that have clocks of their own by where they stand in a file: `log.imu.t` is the time of
-# `log.imu.gx` and `log.rc.t` that of `log.rc.aileron`.
+# Arrays with separate clocks, by their place in a file: `log.imu.t` is the time of `log.imu.gx` and
+# `log.rc.t` that of `log.rc.aileron`.
 
 
 def by_clocks(table: ArrayTable) -> ChannelLog | None:
-    """Return arrays as topics, each with the times of its group or of the nearest above that has
-    some of its length; None where all have one clock."""
+    """Return arrays as topics, or None if all have one clock.
+
+    A topic has the times of its group, or of the nearest group above with times of its length.
+    """
     arrays = {s.name: s.values for s in table.survey() if s.values is not None}
     clocks: dict[str, np.ndarray] = {}
     for name, stamps in arrays.items():
         if is_called_time(name) and stamps.size > 1 and np.all(stamps[1:] > stamps[:-1]):
             leaf = _LEVEL.split(name)[-1]
             unit = table.time_unit(name) or split_unit(leaf)[1] or likely_unit(stamps)
-            with np.errstate(over="ignore"):  # of a damaged file
+            with np.errstate(over="ignore"):  # for a damaged file
                 clocks[name] = stamps * SECONDS[unit]
     of_clock: dict[str, list[str]] = {}
     without = []
@@ -326,7 +328,7 @@ def by_clocks(table: ArrayTable) -> ChannelLog | None:
 
 
 def _clock_of(name: str, size: int, clocks: Mapping[str, np.ndarray]) -> str | None:
-    """The clock of an array; None where the groups above it have none of its length, or several."""
+    """Return the clock of an array; None without one in the groups above it, or with several."""
     group = _LEVEL.split(name)[:-1]
     for depth in range(len(group), -1, -1):
         near = [
@@ -338,7 +340,7 @@ def _clock_of(name: str, size: int, clocks: Mapping[str, np.ndarray]) -> str | N
 
 
 def clock_notes(table: Table) -> tuple[Finding, ...]:
-    """Note that arrays have clocks of their own."""
+    """Return a note if arrays have separate clocks."""
     log = by_clocks(table) if isinstance(table, ArrayTable) else None
     if log is None:
         return ()

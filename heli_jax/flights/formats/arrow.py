@@ -1,4 +1,4 @@
-"""Logs in columns of Apache: Parquet, and Arrow's own files and streams (.feather, .arrow)."""
+"""Logs in Apache's column formats: Parquet, and Arrow files and streams (.feather, .arrow)."""
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -12,44 +12,44 @@ from heli_jax.flights.log import Budget, Survey, column, require_columns, requir
 from heli_jax.flights.progress import Digest
 from heli_jax.regular_file import open_regular, read_regular, size_words
 
-# Imported again within the functions that need it, as in `csv_text`.
+# Imported inside the functions that need it, as in `csv_text`.
 if TYPE_CHECKING:
     import pyarrow as pa
 
 ARROW_MARK = b"ARROW1"
-"""what files of Arrow begin with, and those of Feather"""
+"""First bytes of Arrow and Feather files."""
 _STREAM = b"\xff\xff\xff\xff"
 _LARGEST, _LARGEST_ARROW = 16 * 10**9, 10**9
-"""bytes: of Parquet the columns asked for go into memory, of Arrow the whole file"""
+"""Largest files [bytes]: Parquet loads only requested columns, Arrow the whole file."""
 _LONGEST_FOOTER = 64 * 10**6
 _AT_ONCE = 2 * 10**6
-"""cells that are decoded before their rows are counted: 16 MB of numbers"""
+"""Cells decoded before their rows are counted: 16 MB of numbers."""
 
 
 def open_parquet(path: Path) -> "ColumnTable":
-    """Open a Parquet file and read its schema; only the columns asked for are read later."""
+    """Open a Parquet file and read its schema; only requested columns are read later."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     where = str(path)
     with open_regular(path, "a log in Parquet", _LARGEST) as opened:
         size = os.fstat(opened.fileno()).st_size
-        # Before anything goes through the whole file: what ends otherwise is none of Parquet.
+        # Before anything reads the whole file: a file with another end is not Parquet.
         _check_end(where, opened, size)
         try:
             file = pq.ParquetFile(path)
             schema, metadata = file.schema_arrow, file.metadata
-        # pyarrow raises UnicodeDecodeError where the name of a column is no text.
+        # pyarrow raises UnicodeDecodeError if the name of a column is no text.
         except (pa.ArrowException, OSError, UnicodeDecodeError) as e:
             raise wrong(where, "is no whole Parquet file") from e
         require_few_columns(where, metadata.num_columns)
-        # Text stays as its dictionary: a few words that every row repeats can be large.
+        # Text stays in dictionary form: a few words that every row repeats can be large.
         texts = [f.name for f in schema if pa.types.is_string(f.type) or pa.types.is_binary(f.type)]
         if texts:
             file = pq.ParquetFile(path, read_dictionary=texts)
 
     def pieces(names: Sequence[str]) -> "Iterator[pa.RecordBatch]":
-        # Counted: a damaged column can claim, and decode to, any number of rows.
+        # Counted, because a damaged column can claim and decode to any number of rows.
         rows = 0
         try:
             for piece in file.iter_batches(
@@ -58,15 +58,15 @@ def open_parquet(path: Path) -> "ColumnTable":
                 rows += piece.num_rows
                 if rows > metadata.num_rows:
                     break
-                piece.validate(full=True)  # a damaged page can decode to lengths that do not fit
+                piece.validate(full=True)  # a damaged page can decode to inconsistent lengths
                 yield piece
         except (pa.ArrowException, OSError, MemoryError, UnicodeDecodeError) as e:
             raise wrong(where, "is no whole Parquet file") from e
         if rows != metadata.num_rows:
             raise wrong(where, "is no whole Parquet file")
 
-    # Of groups of rows: what is said of a single column is not asked, since of some damage to it
-    # pyarrow ends the whole process.
+    # From groups of rows, not single columns: with some damage to a column, pyarrow ends the whole
+    # process.
     groups = (metadata.row_group(i) for i in range(metadata.num_row_groups))
     unpacked = sum(group.total_byte_size for group in groups)
     count, digest = metadata.num_rows, Digest(path)
@@ -74,9 +74,9 @@ def open_parquet(path: Path) -> "ColumnTable":
 
 
 def _check_end(path: str, file: BinaryIO, size: int) -> None:
-    """Refuse a file whose end is not that of a Parquet file, or says that it is mostly header."""
+    """Refuse a file whose end is not that of a Parquet file, or states an oversized footer."""
     # A Parquet file ends with its metadata, their length (4 bytes, little-endian) and its mark:
-    # PAR1, or PARE where the metadata are encrypted. 12 bytes are both marks and the length.
+    # PAR1, or PARE if the metadata are encrypted. 12 bytes are both marks and the length.
     file.seek(max(size - 8, 0))
     end = file.read(8)
     length = int.from_bytes(end[:4], "little")
@@ -113,7 +113,7 @@ def open_arrow(path: Path) -> "ColumnTable":
     require_few_columns(where, len(table.schema))
 
     def of_columns(names: Sequence[str]) -> "Iterator[pa.RecordBatch]":
-        # By place: of two columns of one name `select` takes neither.
+        # By place: `select` fails if two columns have the same name.
         flat = (not pa.types.is_nested(f.type) for f in table.schema)
         kept = [i for i, f in enumerate(flat) if f and table.column_names[i] in names]
         yield from table.select(kept).to_batches()
@@ -125,7 +125,7 @@ def open_arrow(path: Path) -> "ColumnTable":
 
 
 class ColumnTable:
-    """A `Table` on columns of Arrow, which come in pieces."""
+    """`Table` of Arrow columns, which come in pieces."""
 
     notes: tuple[Finding, ...] = ()
 
@@ -140,10 +140,11 @@ class ColumnTable:
         pieces: "Callable[[Sequence[str]], Iterator[pa.RecordBatch]]",
         unpacked: int,
     ) -> None:
-        """
+        """Make a table of columns.
+
         Args:
-            pieces: of columns by name.
-            unpacked: bytes of all columns once they are unpacked, where the file states them.
+            pieces: function that yields the pieces of columns by name.
+            unpacked: bytes of all columns after unpacking, if the file states them, else 0.
         """
         if not len(schema) or not n_rows:
             raise wrong(path, "holds no rows, expected a log")
@@ -158,14 +159,14 @@ class ColumnTable:
 
     @property
     def sha256(self) -> str:
-        """Fingerprint of the whole file; reading a log's columns takes less time."""
+        """SHA-256 of the whole file; slower than reading a log's columns."""
         try:
             return self._digest.hex()
         except OSError as e:
             raise wrong(self.path, f"cannot be read ({e.strerror or type(e).__name__})") from e
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """The columns as float64 (N,), NaN where a value is null."""
+        """Return the columns as float64 (N,), NaN where a value is null."""
         require_columns(self.path, self.names, names)
         for name in names:
             kind = self._schema.field(name).type
@@ -173,8 +174,8 @@ class ColumnTable:
                 raise wrong(self.path, f"holds {kind}, expected numbers", column(name))
         needed = sorted(set(names))
         self._budget.require(8 * self._n_rows * len(needed))
-        # Each piece goes to its place as it is decoded: all of them together, and an array made of
-        # them, would be three times the numbers.
+        # Each decoded piece is copied to its place. All pieces and an array from them would take
+        # three times the memory.
         numbers = {name: np.empty(self._n_rows) for name in needed}
         first = 0
         for piece in self._pieces(needed):
@@ -185,8 +186,10 @@ class ColumnTable:
         return {name: numbers[name] for name in names}
 
     def survey(self) -> list[Survey]:
-        """Every column; what is not a number counts as text. Lists and records within cells are
-        not read, so that all of their cells count as filled."""
+        """Survey every column; non-numeric ones count as text.
+
+        Lists and records are not read, so all of their cells count as filled.
+        """
         import pyarrow as pa
 
         flat = [not pa.types.is_nested(f.type) for f in self._schema]
@@ -207,22 +210,22 @@ class ColumnTable:
         return surveys
 
     def place(self, row: int) -> str:
-        """`row 1` is the first."""
+        """Return the place of a row; `row 1` is the first."""
         return f"row {row + 1}"
 
     def cell_text(self, name: str, row: int) -> str:
-        """Text of a cell."""
+        """Return the text of a cell."""
         value = self._read([name]).column(name)[row].as_py()
         return "nothing" if value is None else repr(value)[:40]
 
     def time_unit(self, name: str) -> str | None:
-        """`s`, `ms`, `us` or `ns` for a column of time stamps or durations."""
-        # By place: of two columns of one name the first, where `field` would refuse the name.
+        """Return `s`, `ms`, `us` or `ns` for a column of time stamps or durations."""
+        # By place: `field` refuses a name that two columns share.
         kind = self._schema.field(self.names.index(name)).type
         return str(kind.unit) if _is_clock(kind) else None
 
     def _read(self, names: Sequence[str]) -> "pa.Table":
-        """The columns, none of them of lists or records."""
+        """Return the columns, none of them of lists or records."""
         import pyarrow as pa
 
         self._budget.require(max(8 * self._n_rows * len(names), self._unpacked))
@@ -246,15 +249,15 @@ def _is_number(kind: "pa.DataType") -> bool:
 
 
 def _floats(values: "pa.Array | pa.ChunkedArray") -> np.ndarray:
-    """Numbers, or ticks of a clock, as float64 (N,), NaN where null."""
+    """Return numbers, or ticks of a clock, as float64 (N,), NaN where null."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
-    # Ticks as whole numbers first: no cast goes from stamps to floating point.
+    # Ticks become integers first, because no cast goes from stamps to floats.
     if _is_clock(values.type):
         values = values.cast(pa.int32() if pa.types.is_time32(values.type) else pa.int64())
-    # Unsafe, since a safe cast refuses integers above 2^53, which stamps in ns all are. A
-    # calendar's stamps round to 256 ns.
+    # Unsafe, because a safe cast refuses integers above 2^53, as all stamps in ns are. Calendar
+    # stamps round to 256 ns.
     values = pc.cast(values, pa.float64(), safe=False)
     if isinstance(values, pa.ChunkedArray):
         return floats(values)
@@ -264,11 +267,11 @@ def _floats(values: "pa.Array | pa.ChunkedArray") -> np.ndarray:
 
 
 def floats(numbers: "pa.ChunkedArray") -> np.ndarray:
-    """Numbers of type float64 (N,), NaN where null."""
+    """Return numbers of type float64 (N,), NaN where null."""
     import pyarrow as pa
 
     values, at = np.empty(len(numbers), np.float64), 0
-    # As buffers, since to_numpy imports pandas, which takes a second.
+    # As buffers, because to_numpy imports pandas, which takes a second.
     for chunk in (c for c in numbers.chunks if len(c)):
         piece = values[at : at + len(chunk)]
         piece[:] = np.frombuffer(chunk.buffers()[1], np.float64, len(chunk), 8 * chunk.offset)

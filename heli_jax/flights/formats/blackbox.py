@@ -1,7 +1,7 @@
 """Blackbox logs of Rotorflight, Betaflight and Cleanflight (.bbl, .bfl, .TXT).
 
-Source of the format: 'Blackbox logging internals' of Cleanflight; the events of Rotorflight are
-those that its firmware writes. The channels keep the firmware's own numbers and names.
+Source of the format: 'Blackbox logging internals' of Cleanflight; Rotorflight's events are from its
+firmware. The channels keep the firmware's own numbers and names.
 """
 
 import hashlib
@@ -31,17 +31,15 @@ from heli_jax.flights.log import ChannelLog, Topic, wrong
 from heli_jax.regular_file import read_regular
 
 _LARGEST = 4 * 10**8
-"""bytes: opened it takes about ten times as much"""
+"""Largest file [bytes]; reading takes about ten times as much memory."""
 _MOST_FLIGHTS = 1000
 _DEGREES_PER_SECOND = "0x3f800000"
-"""gyro_scale of firmware whose gyro counts are degrees per second: the float 1.0"""
+"""gyro_scale of firmware whose gyro counts are degrees per second: the float 1.0."""
 
 
 @dataclass(frozen=True)
 class MainFrames:
-    """The frames of the control loop: `columns` of (N,) by name, `times` (N,) [us] from the
-    firmware's start, `starts` (N,) [bytes]; `dropped` frames could not be computed or have
-    impossible times."""
+    """Frames of the control loop."""
 
     columns: Mapping[str, np.ndarray]
     times: np.ndarray
@@ -50,18 +48,17 @@ class MainFrames:
 
 
 def open_blackbox(path: Path) -> tuple[ChannelLog, ...]:
-    """The flights of a blackbox file, without those that hold no frame."""
+    """Read the flights of a blackbox file, without those that have no frame."""
     data = read_regular(path, "a blackbox log", _LARGEST)
     starts = [match.start() for match in re.finditer(re.escape(MARK), data)]
     if not starts:
         raise wrong(str(path), "is no blackbox log, expected one that begins with its header")
     if len(starts) > _MOST_FLIGHTS:
         raise wrong(str(path), f"expected at most {_MOST_FLIGHTS} flights, got {len(starts)}")
-    # Of the whole file and not of a flight's bytes, so that it is the number that sha256sum gives
-    # for the file a user has.
+    # Of the whole file, so that it equals the output of sha256sum for the user's file.
     sha256, size = hashlib.sha256(data).hexdigest(), len(data)
-    # Each flight's bytes are let go of once its frames are found: beside them and what is made of
-    # them there would not be three times the file, but four.
+    # Each flight's bytes are released once its frames are found. This keeps the peak memory at
+    # three times the file, not four.
     rest = deque(data[start:end] for start, end in pairwise([*starts, size]))
     del data
     flights: list[ChannelLog] = []
@@ -71,8 +68,8 @@ def open_blackbox(path: Path) -> tuple[ChannelLog, ...]:
         try:
             log = _flight(str(path), rest.popleft(), sha256, size, (i + 1, len(starts)))
         except InputError as e:
-            # One flight that cannot be read shall not cost the others of the file. Its problem is
-            # told only where there is nothing else to show.
+            # An unreadable flight must not affect the others of the file. Its problem is reported
+            # only if no flight is readable.
             problems.append(e)
             continue
         if log is not None:
@@ -85,14 +82,14 @@ def open_blackbox(path: Path) -> tuple[ChannelLog, ...]:
 def _flight(
     path: str, data: bytes, sha256: str, size: int, flight: tuple[int, int]
 ) -> ChannelLog | None:
-    """One flight from its bytes; None where it holds no frame."""
+    """Read one flight from its bytes; None if it has no frame."""
     head = read_header(path, data)
     frames = find_frames(data, head.start, head.layouts)
     del data
     main = main_frames(frames, head)
     if not main.times.size:
         return None
-    # P frames have the names and signs of I frames, so one layout is right for all rows.
+    # P frames have the names and signs of I frames, so one layout fits all rows.
     layout = head.layouts["I"]
     units = _units(layout, head)
     topics = [Topic("main", main.times * 1e-6, main.columns, units, "time")]
@@ -105,7 +102,8 @@ def _flight(
         sha256=sha256,
         topics=tuple(topics),
         firmware=head.settings.get("Firmware revision", head.settings.get("Firmware type", "")),
-        # The lines named Field say how the bytes are packed, which is no setting of the vehicle.
+        # The lines named Field describe the packing of the bytes and are no settings of the
+        # vehicle.
         parameters={k: v for k, v in head.settings.items() if not k.startswith("Field ")},
         notes=_losses(frames, main),
         flight=flight,
@@ -113,9 +111,9 @@ def _flight(
 
 
 def _units(layout: FrameLayout, head: Header) -> dict[str, str]:
-    """The units that are sure whatever the version of the firmware."""
-    # A field that is not here keeps a count without a unit. A unit that is right for some firmware
-    # alone would be copied into a configuration, and scale a fit by a wrong factor.
+    """Return the units that are certain for any version of the firmware."""
+    # Other fields stay counts without a unit. A unit that is right only for some firmware would be
+    # copied into a configuration and scale a fit wrongly.
     units = {"time": "us", "headspeed": "rpm", "tailspeed": "rpm"}
     if head.settings.get("gyro_scale", "").lower() == _DEGREES_PER_SECOND:
         gyros = [n for n in layout.names if n.startswith(("gyroADC[", "gyroRAW[", "gyroUnfilt["))]
@@ -124,14 +122,14 @@ def _units(layout: FrameLayout, head: Header) -> dict[str, str]:
 
 
 def _slow(frames: Frames, head: Header, main: MainFrames) -> Topic | None:
-    """Settings that change in flight (S frames) as a topic; None where there are none."""
+    """Return the settings that change in flight (S frames) as a topic; None if there are none."""
     if "S" not in head.layouts or not frames.starts["S"].size:
         return None
     layout = head.layouts["S"]
     values = frames.rows["S"] + np.array([constant(p, head) for p in layout.predictors], np.int64)
-    # They stand between main frames: the time of the one before.
+    # S frames are between main frames and have the time of the previous one.
     last = np.maximum(np.searchsorted(main.starts, frames.starts["S"]) - 1, 0)
-    # A field may stand in several kinds of frames; a channel's name has to be one topic's alone.
+    # A field may be in several kinds of frames, but a channel name belongs to one topic.
     columns = {
         f"slow.{name}" if name in main.columns else name: _signed(values[:, i], has_sign)
         for i, (name, has_sign) in enumerate(zip(layout.names, layout.signed, strict=True))
@@ -140,7 +138,7 @@ def _slow(frames: Frames, head: Header, main: MainFrames) -> Topic | None:
 
 
 def _signed(values: np.ndarray, has_sign: bool) -> np.ndarray:
-    """The lowest 32 bits of numbers (N,), with a sign or without."""
+    """Return the lowest 32 bits of numbers (N,), with or without a sign."""
     return values.astype(np.int64).astype(np.uint32).view(np.int32 if has_sign else np.uint32)
 
 
@@ -158,19 +156,20 @@ def _losses(frames: Frames, main: MainFrames) -> tuple[Finding, ...]:
     return tuple(notes)
 
 
-# The numbers of a blackbox log: what its frames hold plus what the firmware predicted, and which
-# frames can be believed.
+# Numbers of a blackbox log: the contents of its frames plus the firmware's predictions, for the
+# plausible frames.
 #
-# An I frame stands alone; each P frame holds differences from what the frames before it let expect.
-# So a run is an I frame with the P frames up to the next, and runs do not depend on each other: the
-# k-th frames of all runs are computed at once. Nor does a field depend on another, save a motor on
-# the first.
+# An I frame is independent; each P frame has differences from the prediction by earlier frames. A
+# run is an I frame with the P frames up to the next one. Runs are independent, so the k-th frames
+# of all runs are computed at once. Fields are independent too, except that a motor may depend on
+# the first one.
 #
-# All arithmetic is that of the firmware: 32 bits that overflow silently, division towards zero. A
-# field without a sign has the same bits.
+# The arithmetic is that of the firmware: 32 bits that overflow silently, and division towards zero.
+# An unsigned field has the same bits.
 
 _LONGEST_JUMP = 10_000_000
-"""us between frames, as firmware's own tools have it: what jumps further was misread"""
+"""Longest step between frames [us], as in the firmware's own tools; a longer one is a read error.
+"""
 
 
 class Runs(NamedTuple):
@@ -181,9 +180,9 @@ class Runs(NamedTuple):
 
 
 def main_frames(frames: Frames, head: Header) -> MainFrames:
-    """The frames I and P with predictions added, in the order of the file."""
-    # The finder keeps each kind apart. A difference needs the frame that stood before it in the
-    # file, so the two kinds are merged by their positions.
+    """Return the I and P frames with predictions added, in the order of the file."""
+    # The finder separates the kinds. A difference refers to the previous frame in the file, so both
+    # kinds are merged by their positions.
     starts = np.concatenate([frames.starts["I"], frames.starts["P"]])
     order = np.argsort(starts, kind="stable")
     starts, is_first = starts[order], order < frames.starts["I"].size
@@ -208,15 +207,14 @@ def main_frames(frames: Frames, head: Header) -> MainFrames:
 
 
 def _runs(starts: np.ndarray, is_first: np.ndarray, damage: np.ndarray) -> Runs:
-    """The runs of frames; P frames behind damage are in none."""
+    """Return the runs of frames; P frames after damage are in none."""
     first = np.flatnonzero(is_first)
     end = np.append(first[1:], starts.size)
-    # The first frame behind each place of damage: the difference that was lost is missing in all
-    # that follow.
+    # First frame after each damaged place: the lost difference is missing in all that follow.
     behind = np.searchsorted(starts, damage)
     for place in np.unique(behind):
         run = int(np.searchsorted(first, place, side="right")) - 1
-        # An I frame right behind the damage needs nothing from before it.
+        # An I frame directly after the damage is independent of the frames before it.
         if run >= 0 and first[run] < place:
             end[run] = min(end[run], place)
     return Runs(first, end - first)
@@ -225,20 +223,22 @@ def _runs(starts: np.ndarray, is_first: np.ndarray, damage: np.ndarray) -> Runs:
 def _plausible(
     stamps: np.ndarray, runs: Runs, frames: Frames, starts: np.ndarray
 ) -> tuple[np.ndarray | None, np.ndarray]:
-    """The frames whose times go on from the last one's, None where all do, and these times
-    [us]."""
+    """Return the plausible frames, None if all are, and their times [us].
+
+    The times of plausible frames continue from the previous ones.
+    """
     resumed = set(np.searchsorted(starts, np.asarray(frames.resumes, np.int64)).tolist())
-    # In a run.
+    # Frames that are in a run.
     edges = np.zeros(stamps.size + 1, np.int8)
     edges[runs.begin] += 1
     np.subtract.at(edges, runs.begin + runs.length, 1)
     inside = np.cumsum(edges[:-1], dtype=np.int8) > 0
     rows = None if inside.all() else np.flatnonzero(inside)
     kept = stamps if rows is None else stamps[rows]
-    # Modulo 2^32, so that the turn of the counter is a small step like any other, and a step back
-    # is a huge one.
+    # Modulo 2^32, so that an overflow of the counter is a small step, and a step back is a huge
+    # one.
     steps = np.diff(kept)
-    # Nearly always nothing is wrong, and the runs need not be looked at one by one.
+    # Usually nothing is wrong, and no loop over the runs is needed.
     if kept.size and not resumed and np.all(steps < _LONGEST_JUMP):
         in_turn = np.empty(kept.size, np.int64)
         in_turn[0] = 0
@@ -251,12 +251,12 @@ def _plausible(
     rejected: int | None = None
     for begin, count in zip(runs.begin.tolist(), runs.length.tolist(), strict=True):
         stamp = int(stamps[begin])
-        # The firmware's counter starts again at zero after 71 minutes.
+        # The firmware's counter overflows after 71 minutes.
         base = stamp if now is None else now + ((stamp - now) & 0xFFFFFFFF)
-        # After a pause that the firmware announces the time may jump by any amount. Without one a
-        # jump means that the stamp was misread.
+        # After a pause that the firmware announces, the time may jump by any amount. Any other jump
+        # is a misread stamp.
         if not (now is None or begin in resumed or _goes_on(now, stamp)):
-            # Two I frames that agree with each other outvote what stood before them.
+            # Two consistent I frames outvote the frames before them.
             if rejected is None or not _goes_on(rejected, stamp):
                 rejected = stamp
                 continue
@@ -266,8 +266,8 @@ def _plausible(
                 times.pop()
         rejected = None
         steps = np.diff(stamps[begin : begin + count]).astype(np.int64)
-        # The False behind the end stops the search in a run without any jump. Of one with a jump
-        # the frames in front of it are kept.
+        # The appended False ends the search in a run without a jump. In a run with a jump, the
+        # frames before it are kept.
         whole = int(np.argmin(np.append(steps < _LONGEST_JUMP, False))) + 1
         keep.append(np.arange(begin, begin + whole))
         times.append(base + np.concatenate([[0], np.cumsum(steps[: whole - 1])]))
@@ -282,7 +282,7 @@ def _goes_on(before: int, stamp: int) -> bool:
 
 
 def constant(predictor: int, head: Header) -> int:
-    """Return the constant that a predictor expects for a whole flight; 0 for other predictors."""
+    """Return the constant that a predictor uses for a whole flight; 0 for other predictors."""
     match predictor:
         case frames_of.MIN_THROTTLE:
             return head.integer("minthrottle", 1150)
@@ -298,16 +298,17 @@ def constant(predictor: int, head: Header) -> int:
 def add_predictions(
     values: np.ndarray, i: int, runs: Runs, is_first: np.ndarray, motor: np.ndarray, head: Header
 ) -> None:
-    """Make the numbers of a field, as written, those that were logged.
+    """Add the predictions to the written numbers of a field, in place.
 
     Args:
-        values: (N,) int32 of all frames in the file's order; changed in place. Those of frames in
-            no run come out as anything.
-        is_first: which (N,) are I frames.
-        motor: what the first motor was told (N,) int32, where a predictor of this field is that.
+        values: (N,) int32 of all frames in the file's order; frames in no run get arbitrary values.
+        i: index of the field.
+        runs: runs of the frames.
+        is_first: mask (N,) of the I frames.
+        motor: command of the first motor (N,) int32, if a predictor of this field uses it.
+        head: header of the flight.
     """
-    # Nothing stands before an I frame, so of the predictors only constants and the first motor can
-    # be meant in it.
+    # No frame precedes an I frame, so only constants and the first motor can be its predictors.
     for letter, rows in (("I", is_first), ("P", ~is_first)):
         predictor = head.layouts[letter].predictors[i]
         if predictor == frames_of.MOTOR_0:
@@ -319,8 +320,8 @@ def add_predictions(
         case frames_of.PREVIOUS:
             _add_up(values, runs)
         case frames_of.STRAIGHT_LINE:
-            # A line through the two frames before: what is written is the change of the step. An
-            # I frame counts as both of those before the first P frame.
+            # A line through the two previous frames: the frame has the change of the step. An I
+            # frame counts as both frames before the first P frame.
             at_first = values[runs.begin]
             values[runs.begin] = 0
             _add_up(values, runs)
@@ -334,10 +335,10 @@ def add_predictions(
 
 
 def _add_up(values: np.ndarray, runs: Runs) -> None:
-    """Each number (N,) plus all before it in its run, in place."""
+    """Sum the numbers (N,) cumulatively within each run, in place."""
     before = values[runs.begin]
     np.cumsum(values, dtype=values.dtype, out=values)
-    # What the runs before have added up to, the frames behind them that are in no run included.
+    # Remove the sum of the previous runs, and of frames after them that are in no run.
     np.subtract(before, values[runs.begin], out=before)
     if runs.begin.size:
         until = np.diff(runs.begin, append=values.size)
@@ -347,7 +348,7 @@ def _add_up(values: np.ndarray, runs: Runs) -> None:
 def _step(
     values: np.ndarray, runs: Runs, expected: Callable[[np.ndarray, np.ndarray], np.ndarray]
 ) -> None:
-    """Add to each P frame what is `expected` of the one before it and the one before that."""
+    """Add to each P frame the value that is `expected` from the two previous frames."""
     longest_first = np.argsort(-runs.length, kind="stable")
     begin, length = runs.begin[longest_first], runs.length[longest_first]
     # An I frame counts as both frames before the first P frame.
@@ -363,23 +364,22 @@ def _step(
 
 
 def _mean(last: np.ndarray, earlier: np.ndarray, has_sign: bool) -> np.ndarray:
-    """The mean (R,) int32 of numbers (R,) int32 whose top bit is a sign or not."""
+    """Return the mean (R,) int32 of numbers (R,) int32, with or without a sign."""
     kind = np.int32 if has_sign else np.uint32
     both = last.view(kind).astype(np.int64) + earlier.view(kind)
-    # Division in C goes towards zero, NumPy's towards minus infinity: odd negative sums would be
-    # off by one, and each frame would hand the error on to the next.
+    # Division in C rounds towards zero, in NumPy towards minus infinity. Odd negative sums would be
+    # off by one, and the error would accumulate.
     return ((both + (both < 0)) >> 1).astype(np.int32)
 
 
 def _iterations_ahead(head: Header) -> np.ndarray:
-    """By the phase of an iteration between two I frames, how many there are to the next that the
-    firmware logs: int32."""
+    """Return the iterations to the next logged frame, int32, by phase between two I frames."""
     between, part, whole = head.intervals
-    # The condition is the one by which the firmware leaves iterations out. The count is not in the
-    # frame, so it has to be made up in the same way.
+    # The same condition as in the firmware. The count is not in the frame, so it must be
+    # reconstructed.
     phase = np.arange(between)
     logged = (phase + part - 1) % whole < part
     logged[0] = True  # an I frame
-    # From each phase, the steps to the next that is logged: at most to the next I frame.
+    # Steps from each phase to the next logged iteration, at most to the next I frame.
     ahead = np.flatnonzero(np.append(logged, True))
     return (ahead[np.searchsorted(ahead, phase, side="right")] - phase).astype(np.int32)

@@ -1,13 +1,12 @@
-"""Blackbox format: header, fields of a frame, and the places of frames.
+"""Blackbox format: the header, the fields of a frame, and the search for frames.
 
-The header is lines of `H name:value` that say how the frames are written. Every decoder takes the
-bytes of the log (B,) uint8 and the positions (M,) where M groups of fields begin, and returns their
-values, int32 (M, k), and the positions (M,) behind them. Numbers without a sign are the same bits:
-half the memory, which is what decoding waits for. A position beyond the end reads the last byte:
-the caller compares the positions behind with the size.
+The header has lines `H name:value` that describe the frames. A decoder takes the bytes of the log
+(B,) uint8 and the positions (M,) of M groups of fields. It returns the values, int32 (M, k), and
+the positions (M,) after the groups. Unsigned numbers are kept as int32 with the same bits, which
+halves the memory traffic. A position beyond the end reads the last byte, so the caller must compare
+the positions with the size.
 
-Source: the field encodings as documented in 'Blackbox logging internals' of Cleanflight, data
-version 2.
+Source: the field encodings in 'Blackbox logging internals' of Cleanflight, data version 2.
 """
 
 import re
@@ -24,26 +23,26 @@ SIGNED_VB, UNSIGNED_VB, NEG_14BIT, TAG8_8SVB = 0, 1, 3, 6
 TAG2_3S32, TAG8_4S16, NULL, TAG2_3SVARIABLE = 7, 8, 9, 10
 
 LARGEST_GROUP = {TAG8_8SVB: 8, TAG2_3S32: 3, TAG8_4S16: 4, TAG2_3SVARIABLE: 3}
-"""fields that share a tag, by encoding; those of the others stand alone"""
+"""Number of fields that share a tag, by encoding. Other encodings have one field a group."""
 
 
 def unsigned_vb(data: np.ndarray, at: np.ndarray) -> Decoded:
-    """Numbers of seven bits a byte, the lowest first; the top bit says that more follow."""
+    """Decode numbers of seven bits a byte, lowest first; the top bit means that one follows."""
     return _variable(data, at, _SEVEN_BITS)
 
 
 def signed_vb(data: np.ndarray, at: np.ndarray) -> Decoded:
-    """Zigzag: 0, -1, 1, -2, ... stand as 0, 1, 2, 3, ..."""
+    """Decode zigzag numbers: 0, -1, 1, -2, ... are stored as 0, 1, 2, 3, ..."""
     return _variable(data, at, _ZIGZAG)
 
 
 def _variable(data: np.ndarray, at: np.ndarray, of_one_byte: np.ndarray) -> Decoded:
-    """Numbers of a variable length; `of_one_byte` are those of a single byte, by the byte."""
+    """Decode numbers of variable length; `of_one_byte` holds the value of each single byte."""
     first = data.take(at, mode="clip")
-    # Most end with their first byte, since what is logged are small differences from a prediction:
-    # a table has these, and only the numbers that go on are looked at again.
+    # Most numbers are small differences from a prediction and end with their first byte. A table
+    # decodes these, so only longer numbers need a second pass.
     values = of_one_byte.take(first)
-    # The sum makes a new array: the caller still needs the positions at which the groups begin.
+    # The sum makes a new array, because the caller still needs the original positions.
     after = at + 1
     long = np.flatnonzero(first & 128)
     if long.size:
@@ -53,20 +52,20 @@ def _variable(data: np.ndarray, at: np.ndarray, of_one_byte: np.ndarray) -> Deco
 
 
 def _long_numbers(data: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers (M,) uint32 of two bytes and more, and the positions behind them."""
+    """Return numbers (M,) uint32 of two and more bytes, and the positions after them."""
     values, at = _bytes(data, at) & 127, at + 1
     more = np.arange(at.size)
     for shift in (7, 14, 21, 28):
         byte = _bytes(data, at[more])
-        # Five groups of seven bits are 35, of which a number of the firmware has the lowest 32: the
-        # others are shifted out.
+        # Five groups have 35 bits and a number of the firmware has 32. The shift drops the top
+        # bits.
         values[more] |= (byte & 127) << shift
         at[more] += 1
         more = more[(byte & 128) != 0]
         if not more.size:
             break
-    # 32 bits end with the fifth byte: a number that goes on is damage, which the firmware's own
-    # tools read as zero.
+    # 32 bits end with the fifth byte, so a longer number is damage. The firmware's own tools read
+    # it as zero.
     values[more] = 0
     return values, at
 
@@ -80,14 +79,14 @@ _ZIGZAG = _unfolded(np.arange(256, dtype=np.uint32) & 127)
 
 
 def negative_14_bit(data: np.ndarray, at: np.ndarray) -> Decoded:
-    """The negative of a number of 14 bits, as a falling battery voltage is kept."""
+    """Decode 14-bit numbers that are stored negated, such as a falling battery voltage."""
     values, at = unsigned_vb(data, at)
     return -_signed(values.view(np.uint32), 14), at
 
 
 def tag8_8svb(data: np.ndarray, at: np.ndarray, count: int) -> Decoded:
-    """A byte says which of up to eight fields are not zero; these follow. One alone has no tag."""
-    # The tag would take more room than it saves, so the firmware leaves it out.
+    """Decode up to eight fields; a tag byte marks the nonzero ones. A single field has no tag."""
+    # The firmware omits the tag of a single field, where it would cost more than it saves.
     if count == 1:
         return signed_vb(data, at)
     tag, at = _bytes(data, at), at + 1
@@ -101,40 +100,40 @@ def tag8_8svb(data: np.ndarray, at: np.ndarray, count: int) -> Decoded:
 
 
 def tag8_4s16(data: np.ndarray, at: np.ndarray) -> Decoded:
-    """Four fields of 0, 4, 8 or 16 bits in a row of nibbles, as two bits each of a byte say."""
+    """Decode four fields of 0, 4, 8 or 16 bits; a leading byte has a 2-bit size code for each."""
     tag, start = _bytes(data, at), at + 1
     values = np.zeros((at.size, 4), np.int32)
     nibble = np.zeros(at.size, np.int64)
     for k in range(4):
         size = (tag >> (2 * k)) & 3
-        # Code 0 is missing: such a field takes no bits, and its value stays zero.
+        # Code 0 is not in the list: the field takes no bits and its value stays zero.
         for code, bits in ((1, 4), (2, 8), (3, 16)):
             i = np.flatnonzero(size == code)
             if not i.size:
                 continue
-            # A field may begin in the middle of a byte: three bytes always hold it.
+            # A field may begin in the middle of a byte. Three bytes always contain it.
             first = start[i] + (nibble[i] >> 1)
             three = _joined(data, first, 3)
             shift = (24 - 4 * (nibble[i] & 1) - bits).astype(np.uint32)
             values[i, k] = _signed(three >> shift, bits)
             nibble[i] += bits // 4
-    # The next field begins with a whole byte: half a byte that is left over stays empty.
+    # The next group begins at a whole byte, so a remaining half byte is skipped.
     return values, start + ((nibble + 1) >> 1)
 
 
-# Bits and shifts of the three fields, by the two bits on top of the first byte; a word is as many
-# bytes long as the code says, plus one.
+# Bits and shifts of the three fields, by the top two bits of the first byte. The word has one byte
+# more than that code.
 _TAG2_3S32 = (((2, 4), (2, 2), (2, 0)), ((4, 8), (4, 4), (4, 0)), ((6, 16), (6, 8), (6, 0)))
 _TAG2_3SVARIABLE = (((2, 4), (2, 2), (2, 0)), ((5, 9), (5, 4), (4, 0)), ((8, 14), (7, 7), (7, 0)))
 
 
 def tag2_3s32(data: np.ndarray, at: np.ndarray) -> Decoded:
-    """Three fields of 2, 4 or 6 bits each, or of whole bytes, as two bits of the first say."""
+    """Decode three fields of 2, 4 or 6 bits or whole bytes, by the top two bits of the first."""
     return _three(data, at, _TAG2_3S32)
 
 
 def tag2_3svariable(data: np.ndarray, at: np.ndarray) -> Decoded:
-    """Three fields of 2, 2, 2 or 5, 5, 4 or 8, 7, 7 bits, or of whole bytes."""
+    """Decode three fields of 2, 2, 2 or 5, 5, 4 or 8, 7, 7 bits, or of whole bytes."""
     return _three(data, at, _TAG2_3SVARIABLE)
 
 
@@ -144,7 +143,7 @@ def _three(
     lead = _bytes(data, at)
     values = np.zeros((at.size, 3), np.int32)
     kind = lead >> 6
-    # Of kind 3 only the first byte is sure; the lengths that stand in it are added field by field.
+    # For kind 3 only the first byte is certain; the field lengths in it are added one by one.
     after = at + 1 + np.where(kind < 3, kind, 0).astype(np.int64)
     for code, layout in enumerate(layouts):
         i = np.flatnonzero(kind == code)
@@ -152,8 +151,7 @@ def _three(
             word = _joined(data, at[i], code + 1)
             for k, (bits, shift) in enumerate(layout):
                 values[i, k] = _signed(word >> shift, bits)
-    # The positions are moved on in place: where a field begins depends on how long those before it
-    # are.
+    # The positions are advanced in place, because each field begins where the previous one ends.
     _whole_bytes(data, lead, values, after, np.flatnonzero(kind == 3))
     return values, after
 
@@ -161,7 +159,7 @@ def _three(
 def _whole_bytes(
     data: np.ndarray, lead: np.ndarray, values: np.ndarray, after: np.ndarray, i: np.ndarray
 ) -> None:
-    """Fields of one to four bytes each, the lowest first, into `values` and `after` at rows `i`."""
+    """Decode fields of one to four bytes, lowest first, into rows `i` of `values` and `after`."""
     for k in range(3):
         size = (lead[i] >> (2 * k)) & 3
         for code in range(4):
@@ -175,13 +173,13 @@ def _whole_bytes(
 
 
 def _bytes(data: np.ndarray, at: np.ndarray) -> np.ndarray:
-    # Clipped, because most positions are guesses that may lie beyond the end of the file. Four
-    # bytes wide, because shifted bytes of uint8 would overflow.
+    # Positions are clipped, because most are guesses that may lie beyond the end of the file. Four
+    # bytes wide, because shifted uint8 values would overflow.
     return data.take(at, mode="clip").astype(np.uint32)
 
 
 def _joined(data: np.ndarray, at: np.ndarray, count: int) -> np.ndarray:
-    """`count` bytes as one number, the highest first."""
+    """Return `count` bytes as one number, the highest first."""
     number = _bytes(data, at)
     for n in range(1, count):
         number = (number << 8) | _bytes(data, at + n)
@@ -189,15 +187,15 @@ def _joined(data: np.ndarray, at: np.ndarray, count: int) -> np.ndarray:
 
 
 def _signed(number: np.ndarray, bits: int) -> np.ndarray:
-    """The lowest `bits` bits as two's complement."""
-    # Half the range is added before the mask and taken off behind it. That needs no branch, so that
-    # it does for whole arrays what a comparison does for one number.
+    """Return the lowest `bits` bits as two's complement."""
+    # Adding half the range before the mask and subtracting it afterwards needs no branch, so it
+    # works on whole arrays.
     half = 1 << (bits - 1)
     return (((number + half) & ((1 << bits) - 1)) - half).view(np.int32)
 
 
 def _nothing(data: np.ndarray, at: np.ndarray) -> Decoded:
-    # Such a field takes no byte of the frame: its prediction is its value.
+    # The field takes no byte of the frame: its value is the prediction.
     return np.zeros((at.size, 1), np.int32), at
 
 
@@ -215,12 +213,12 @@ KNOWN = frozenset((*_ALONE, TAG8_8SVB))
 
 
 def decode(data: np.ndarray, at: np.ndarray, encodings: tuple[int, ...]) -> Decoded:
-    """All fields (M, F) of frames of one kind whose fields begin at `at` (M,)."""
+    """Decode all fields (M, F) of frames of one kind whose fields begin at `at` (M,)."""
     values = np.empty((at.size, len(encodings)), np.int32)
     field = 0
     while field < len(encodings):
         encoding = encodings[field]
-        # Neighbours of one encoding share a tag, up to as many as it has room for.
+        # Neighbouring fields of one encoding share a tag, up to the size of its group.
         end = field + 1
         while (
             end < len(encodings)
@@ -228,8 +226,8 @@ def decode(data: np.ndarray, at: np.ndarray, encodings: tuple[int, ...]) -> Deco
             and end - field < LARGEST_GROUP.get(encoding, 1)
         ):
             end += 1
-        # The only group whose layout depends on how many fields are in it. The others always hold
-        # as many as there is room for, and what is too many is left out.
+        # Only this group's layout depends on the number of fields in it. The others always hold a
+        # full group, and surplus fields are dropped.
         if encoding == TAG8_8SVB:
             numbers, at = tag8_8svb(data, at, end - field)
         else:
@@ -240,21 +238,21 @@ def decode(data: np.ndarray, at: np.ndarray, encodings: tuple[int, ...]) -> Deco
 
 
 MARK = b"H Product:Blackbox flight data recorder by Nicholas Sherlock"
-"""with which every flight of a file begins"""
+"""First bytes of every flight in a file."""
 
 PREVIOUS, STRAIGHT_LINE, AVERAGE, MIN_THROTTLE, MOTOR_0, INCREMENT = 1, 2, 3, 4, 5, 6
 FIFTEEN_HUNDRED, VBAT_REFERENCE, MIN_MOTOR = 8, 9, 11
 _LAST_PREDICTOR = MIN_MOTOR
 _MOST_FIELDS = 256
-"""of a frame: ten times what firmware writes in its largest"""
+"""Largest number of fields in a frame, ten times that of the largest frame firmware writes."""
 _LONGEST_HEADER = 1 << 20
 _MOST_ITERATIONS = 1 << 16
-"""between two I frames: firmware writes one in 32 ms"""
+"""Most iterations between two I frames; firmware writes one in 32 ms."""
 
 
 @dataclass(frozen=True)
 class FrameLayout:
-    """The fields of one kind of frame; each tuple is (F,), in the order of the bytes."""
+    """Fields of one kind of frame; each tuple is (F,), in the order of the bytes."""
 
     names: tuple[str, ...]
     signed: tuple[bool, ...]
@@ -264,9 +262,10 @@ class FrameLayout:
 
 @dataclass(frozen=True)
 class Header:
-    """Header: `settings` by name, `layouts` by the frames' letter.
+    """Header of a flight.
 
-    `start` is where the frames begin [bytes from the flight's first].
+    `settings` are by name, `layouts` by the frames' letter. `start` is the position of the first
+    frame [bytes from the beginning of the flight].
     """
 
     settings: dict[str, str]
@@ -274,46 +273,45 @@ class Header:
     start: int
 
     def integer(self, name: str, default: int) -> int:
-        """A setting of one number, or the first of several, as firmware of any age writes it."""
+        """Return a setting as an integer: its only number or the first of several."""
         match = re.match(r"\s*(-?\d{1,10})\b", self.settings.get(name, ""))
         return int(match[1]) if match else default
 
     @property
     def intervals(self) -> tuple[int, int, int]:
-        """Iterations between I frames, and of how many iterations how many are logged."""
+        """Iterations between I frames, and the logged share as two numbers: part, whole."""
         between = self.integer("I interval", 1)
         match = re.fullmatch(r"(\d{1,5})(?:/(\d{1,5}))?", self.settings.get("P interval", "1/1"))
-        # Old firmware writes a share, 1/2; new firmware a divisor alone, 2.
+        # Old firmware writes a fraction, 1/2; new firmware writes only the divisor, 2.
         part, whole = (1, 1) if not match else (int(match[1]), int(match[2] or 0))
         if match and not match[2]:
             part, whole = 1, part
-        # Bounded, because the iterations between I frames are laid out as an array by whoever
-        # predicts them, and the header of a damaged file may claim any number.
+        # Bounded, because the prediction allocates an array of the iterations between I frames, and
+        # a damaged header may contain any number.
         return min(max(between, 1), _MOST_ITERATIONS), part, max(whole, 1)
 
 
 def read_header(path: str, data: bytes) -> Header:
-    """The header at the beginning of `data`, which is one flight of the file `path`."""
+    """Read the header at the beginning of `data`, which is one flight of the file `path`."""
     settings, at = {}, 0
     while data.startswith(b"H ", at):
         end = data.find(b"\n", at, at + _LONGEST_HEADER)
         if end < 0 or end > _LONGEST_HEADER:
             raise wrong(path, "the header is cut off, expected frames behind it")
-        # In Latin-1 every byte is a letter: the name of a craft in another encoding must not refuse
-        # the flight.
+        # Latin-1 decodes any byte, so a craft name in another encoding does not refuse the flight.
         name, _, value = data[at + 2 : end].decode("latin-1").partition(":")
         settings[name.strip()] = value.strip()
         at = end + 1
     version = settings.get("Data version", "")
-    # Other versions pack the same encodings in another way, and would be read as wrong numbers
-    # without any error.
+    # Other versions pack the same encodings differently and would give wrong numbers without an
+    # error.
     if version != "2":
         raise wrong(path, f"data version {shown(version)}, expected 2", "blackbox header")
     layouts = {
         letter: _layout(path, settings, letter) for letter in "ISGH" if _has(settings, letter)
     }
-    # Neither serves alone: P frames are differences from I frames, and of these there is one in
-    # 32 ms.
+    # Both kinds are needed: P frames are differences from I frames, and I frames come only every 32
+    # ms.
     if "I" not in layouts or "Field P predictor" not in settings:
         raise wrong(path, "no fields of I and P frames, expected both", "blackbox header")
     layouts["P"] = _layout(path, settings, "P", layouts["I"])
@@ -329,7 +327,7 @@ def _has(settings: dict[str, str], letter: str) -> bool:
 def _layout(
     path: str, settings: dict[str, str], letter: str, named: FrameLayout | None = None
 ) -> FrameLayout:
-    """The fields of one kind of frame; P frames have the names and signs of I frames, `named`."""
+    """Return the fields of one kind of frame; P frames take names and signs from `named`."""
     if named is None:
         names = tuple(settings[f"Field {letter} name"].split(","))
         if len(names) > _MOST_FIELDS or len(set(names)) < len(names) or "" in names:
@@ -342,8 +340,8 @@ def _layout(
         names, signed = named.names, named.signed
     predictors = _listed_numbers(path, settings, f"Field {letter} predictor", len(names))
     encodings = _listed_numbers(path, settings, f"Field {letter} encoding", len(names))
-    # One field of unknown length makes all that stands behind it unreadable, so the flight is
-    # refused before any frame is decoded.
+    # A field of unknown length makes everything after it unreadable, so the flight is refused
+    # before any frame is decoded.
     for kind, numbers, known in (
         ("predictor", predictors, range(_LAST_PREDICTOR + 1)),
         ("encoding", encodings, KNOWN),
@@ -363,33 +361,34 @@ def _listed_numbers(path: str, settings: dict[str, str], name: str, count: int) 
     return tuple(int(number) for number in text.split(","))
 
 
-# Frames have no length: each ends where the next begins, and which that is shows only once its
-# fields are decoded. To do that frame by frame is a hundred times too slow in Python. So every
-# byte that might begin a frame is taken for one, all are decoded at once with NumPy, and a walk
-# from end to beginning keeps those that are frames. What is no frame where one should be is
-# damage; the walk goes on at the next byte from which a frame leads to the beginning of another.
+# Frames have no length: each ends where the next begins, and that is known only after its fields
+# are decoded. Decoding frame by frame is a hundred times too slow in Python. Therefore every byte
+# that might begin a frame is treated as one, and NumPy decodes all of them at once. A walk from
+# each frame's end to the next one's beginning keeps the real frames. Where none follows, the log is
+# damaged, and the walk goes on at the next candidate.
 
 LONGEST_FRAME = 256
-"""bytes, as firmware's own tools have it: what goes on for longer is damage"""
+"""Longest frame [bytes], as in the firmware's own tools; a longer one is damage."""
 _CELLS_AT_ONCE = 1 << 25
-"""numbers of 32 bits that a piece may hold, were each of its bytes a frame"""
+"""Largest number of 32-bit cells in a piece if each of its bytes were a frame."""
 _LONGEST_PIECE = 1 << 20
-"""bytes: what is shorter costs more in calls of NumPy than in decoding"""
+"""Longest piece [bytes]; in a shorter one, calls of NumPy cost more than decoding."""
 _EVENT = ord("E")
 _END_OF_LOG = b"End of log\0"
 
-# Numbers in an event, by its type: v is one of variable length. Types 50 to 52 are Rotorflight's.
+# Fields of an event by its type; each v is one number of variable length. Types 50 to 52 are
+# Rotorflight's.
 _EVENTS = {0: "v", 14: "vv", 15: "v", 30: "vv", 50: "v", 51: "v", 52: "v"}
 _ADJUSTMENT, _RESUME, _CUSTOM, _END = 13, 14, (100, 101), 255
 
 
 @dataclass
 class Frames:
-    """The frames of one flight, by the letter of their kind in the order of the file.
+    """Frames of one flight, by the letter of their kind, in the order of the file.
 
-    `rows` (M, F) int32 are the numbers as written, before any prediction; `starts` (M,) where each
-    frame begins [bytes]. `damage` (D,) are the places where something was no frame, `resumes` where
-    the firmware says that it went on after a pause, `end` says that it closed the log.
+    `rows` (M, F) int32 are the numbers as written, before prediction; `starts` (M,) are the frames'
+    positions [bytes]. `damage` (D,) are the positions without a valid frame, `resumes` those where
+    the firmware continued after a pause. `end` is True if the firmware closed the log.
     """
 
     rows: dict[str, np.ndarray]
@@ -400,7 +399,7 @@ class Frames:
 
 
 def find_frames(data: bytes, start: int, layouts: dict[str, FrameLayout]) -> Frames:
-    """All frames of a flight."""
+    """Find all frames of a flight."""
     return _Walk(data, start, layouts).run()
 
 
@@ -417,10 +416,10 @@ class _Candidates:
 
 
 class _Chain:
-    """Candidates of a piece, each with the one that begins where it ends.
+    """Candidates of a piece, each linked to the one that begins where it ends.
 
-    Most lead to their neighbour. So the walk goes from one place where that is not so to the next,
-    and not from frame to frame, which took Python half of the time.
+    Most link to their neighbour. The walk therefore jumps from one break to the next; a step per
+    frame took half of the run time.
     """
 
     def __init__(self, starts: np.ndarray, ends: np.ndarray) -> None:
@@ -437,8 +436,7 @@ class _Chain:
         self.ranges: list[tuple[int, int]] = []
 
     def follow(self, at: int) -> int:
-        """The end of the last of the frames that follow on one another from `at`; 0 where none
-        begins there."""
+        """Return the end of the last frame in the chain from `at`; 0 if none begins there."""
         i = int(np.searchsorted(self.starts, at))
         if i == self.starts.size or self.starts[i] != at:
             return 0
@@ -450,12 +448,12 @@ class _Chain:
             i = int(self.following[last])
 
     def next_behind(self, at: int, otherwise: int) -> int:
-        """Return the place of the next candidate behind `at`."""
+        """Return the place of the next candidate after `at`."""
         i = int(np.searchsorted(self.starts, at, side="right"))
         return int(self.starts[i]) if i < self.starts.size else otherwise
 
     def visited(self) -> np.ndarray:
-        """Places of the candidates that were followed."""
+        """Return the places of the candidates that were followed."""
         edges = np.zeros(self.starts.size + 1, np.int64)
         for first, end in self.ranges:
             edges[first] += 1
@@ -470,8 +468,8 @@ class _Walk:
         self.bytes = np.frombuffer(data, np.uint8)
         self.is_letter = np.zeros(256, bool)
         self.is_letter[[*map(ord, layouts), _EVENT]] = True
-        # A piece is as long as the numbers of all its candidates fit in memory: any byte may be
-        # one, each with as many numbers as the widest frame has fields.
+        # A piece is so long that the numbers of all candidates fit in memory. Any byte may be a
+        # candidate, with as many numbers as the widest frame.
         widest = max(len(layout.names) for layout in layouts.values())
         self.piece = max(1024, min(_LONGEST_PIECE, _CELLS_AT_ONCE // widest))
         self.frames = Frames({}, {})
@@ -490,28 +488,27 @@ class _Walk:
         return self.frames
 
     def _walk_piece(self, first: int, last: int) -> None:
-        """Walk from `self.at` to the first frame that begins at `last` or behind it."""
+        """Walk from `self.at` to the first frame that begins at `last` or after it."""
         candidates = {letter: self._candidates(letter, first, last) for letter in self.layouts}
-        # One chain serves all kinds of frames, since a byte is the letter of one kind at most.
+        # One chain serves all kinds of frames, because a byte is the letter of at most one kind.
         chain = _Chain(
             np.concatenate([each.starts for each in candidates.values()]),
             np.concatenate([each.ends for each in candidates.values()]),
         )
         while self.at < last and not self.frames.end:
             end = chain.follow(self.at)
-            # Events are decoded one by one on the way: they are rare, and each type has another
-            # form.
+            # Events are decoded one by one: they are rare, and each type has its own form.
             if not end and self.data[self.at] == _EVENT:
                 end = self._event_end(self.at)
             if end:
                 self.at, self.in_damage = end, False
                 continue
             self._note_damage()
-            # On at the next candidate and not at the next letter: a letter that stands in numbers
-            # by chance seldom leads to another one.
+            # Continue at the next candidate, not the next letter: a letter within numbers seldom
+            # leads to another one.
             self.at = chain.next_behind(self.at, last)
-        # A letter within another frame's numbers is a candidate too. Only those that the walk came
-        # upon from the end of a frame are frames.
+        # A letter within another frame's numbers is a candidate too. Only candidates reached from
+        # the end of a frame are frames.
         is_frame = np.zeros(last - first, bool)
         is_frame[chain.visited() - first] = True
         for letter, each in candidates.items():
@@ -520,17 +517,17 @@ class _Walk:
     def _candidates(self, letter: str, first: int, last: int) -> _Candidates:
         starts = first + np.flatnonzero(self.bytes[first:last] == ord(letter))
         values, ends = decode(self.bytes, starts + 1, self.layouts[letter].encodings)
-        # A frame leads to another, or to the end of the file.
+        # A frame leads to another one or to the end of the file.
         whole = (ends <= self.size) & (ends - starts <= LONGEST_FRAME)
-        # A single byte is a letter by chance often enough. That another letter stands just where
-        # the frame would end is what makes it likely to be one.
+        # A byte is often a letter by chance. A second letter at the frame's end makes a real frame
+        # likely.
         follows = self.is_letter[self.bytes.take(ends, mode="clip")]
         found = _Candidates(starts, ends, values)
         return found.at(np.flatnonzero(whole & (follows | (ends == self.size))))
 
     def _note_damage(self) -> None:
         rest = self.data[self.at : self.at + LONGEST_FRAME]
-        # Erased memory behind the last frame is no loss.
+        # Erased memory after the last frame is no loss.
         blank = not rest.strip(b"\xff") or not rest.strip(b"\0")
         if not self.in_damage and not blank:
             self.frames.damage.append(self.at)
@@ -539,8 +536,8 @@ class _Walk:
     def _event_end(self, at: int) -> int:
         """Return the end of the event at `at`; 0 if there is none."""
         kind = self.data[at + 1] if at + 1 < len(self.data) else -1
-        # The type alone is one byte, which damage makes by chance. The words behind it do not come
-        # about so, and the end of a log is believed only with them.
+        # Damage produces the one-byte type by chance, but not the words after it. The end of a log
+        # needs both.
         if kind == _END:
             self.frames.end = self.data.startswith(_END_OF_LOG, at + 2)
             return at + 2 + len(_END_OF_LOG) if self.frames.end else 0
@@ -555,7 +552,7 @@ class _Walk:
 
     def _numbers_end(self, at: int, kind: int) -> int:
         if kind == _ADJUSTMENT and at < len(self.data):
-            # A float of four bytes where the top bit of the function says so, else a number.
+            # A float of four bytes if the function's top bit is set, else a number.
             return at + 5 if self.data[at] >= 128 else self._skip_numbers(at + 1, 1)
         if kind in _CUSTOM and at < len(self.data):
             return at + 1 + self.data[at]
@@ -565,8 +562,8 @@ class _Walk:
 
     def _skip_numbers(self, at: int, count: int) -> int:
         for _ in range(count):
-            # At most five bytes, as a number of 32 bits has, or damage could claim the rest of the
-            # file.
+            # A 32-bit number has at most five bytes; without this limit, damage could claim the
+            # rest of the file.
             length = next((n for n, b in enumerate(self.data[at : at + 5], 1) if b < 128), 5)
             at += length
         return at

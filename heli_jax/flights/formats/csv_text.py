@@ -1,7 +1,7 @@
-"""Logs in delimited text, of which pyarrow reads the numbers.
+"""Logs in delimited text; pyarrow reads the numbers.
 
-A clean file takes the fast way, all columns at once as numbers. Where a cell is no plain number the
-columns are read as text; where a row has another number of cells, its line is told.
+In a clean file all columns are read at once as numbers. If a cell is no plain number, the columns
+are read as text. If a row has a wrong number of cells, the error names its line.
 """
 
 import codecs
@@ -37,62 +37,63 @@ from heli_jax.flights.log import (
 from heli_jax.flights.progress import Digest
 from heli_jax.regular_file import read_regular, size_words
 
-# Imported again within the functions that need it: it takes a quarter of a second, which
-# flights made in Python need not wait for.
+# Imported inside the functions that need it: it takes 0.25 s, which flights made in Python would
+# not use.
 if TYPE_CHECKING:
     import pyarrow as pa
 
 _LARGEST = 8 * 10**9
-"""bytes: the file is held in memory, and the columns that are asked for"""
+"""Largest file [bytes]; the file and the requested columns are held in memory."""
 _LARGEST_TEXT = 10**9
-"""bytes of cells that are looked at as text"""
+"""Largest size of cells that are parsed as text [bytes]."""
 _LOOKED_AT, _MOST_LINES = 1 << 20, 20_000
-"""bytes and lines in which a table is sought"""
+"""Bytes and lines in which the table is searched."""
 _FEWEST = 3
-"""rows that make a table"""
+"""Fewest rows of a table."""
 _FOREIGN = 0.1
-"""part of the bytes that are none of ASCII, from which on they are no text of a log"""
+"""Largest share of non-ASCII bytes in the text of a log."""
 _DELIMITERS = ("\t", "|", ";", ",")
-"""the surest first: a tab stands in no number and in hardly any name, a comma may be decimal"""
+"""Delimiters, the most reliable first: a tab is in no number and hardly any name, a comma may be
+decimal."""
 _MARK = re.compile(r"\s*(?:#+|//+|%+(?=[\s%]|[^,;\t]*$))\s*")
-"""of a comment. A name may begin with a percent sign"""
+"""Mark of a comment. A name may begin with a percent sign."""
 _SEPARATOR = re.compile(r'"?sep=([,;|:\t ])"?\s*', re.IGNORECASE)
 MISSING = (
     *("NA", "N/A", "n/a", "null", "NULL", "None", "-", "#N/A", "--", "---", "?", "missing"),
     *("1.#QNAN", "-1.#QNAN", "1.#IND", "-1.#IND", "NaT", "<NA>"),
 )
-"""cells that say that there is no value, beside NaN, which is a number"""
+"""Cells without a value. NaN is not among them, because it is a number."""
 _SIGN = "[+\u2212-]?"
 _NUMBER = re.compile(
     rf"{_SIGN}(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eEdD]{_SIGN}[0-9]+)?|{_SIGN}(?:nan|inf|infinity)",
     re.IGNORECASE,
 )
-"""float() would also take 1_000, and digits of any script"""
+"""Text of a number. float() would also accept 1_000 and digits of any script."""
 _WITH_COMMA = re.compile(r"[+-]?[0-9]*,[0-9]+(?:[eEdD][+-]?[0-9]+)?")
 
 
 class _Head(NamedTuple):
-    """The names of a table, and where its rows begin."""
+    """Names of a table and the place where its rows begin."""
 
     names: tuple[str, ...]
     number: int
-    """of the line of names, from 1"""
+    """Line of the names, from 1."""
     delimiter: str
     begin: int
-    """of the rows [bytes]"""
+    """Beginning of the rows [bytes]."""
     first_line: int
-    """of the rows, from 1"""
+    """First line of the rows, from 1."""
     units: tuple[str, ...] = ()
     is_fitting: bool = True
-    """False where no rows of as many cells were found right below"""
+    """False if no rows with the same number of cells follow directly."""
 
 
 class _Line(NamedTuple):
     number: int
     text: str
-    """without the mark of a comment"""
+    """Text without the mark of a comment."""
     after: int
-    """where the next begins [bytes]"""
+    """Beginning of the next line [bytes]."""
     is_comment: bool
 
 
@@ -127,22 +128,23 @@ def open_csv(path: Path) -> "CsvTable":
 
 
 def is_gzipped(path: Path) -> bool:
-    """True if a file's name says so."""
+    """True if the file's name ends in `.gz`."""
     return path.suffix.lower() == ".gz"
 
 
 def inner_ending(path: Path) -> str:
-    """Return the ending of the unpacked file: `.csv` of `log.csv.gz`, of `log.csv` too."""
+    """Return the ending of the unpacked file: `.csv` for `log.csv.gz` and for `log.csv`."""
     return Path(path.stem if is_gzipped(path) else path.name).suffix.lower()
 
 
 def unpacked(path: str, data: bytes) -> bytes:
-    """Unpack the bytes that were packed by gzip (RFC 1952)."""
+    """Unpack bytes packed by gzip (RFC 1952)."""
     text, budget = bytearray(), Budget(path, len(data))
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
             while piece := file.read(1 << 22):
-                # And its numbers: of two letters, a digit and what is behind it, eight bytes.
+                # The numbers take memory too: eight bytes for two characters, a digit and its
+                # delimiter.
                 ends = sum(map(piece.count, (b"\n", b",", b";", b"\t")))
                 budget.take(len(piece) + 8 * ends)
                 text += piece
@@ -154,8 +156,8 @@ def unpacked(path: str, data: bytes) -> bytes:
 def as_text(path: str, data: bytes) -> bytes:
     """Return a file's text in UTF-8 with `\\n` between its lines.
 
-    Spreadsheets save "Unicode text" as UTF-16 with a mark, and older programs write one byte a
-    letter, of which the degree sign in a header is the commonest.
+    Spreadsheets save "Unicode text" as UTF-16 with a mark. Older programs write one byte a letter;
+    the degree sign in a header is the most common case.
     """
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         try:
@@ -163,7 +165,7 @@ def as_text(path: str, data: bytes) -> bytes:
         except UnicodeDecodeError as e:
             raise wrong(path, "begins as UTF-16 text but is damaged, expected whole text") from e
     data = data.removeprefix(codecs.BOM_UTF8)
-    if (null := data.find(b"\0")) >= 0:  # valid in UTF-8, and in no log
+    if (null := data.find(b"\0")) >= 0:  # valid in UTF-8, but in no log
         at = data.count(b"\n", 0, null) + 1
         raise wrong(path, "got binary data, expected text", f"line {at}")
     try:
@@ -179,14 +181,15 @@ def as_text(path: str, data: bytes) -> bytes:
     return data.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in data else data
 
 
-# Where the table is: a line of names right above rows of as many cells, most of them numbers.
+# The table is located by a line of names directly above rows with as many cells, most of them
+# numbers.
 
 
 def _find_head(path: str, data: bytes, delimiters: Sequence[str]) -> _Head:
-    """Find the header of the table, below what stands above it: titles, settings, comments."""
+    """Find the header of the table, below titles, settings and comments."""
     lines = list(_lines(data))
     if lines and (separator := _SEPARATOR.fullmatch(lines[0].text)):
-        # Excel's own word for what stands between cells.
+        # Excel's own statement of the delimiter.
         delimiters, lines = (separator[1],), lines[1:]
     plain = [line for line in lines if not line.is_comment]
     if not plain:
@@ -201,7 +204,7 @@ def _find_head(path: str, data: bytes, delimiters: Sequence[str]) -> _Head:
 
 
 def _lines(data: bytes) -> Iterator[_Line]:
-    """The lines at the beginning of a text that are not blank."""
+    """Yield the lines at the beginning of a text that are not blank."""
     at = 0
     for number in range(1, _MOST_LINES):
         if at >= min(len(data), _LOOKED_AT):
@@ -216,7 +219,7 @@ def _lines(data: bytes) -> Iterator[_Line]:
 
 
 def _head(lines: Sequence[_Line], delimiter: str) -> _Head | None:
-    """The names above the first run of rows with as many cells."""
+    """Return the names above the first run of rows with the same number of cells."""
     if not any(delimiter in line.text for line in lines):
         return None
     cells = [_cells_of(line.text, delimiter) for line in lines]
@@ -225,21 +228,21 @@ def _head(lines: Sequence[_Line], delimiter: str) -> _Head | None:
     def width(i: int) -> int:
         return 0 if lines[i].is_comment or not _is_row(cells[i]) else len(cells[i])
 
-    # A file may end before there are so many.
+    # A short file may end before `_FEWEST` rows.
     for row in range(1, len(lines)):
         run = range(row, min(row + _FEWEST, len(lines)))
         if width(row) < 2 or any(width(i) != width(row) for i in run):
             continue
-        # A rule, or a word on what follows, between names and rows.
+        # A ruler or a remark may be between the names and the rows.
         at = row - 1 - (row > 1 and len(cells[row - 1]) == 1)
         stated: tuple[str, ...] = ()
-        # To know all units takes a quarter of a second, so that they are looked for last.
+        # The list of all units takes 0.25 s to load, so units are searched last.
         if at > 0 and _names_fit(cells[at - 1], cells[row]):
             stated = row_of_units(cells[at])
             at -= bool(stated)
         if not _names_fit(cells[at], cells[row]):
             continue
-        # A delimiter at the end of each row, or a column for comments that rows need not have.
+        # Rows may end with a delimiter, or lack the cell of a column for comments.
         names, units_of = (
             (*(cell.strip() for cell in one), *[""] * width(row))[: width(row)]
             for one in (cells[at], stated)
@@ -262,7 +265,7 @@ def _cells_of(line: str, delimiter: str) -> list[str]:
 
 
 def _is_value(cell: str) -> bool:
-    """True for a cell of a sample: a number, a time, or a mark for nothing."""
+    """True if a cell belongs to a sample: a number, a time, or a mark for a missing value."""
     number = _NUMBER.fullmatch(cell) or _WITH_COMMA.fullmatch(cell)
     return number is not None or cell in MISSING or is_date(cell)
 
@@ -275,7 +278,7 @@ def _is_row(cells: Sequence[str]) -> bool:
 
 
 def _names_fit(names: Sequence[str], row: Sequence[str]) -> bool:
-    """True where a line names the cells of a row."""
+    """True if a line names the cells of a row."""
     filled = [name.strip() for name in names if name.strip()]
     surplus = len(names) - len(row)
     fits = (
@@ -283,43 +286,46 @@ def _names_fit(names: Sequence[str], row: Sequence[str]) -> bool:
         or (surplus == 1 and names[-1].strip().lower() in ("", "comment", "comments"))
         or (surplus == -1 and not row[-1].strip())
     )
-    # A sample of which all but the time is text is no line of names.
+    # A sample in which all but the time is text is no line of names.
     if not fits or not filled or _is_value(filled[0]):
         return False
     return 2 * sum(map(_is_value, filled)) < len(filled)
 
 
 def row_of_units(cells: Sequence[str]) -> tuple[str, ...]:
-    """The units in a row below the names, brackets taken off; empty where it is no such row."""
+    """Return the units in a row below the names, without brackets; empty if it is no such row."""
     bare = [re.sub(r"^[\[(](.*)[\])]$", r"\1", cell.strip().strip('"')).strip() for cell in cells]
-    # A row of marks for nothing says nothing of units.
+    # A row of missing values gives no units.
     words = [word for word in bare if word not in ("", "-", "1", "--", *MISSING)]
     if not words or any(map(_NUMBER.fullmatch, words)):
         return ()
-    # As it is known, in small letters where it is by these alone, as of DEG/SEC. Of one letter
-    # there are too many: P is pressure, rate and pitch.
+    # Lower case is tried second, as for DEG/SEC. Single letters are excluded because they are
+    # ambiguous: P is pressure, rate and pitch.
     known = {}
     for word in words:
         if time_unit(word) or units.is_unit(word):
             known[word] = word
         elif len(word) > 1 and units.is_unit(word.casefold()):
             known[word] = word.casefold()
-    # Some of them may be written as only their author does.
+    # Some units may be written in a way that is not known.
     if 2 * sum(word in known for word in words) < len(words):
         return ()
     return tuple(known.get(word, word) for word in bare)
 
 
 def _whole(rows: memoryview, head: _Head) -> tuple[memoryview, tuple[Finding, ...]]:
-    """The rows without those of empty cells at the end, as spreadsheets write them, and without a
-    last line that ends before its last cells, as where a logger lost its power; and a note."""
+    """Return the rows without incomplete ones at the end, and a note.
+
+    Spreadsheets append rows of empty cells. A logger that lost its power leaves a last line without
+    its last cells.
+    """
     end = bytes(rows[-(1 << 16) :])
     kept = len(end.rstrip(b" \t\n" + head.delimiter.encode()))
     if kept and (after := end.find(b"\n", kept)) >= 0:
         return rows[: len(rows) - len(end) + after + 1], ()
     at = end.rfind(b"\n") + 1
     cells = end[at:].count(head.delimiter.encode()) + 1
-    # Of quotes a delimiter may stand within; an only line is told as what it is.
+    # A delimiter may be inside quotes. A single line is kept, so that its own error is reported.
     if at == 0 or cells >= len(head.names) or b'"' in end[at:]:
         return rows, ()
     words = f"the last line is cut off ({cells} of {len(head.names)} cells): it is left out"
@@ -327,7 +333,7 @@ def _whole(rows: memoryview, head: _Head) -> tuple[memoryview, tuple[Finding, ..
 
 
 class CsvTable:
-    """A `Table` on delimited text."""
+    """`Table` of delimited text."""
 
     format = "csv"
 
@@ -346,8 +352,8 @@ class CsvTable:
         self._digest, self._rows, self._head = digest, rows, head
         self._dates: set[str] = set()
         self._quote = '"' if has_quotes else False
-        # The decimal sign of the file, by its first rows: `1.577` beside `0,25` would else be one
-        # and a half. Between commas a decimal one stands within quotes.
+        # The first rows decide the decimal sign of the whole file: otherwise `1.577` beside `0,25`
+        # would be read as one and a half. Between commas, a decimal comma is in quotes.
         lines = bytes(rows[:_LOOKED_AT]).decode("utf-8", "ignore").split("\n")[:2000]
         lines = [line for line in lines if "," in line and (head.delimiter != "," or '"' in line)]
         cells = (cell.strip() for line in lines for cell in _cells_of(line, head.delimiter))
@@ -355,11 +361,11 @@ class CsvTable:
 
     @property
     def sha256(self) -> str:
-        """Fingerprint of the file."""
+        """SHA-256 of the file."""
         return self._digest.hex()
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """The columns as float64 (N,), NaN where a cell is empty."""
+        """Return the columns as float64 (N,), NaN where a cell is empty."""
         require_columns(self.path, self.names, names)
         with progress.reading(self.path, self.size):
             columns = self._columns([self.names.index(name) for name in names])
@@ -377,7 +383,7 @@ class CsvTable:
         return numbers
 
     def survey(self) -> list[Survey]:
-        """Every column, in the file's order."""
+        """Survey every column, in the file's order."""
         with progress.reading(self.path, self.size):
             columns = self._columns(range(len(self.names)))
         surveys = []
@@ -389,26 +395,26 @@ class CsvTable:
                     place = f"{self.cell_text(name, values)} in {self.place(values)}"
                     strays = f"{odd} of {filled} {words}: {place}"
                 values = None
-            # What stands behind a delimiter at the end of every row is no column.
+            # A delimiter at the end of every row makes no column.
             if name or filled:
                 surveys.append(Survey(name, values, filled, strays))
         return surveys
 
     def place(self, row: int) -> str:
-        """`line 12`, counted from the top of the file, comments and blank lines included."""
+        """Return `line 12`, counted from the top of the file with comments and blank lines."""
         return f"line {self._record(row)[0]}"
 
     def cell_text(self, name: str, row: int) -> str:
-        """Text of a cell."""
+        """Return the text of a cell."""
         cell = self._record(row)[1][self.names.index(name)].strip()
         return shown(cell) if cell else "nothing"
 
     def time_unit(self, name: str) -> str | None:
-        """Seconds of a column of dates; else what a row of units says, where it is one of time."""
+        """Return seconds for a column of dates, else the unit of time in a row of units, if any."""
         return "s" if name in self._dates else time_unit(self.units.get(name, ""))
 
     def _columns(self, indices: Sequence[int]) -> list["_Column"]:
-        """Columns by index: as numbers at once where that will do, else through their text."""
+        """Return columns by index: as numbers at once if possible, else through their text."""
         import pyarrow as pa
 
         table = self._arrow(indices, pa.float64())
@@ -425,24 +431,25 @@ class CsvTable:
         return [self._parsed(self.names[i], table.column(str(i))) for i in indices]
 
     def _parsed(self, name: str, texts: "pa.ChunkedArray") -> "_Column":
-        """A column of texts."""
+        """Parse a column of texts."""
         import pyarrow as pa
         from pyarrow import compute
 
-        pc: Any = compute  # whose functions are made when it is imported
+        pc: Any = compute  # its functions are made on import
         cells: Any = pc.utf8_trim(texts, ' \t"')
         nothing = pc.is_in(cells, pa.array(["", *MISSING]))
         cells = pc.if_else(nothing, pa.scalar(None, pa.string()), cells)
         filled = len(cells) - cells.null_count
         plain = cells
         if self._sign == ",":
-            # A point beside decimal commas would be one between thousands, or a slip.
+            # A point beside decimal commas would be a thousands separator or a slip.
             mixed = pc.match_substring(plain, ".")
             plain = pc.if_else(mixed, pa.scalar("x"), pc.replace_substring(plain, ",", "."))
         is_number = pc.match_substring_regex(plain, f"^(?:{_NUMBER.pattern})$", ignore_case=True)
         odd = filled - pc.sum(is_number).as_py() if filled else 0
         if not odd:
-            # Fortran writes 1.0D+00, some a true minus; pyarrow knows no plus in front.
+            # Fortran writes 1.0D+00, some programs a true minus sign; pyarrow accepts no leading
+            # plus.
             plain = pc.replace_substring(plain, "\u2212", "-")
             plain = pc.replace_substring_regex(plain, r"^\+", "")
             plain = pc.replace_substring_regex(plain, r"([0-9.])[dD]", r"\1e")
@@ -454,20 +461,20 @@ class CsvTable:
         return pc.index(is_number, False).as_py(), filled, odd
 
     def _arrow(self, indices: Sequence[int], kind: Any) -> "pa.Table | None":
-        """Columns by index, in one type; None where pyarrow cannot read them."""
+        """Return columns by index, in one type; None if pyarrow cannot read them."""
         import pyarrow as pa
         from pyarrow import csv as arrow_csv
 
         ragged: list[Any] = []
 
-        # Called for each row with other than the header's number of cells: so for blank lines too,
-        # which are no error. That there is any other is enough: `_ragged` finds its line.
+        # Called for each row with a wrong number of cells. Blank lines are no error. Any other row
+        # is; `_ragged` finds its line.
         def skip(row: Any) -> str:
             if not _is_blank(row.text, self._head.delimiter):
                 ragged.append(row)
             return "skip"
 
-        # By number, since two columns may have one name.
+        # By number, because two columns may have the same name.
         names = [str(i) for i in dict.fromkeys(indices)]
         try:
             table = arrow_csv.read_csv(
@@ -483,20 +490,20 @@ class CsvTable:
                 convert_options=arrow_csv.ConvertOptions(
                     column_types=dict.fromkeys(names, kind),
                     include_columns=names,
-                    # Not its own list, which has words such as #N/A N/A.
+                    # pyarrow's own list has more words, such as #N/A N/A.
                     null_values=["", *MISSING],
                     decimal_point=self._sign,
                 ),
             )
-        except pa.ArrowException:  # such as a line longer than a block, or a cell that is no number
+        except pa.ArrowException:  # e.g. a line longer than a block, or a cell that is no number
             return None
         return None if ragged or not table.num_rows else table
 
     def _ragged(self) -> InputError:
-        """The error of a row that has another number of cells than the header."""
+        """Return the error for a row with a different number of cells than the header."""
         delimiter = self._head.delimiter
         for line, text in self._records():
-            # Counted and not split: a damaged line may hold millions.
+            # Counted, not split: a damaged line may have millions of cells.
             plain = '"' not in text
             count = text.count(delimiter) + 1 if plain else len(self._cells(line, text))
             if count != len(self.names):
@@ -508,15 +515,15 @@ class CsvTable:
         return wrong(self.path, "holds no rows that can be read, expected rows of numbers")
 
     def _record(self, row: int) -> tuple[int, list[str]]:
-        """A row's line and cells."""
-        # From the top each time: only a message asks for one, and an index of all rows would be as
-        # large as the log.
+        """Return a row's line number and cells."""
+        # Read from the top each time: only error messages need this, and an index of all rows would
+        # be as large as the log.
         line, text = next(itertools.islice(self._records(), row, None))
         return line, self._cells(line, text)
 
     def _records(self) -> Iterator[tuple[int, str]]:
-        """Each row's line and text. Blank lines are passed over, as in pyarrow's reader."""
-        # newline: what else Python takes for the end of a line, no spreadsheet and no pyarrow does.
+        """Yield each row's line number and text, without blank lines, as pyarrow's reader does."""
+        # newline: Python ends a line at more characters than spreadsheets and pyarrow do.
         lines = io.TextIOWrapper(io.BytesIO(self._rows), "utf-8", newline="\n")
         for number, line in enumerate(lines, self._head.first_line):
             if not _is_blank(line, self._head.delimiter):
@@ -534,9 +541,10 @@ class CsvTable:
 
 
 type _Column = tuple[np.ndarray | int, int, int]
-"""numbers (N,), or the first row that holds none; cells that are filled, and those of no number"""
+"""Numbers (N,) or the first row without one; count of filled cells; count of cells without a
+number."""
 
 
 def _is_blank(line: str, delimiter: str) -> bool:
-    """True for a line without a cell; one of delimiters alone is a row of empty cells."""
+    """True for a line without a cell; a line of delimiters alone is a row of empty cells."""
     return not line.strip() and delimiter not in line

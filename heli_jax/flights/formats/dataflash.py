@@ -1,8 +1,8 @@
-"""ArduPilot DataFlash logs, binary (.bin) and as text (.log), read with NumPy alone.
+"""Reader of ArduPilot DataFlash logs, binary (.bin) and text (.log), with NumPy alone.
 
-Source: the format of the messages FMT, FMTU, UNIT and MULT of ArduPilot's AP_Logger. Numbers and
-names are those of pymavlink's DFReader, which is not used: a message that claims a length of zero
-never lets it end, and it reads one message at a time.
+Source: the messages FMT, FMTU, UNIT and MULT of ArduPilot's AP_Logger. Numbers and names follow
+pymavlink's DFReader. That reader is not used: a message with length zero makes it loop forever, and
+it reads one message at a time.
 """
 
 import array
@@ -21,16 +21,15 @@ from heli_jax.flights import progress
 from heli_jax.flights.log import ChannelLog, Topic, require_samples, wrong
 from heli_jax.regular_file import read_regular
 
-# The first message of a log is the format of formats: two bytes with which every message begins,
-# and its number 0x80.
+# A log begins with the format of formats: two bytes that begin every message, and its number 0x80.
 MAGIC = b"\xa3\x95\x80"
 _LARGEST, _LARGEST_TEXT = 2 * 10**9, 10**9
 _HEAD = b"\xa3\x95"
 _FMT = 0x80
-# Bytes: three of the head, type and length, 4 of the name, 16 of the kinds and 64 of the columns.
+# Bytes: 3 of the head, type and length, 4 of the name, 16 of the kinds and 64 of the columns.
 _FMT_LENGTH = 89
 _ROWS_AT_ONCE = 1 << 13
-# How a field is stored, and what pymavlink multiplies it with.
+# NumPy type of each kind of field, and the factor that pymavlink multiplies it by.
 FIELDS: dict[str, tuple[str, float | None]] = {
     "a": ("(32,)<i2", None), "b": ("<i1", None), "B": ("<u1", None), "g": ("<f2", None),
     "h": ("<i2", None), "H": ("<u2", None), "i": ("<i4", None), "I": ("<u4", None),
@@ -40,24 +39,22 @@ FIELDS: dict[str, tuple[str, float | None]] = {
     "Q": ("<u8", None),
 }  # fmt: skip
 _APART = 1.0
-"""s before and after the board's time that a message may have some"""
+"""Margin before and after the board's time within which a message's time may lie [s]."""
 _FEWEST_ROWS = 10
-"""of a message, from which on a time that is out of order stands out"""
-# New firmware counts microseconds, old firmware milliseconds.
-# In old firmware's message GPS TimeMS is the time of the week, and T the board's.
+"""Fewest rows of a message in which a time out of order is detected."""
+# New firmware counts microseconds, old firmware milliseconds. In old firmware's GPS message, TimeMS
+# is the time of the week and T the board's time.
 _CLOCKS = {"TimeUS": 1e-6, "TimeMS": 1e-3, "T": 1e-3}
-# These messages describe the log and are no samples: what they say is in units, parameters and
-# firmware.
+# These messages describe the log (units, parameters, firmware) and hold no samples.
 _OF_LOG = ("FMT", "FMTU", "UNIT", "MULT", "PARM", "MSG")
 _PREFIXES = {1.0: "", 1e-2: "c", 1e-3: "m", 1e-6: "u", 1e-9: "n"}
-# Labels of ArduPilot that `heli_jax.units` does not know, in words that it does.
+# Labels of ArduPilot that `heli_jax.units` does not know, and their equivalents.
 _LABELS = {"degheading": "deg", "deglatitude": "deg", "deglongitude": "deg", "satellites": "1"}
 
 
 @dataclass(frozen=True)
 class Format:
-    """Format of a message from its FMT message: kinds of the fields, one letter each, and their
-    names."""
+    """Format of a message: its name, the kinds of its fields (one letter each) and their names."""
 
     name: str
     kinds: str
@@ -70,7 +67,7 @@ class Format:
 
     @property
     def is_valid(self) -> bool:
-        """True if the fields are known, each with a name of its own."""
+        """True if all fields are known and have different names."""
         return (
             len(self.kinds) == len(self.columns) == len(set(self.columns))
             and set(self.kinds) <= FIELDS.keys()
@@ -83,9 +80,9 @@ class Part(NamedTuple):
 
     Attributes:
         form: the description.
-        number: of the message.
-        since: where the description stands, in the count of `at`.
-        at: where each message stands in the file (N,), increasing.
+        number: number of the message.
+        since: position of the description, in the count of `at`.
+        at: positions of the messages in the file (N,), increasing.
         rows: their fields (N,), structured.
     """
 
@@ -97,14 +94,14 @@ class Part(NamedTuple):
 
 
 class _Messages(NamedTuple):
-    """Messages of one name in the file's order, by one description or by several.
+    """Messages of one name in the file's order, by one description or several.
 
     Attributes:
-        name: of the topic.
-        at: where each message stands in the file (M,).
-        columns: their fields (M,), numbers as what they mean.
-        clocks: the fields that may be the time.
-        units: by field.
+        name: name of the topic.
+        at: positions of the messages in the file (M,).
+        columns: their fields (M,), scaled.
+        clocks: fields that may be the time.
+        units: units by field.
     """
 
     name: str
@@ -114,7 +111,7 @@ class _Messages(NamedTuple):
     units: Mapping[str, str] = MappingProxyType({})
 
     def seconds(self, clock: str) -> np.ndarray:
-        """The times (M,) [s] of a clock."""
+        """Return the times (M,) [s] of a clock."""
         return self.columns[clock] * _CLOCKS[clock]
 
     def rows(self, kept: np.ndarray) -> "_Messages":
@@ -124,7 +121,7 @@ class _Messages(NamedTuple):
 
 
 def open_dataflash(path: Path) -> ChannelLog:
-    """The flight of a binary DataFlash log."""
+    """Read a binary DataFlash log."""
     data = read_regular(path, "a DataFlash log", _LARGEST)
     if not data.startswith(MAGIC):
         raise wrong(str(path), "is no DataFlash log, expected one that begins with a format")
@@ -132,26 +129,25 @@ def open_dataflash(path: Path) -> ChannelLog:
     raw = np.frombuffer(data, np.uint8)
     parts = []
     for form, number, since, starts, _ in described:
-        # Messages of one description are of one length, so all of them are taken out of the bytes
-        # at once. Each message's bytes become a row, whose columns are then the fields.
+        # Messages of one description have the same length, so their bytes are gathered at once into
+        # rows.
         at = np.frombuffer(starts, np.int64)
         parts.append(Part(form, number, since, at, _gathered(raw, at + 3, form.dtype)))
     return make_log(str(path), data, parts, damaged)
 
 
 def _gathered(raw: np.ndarray, at: np.ndarray, dtype: np.dtype) -> np.ndarray:
-    """The rows (N,) whose bytes begin at `at` (N,)."""
+    """Return the rows (N,) whose bytes begin at `at` (N,)."""
     rows = np.empty((at.size, dtype.itemsize), np.uint8)
     within = np.arange(dtype.itemsize)
-    # A block at a time: an index of eight bytes for each byte takes more than the log.
+    # Block by block, because an index of eight bytes for each byte takes more memory than the log.
     for i in range(0, at.size, _ROWS_AT_ONCE):
         rows[i : i + _ROWS_AT_ONCE] = raw[at[i : i + _ROWS_AT_ONCE, None] + within]
     return rows.view(dtype)[:, 0]
 
 
 class _Described(NamedTuple):
-    """A description, its message's number, where it stands in the file, where the messages that are
-    read by it begin, and in text their cells."""
+    """A description, its message number and position, its messages' positions, and their cells."""
 
     form: Format
     number: int
@@ -161,9 +157,9 @@ class _Described(NamedTuple):
 
 
 def _walk(data: bytes) -> tuple[list[_Described], int]:
-    """The descriptions that have messages, and how often there was no message."""
-    # The format of formats is stated here, since without it the first message could not be read,
-    # which states it again.
+    """Return the descriptions that have messages, and the number of damaged places."""
+    # The format of formats is stated here, because the first message, which describes it, cannot be
+    # read without it.
     of_formats = Format("FMT", "BBnNZ", ("Type", "Length", "Name", "Format", "Columns"))
     described = [_Described(of_formats, _FMT, 0, array.array("q"), [])]
     forms = {_FMT: of_formats}
@@ -177,29 +173,30 @@ def _walk(data: bytes) -> tuple[list[_Described], int]:
         number = data[at + 2]
         length = lengths.get(number, 0)
         if data[at] != 0xA3 or data[at + 1] != 0x95 or not length:
-            # Blocks that were never written stand at the end, and are no loss.
+            # Blocks that were never written are at the end and are no loss.
             blank = not data[at : at + 256].strip(b"\0") or not data[at : at + 256].strip(b"\xff")
             damaged += not blank
             at = data.find(_HEAD, at + 1)
-            # On to a message that is known: one call a byte would take minutes where none is.
+            # Skip to the next known message. One call per byte would take minutes in a file without
+            # any.
             while at >= 0 and (at + 2 >= size or data[at + 2] not in lengths):
                 at = data.find(_HEAD, at + 1)
             if at < 0:
                 break
             continue
-        # The power goes off before the last block is written: a log seldom ends with a whole
-        # message.
+        # A log seldom ends with a whole message, because the power goes off before the last block
+        # is written.
         if at + length > size:
             damaged += 1
             break
-        # Positions alone are gathered in this loop, and the numbers are read by NumPy afterwards: a
-        # log has millions of messages.
+        # The loop gathers only positions, because a log has millions of messages. NumPy reads the
+        # numbers later.
         starts[number].append(at)
         if number == _FMT:
             taken = _format(data[at + 3 : at + length])
             damaged += taken is None
-            # Every boot describes its messages again. A new firmware may do so otherwise, and what
-            # follows is written by its description.
+            # Every boot describes its messages again. New firmware may change a description, which
+            # then holds for the messages after it.
             if taken is not None and forms.get(taken[0]) != taken[1]:
                 new = _Described(taken[1], taken[0], at, array.array("q"), [])
                 described.append(new)
@@ -210,12 +207,12 @@ def _walk(data: bytes) -> tuple[list[_Described], int]:
 
 
 def _format(body: bytes) -> tuple[int, Format] | None:
-    """The number and the format that a message FMT describes; None of damage."""
+    """Return the number and the format in a message FMT; None if it is damaged."""
     number, length = body[0], body[1]
     name, kinds, columns = (_text(part) for part in (body[2:6], body[6:22], body[22:86]))
     form = Format(name, kinds, tuple(columns.split(",")) if columns else ())
-    # The length is stated beside the kinds that give it. That both agree tells a format from bytes
-    # that look like one.
+    # The length is redundant with the kinds. Agreement of both separates a format from bytes that
+    # look like one.
     if not form.is_valid or length != form.dtype.itemsize + 3:
         return None
     # The format of formats is the same in every log.
@@ -231,7 +228,7 @@ def _text(raw: bytes) -> str:
 def make_log(
     path: str, data: bytes, parts: Sequence[Part], damaged: int, scaled: bool = False
 ) -> ChannelLog:
-    """The log that messages make."""
+    """Return the log that consists of these messages."""
     of_name: dict[str, list[Part]] = {}
     for part in parts:
         of_name.setdefault(part.form.name, []).append(part)
@@ -243,7 +240,8 @@ def make_log(
         if name not in _OF_LOG
         for each in _topics_of(name, of_one, units, scaled)
     ]
-    # The board's clock is that of the most messages of those with one time that is no GPS time.
+    # The board's clock is that of the most frequent message with exactly one time that is not GPS
+    # time.
     certain = [m for m in topics_of if len(m.clocks) == 1 and "Week" not in m.columns]
     board = None
     if certain:
@@ -261,7 +259,7 @@ def make_log(
     if damaged:
         words = f"{damaged} damaged place{'' if damaged == 1 else 's'} skipped"
         notes.append(note("damage.skipped", words, value=damaged))
-    # The firmware names itself when it begins to log; messages of the flight may quote anything.
+    # The firmware logs its name first; later messages may quote any text.
     texts = map(_text, alone["MSG"].columns.get("Message", np.array([], "S1"))[:50])
     settings = _pairs(alone["PARM"].columns, "Name", "Value")
     return ChannelLog(
@@ -279,8 +277,7 @@ def make_log(
 def _topics_of(
     name: str, parts: Sequence[Part], units: Mapping[int, dict[str, str]], scaled: bool
 ) -> Iterator[_Messages]:
-    """The messages of a name as topics: one, but where a new description has another clock or
-    another unit."""
+    """Group messages of a name into topics: one, unless a description changes clock or unit."""
     groups: list[tuple[list[Part], dict[str, str]]] = []
     for part in parts:
         said = units.get(id(part), {})
@@ -298,7 +295,7 @@ def _topics_of(
 
 
 def _joined(name: str, parts: Sequence[Part], scaled: bool) -> _Messages:
-    """Messages by the fields of all of their descriptions; numbers that one lacks are NaN."""
+    """Join messages by the fields of all their descriptions; missing numbers are NaN."""
 
     def values(part: Part, field: str) -> np.ndarray:
         kind = dict(zip(part.form.columns, part.form.kinds, strict=True)).get(field)
@@ -311,7 +308,7 @@ def _joined(name: str, parts: Sequence[Part], scaled: bool) -> _Messages:
     order, columns = np.argsort(at, kind="stable"), {}
     for field in dict.fromkeys(c for p in parts for c in p.form.columns):
         have = [values(part, field) for part in parts]
-        # Text and numbers, or an array and a number, are not made one another.
+        # Text and numbers, or arrays and numbers, cannot be joined.
         if len({(x.ndim, x.dtype.kind == "S") for x in have}) == 1:
             columns[field] = have[0] if len(have) == 1 else np.concatenate(have)[order]
     return _Messages(name, at[order], columns)
@@ -320,24 +317,24 @@ def _joined(name: str, parts: Sequence[Part], scaled: bool) -> _Messages:
 def _multiplied(values: np.ndarray, factor: float | None) -> np.ndarray:
     if factor is None:
         return values
-    # 718 / 100 is the number nearest to 7.18, 718 * 0.01 is not.
+    # 718 / 100 is the float nearest to 7.18, 718 * 0.01 is not.
     return values / round(1.0 / factor) if factor < 1.0 else values * factor
 
 
 def _by_instance(messages: _Messages) -> list[_Messages]:
-    """The messages of each instance, where the log says which field counts them."""
+    """Split the messages by instance if the log marks a field that counts instances."""
     instance = next((c for c, unit in messages.units.items() if unit == "#"), None)
     if instance is None or instance not in messages.columns:
         return [messages]
     numbers = messages.columns[instance]
-    # In text a count is read as any number is.
+    # A text log stores the count as a float.
     whole = numbers.dtype.kind in "iu" or (
         numbers.dtype.kind == "f"
         and np.all(np.isfinite(numbers) & (np.abs(numbers) < 256.0))
         and np.all(numbers == np.rint(numbers))
     )
     counts = np.unique(numbers).astype(np.int64) if whole else ()
-    # A name without an index is what the user of a single sensor expects.
+    # A user with a single sensor expects a name without an index.
     if not len(counts) or (len(counts) == 1 and not counts[0]):
         return [messages]
     name = messages.name
@@ -345,30 +342,36 @@ def _by_instance(messages: _Messages) -> list[_Messages]:
 
 
 def _in_order(messages: _Messages, clock: str) -> _Messages:
-    """The messages without single ones whose time lies outside of those around them, as where a log
-    was cut off in a message: where the others are in order, and these are few."""
+    """Remove single messages whose times lie outside those of their neighbours.
+
+    Such times appear where a log was cut off within a message. The messages stay as they are if the
+    faults are many or the other times are not in order.
+    """
     if not clock or messages.at.size < _FEWEST_ROWS:
         return messages
     times = messages.seconds(clock)
     back = np.flatnonzero(np.diff(times) < 0) + 1
     if not 0 < back.size <= max(1, times.size // 1000):
         return messages
-    # A row before which the times go back is the wrong one, or the one before it is: whichever
-    # leaves the others in order.
+    # Where the time goes back, either this row or the previous one is wrong. The one is removed
+    # that leaves the others in order.
     rows = [r if r + 1 == times.size or times[r + 1] >= times[r - 1] else r - 1 for r in back]
     kept = np.delete(np.arange(times.size), rows)
     return messages.rows(kept) if np.all(np.diff(times[kept]) >= 0) else messages
 
 
 def _clocks(form: Format) -> tuple[str, ...]:
-    """The fields that may be the time; some firmware puts it behind the instance."""
+    """Return the fields that may be the time; some firmware puts it after the instance."""
     named = zip(form.columns, form.kinds, strict=True)
     return tuple(c for c, kind in named if c in _CLOCKS and (kind in "IQ" or c != "T"))
 
 
 def _clock(messages: _Messages, board: np.ndarray | None) -> str:
-    """The field with the board's time [s]: of GPS.TimeMS, a time of week, and GPS.T the one that
-    shares the other messages' time. Empty where there is none."""
+    """Return the field with the board's time [s]; empty if there is none.
+
+    Between GPS.TimeMS, which may be a time of week, and GPS.T it is the one within the other
+    messages' times.
+    """
     clocks = messages.clocks
     if board is None or (len(clocks) < 2 and "Week" not in messages.columns):
         return next(iter(clocks), "")
@@ -391,33 +394,32 @@ def _topic(messages: _Messages, clock: str) -> Topic:
             columns[f"{name}.{column}{end}"] = part
             if messages.units.get(column, "#") != "#":
                 units[f"{name}.{column}{end}"] = messages.units[column]
-    # Without a clock the rows have their order alone, which `clock` says by being empty.
+    # Without a clock only the order of the rows is known; `clock` is empty then.
     times = messages.seconds(clock) if clock else np.arange(messages.at.size, dtype=np.float64)
     return Topic(name, times, columns, units, clock)
 
 
 def _units(parts: Sequence[Part], alone: Mapping[str, _Messages]) -> dict[int, dict[str, str]]:
-    """The units of each description's fields, by the id of its part; `#` is that of a count of
-    instances."""
+    """Return the units of fields, by the id of the part; `#` marks a count of instances."""
     stated = alone["FMTU"].columns
     if not {"FmtType", "UnitIds"} <= set(stated):
         return {}
     labels = _pairs(alone["UNIT"].columns, "Id", "Label")
     factors = _pairs(alone["MULT"].columns, "Id", "Mult")
     units: dict[int, dict[str, str]] = {}
-    # A unit is told in three messages: FMTU has a letter for each field of a format, UNIT says
-    # which unit the letter is, MULT what the field's number has to be multiplied with.
+    # Three messages give a unit: FMTU has a letter for each field, UNIT the unit of each letter,
+    # and MULT the factor of the field's number.
     ids = zip(stated["FmtType"], stated["UnitIds"], alone["FMTU"].at, strict=True)
     for row, (number, unit_ids, at) in enumerate(ids):
         of_number = [p for p in parts if p.number == int(number)]
-        # Of several descriptions it is about the one that holds there.
+        # Of several descriptions, use the one that is valid at this position.
         part = next((p for p in reversed(of_number) if p.since <= at), next(iter(of_number), None))
         if part is None:
             continue
         marks = _text(bytes(unit_ids))
         scales = _text(bytes(stated["MultIds"][row])) if "MultIds" in stated else ""
         found = units[id(part)] = {}
-        # By the letters of the format, since text has whole numbers as any other.
+        # The letters come from the format, because a text log stores every number as a float.
         for i, (column, kind) in enumerate(
             zip(part.form.columns[: len(marks)], part.form.kinds, strict=False)
         ):
@@ -435,8 +437,8 @@ def _unit(mark: str, labels: dict[str, object], scale: object, kind: str) -> str
     if not isinstance(label, str) or not label or mark in "-?":
         return ""
     label = _LABELS.get(label, label)
-    # Whole numbers may count thousandths; floats, and fields that are multiplied when they are
-    # read, hold the unit itself.
+    # Integers may count thousandths. Floats, and fields that are multiplied on reading, hold the
+    # unit itself.
     prefix = _PREFIXES.get(float(scale) if isinstance(scale, int | float) else 1.0, "")
     stored, factor = FIELDS[kind]
     is_count = np.dtype(stored).kind in "iu" and factor is None
@@ -444,13 +446,13 @@ def _unit(mark: str, labels: dict[str, object], scale: object, kind: str) -> str
 
 
 def _pairs(columns: Mapping[str, np.ndarray], key: str, value: str) -> dict[str, object]:
-    """A column by another; of text both without what stands behind the end, ids as letters."""
+    """Return one column by another; text is cut at its end, ids become letters."""
     if not {key, value} <= set(columns):
         return {}
     pairs = {}
     for mark, entry in zip(columns[key], columns[value], strict=True):
-        # Ids are letters that are stored as signed bytes, and a damaged one may be negative. In
-        # text they stand as numbers.
+        # Ids are letters stored as signed bytes, so a damaged one may be negative. A text log
+        # stores them as numbers.
         if isinstance(mark, bytes):
             letter = _text(mark)
         elif np.isfinite(mark):
@@ -462,31 +464,30 @@ def _pairs(columns: Mapping[str, np.ndarray], key: str, value: str) -> dict[str,
 
 
 _FMT_PARTS = 5
-"""cells of a format before the names of the columns, the word FMT among them"""
-# The kinds of fields that hold text, of 4, 16 and 64 characters.
+"""Cells of a format before the names of the columns, the word FMT included."""
+# Kinds of fields that hold text, of 4, 16 and 64 characters.
 _TEXTS = "nNZ"
 
 
 def is_dataflash_text(head: bytes) -> bool:
-    """True if the first bytes of a file hold the format of a message, as such logs begin."""
+    """True if the first bytes of a file contain a message format."""
     return any(line.startswith(b"FMT,") for line in head.splitlines())
 
 
 def open_dataflash_text(path: Path) -> ChannelLog:
-    """The flight of a DataFlash log in text."""
+    """Read a DataFlash log in text."""
     data = read_regular(path, "a DataFlash log in text", _LARGEST_TEXT)
     formats: dict[str, _Described] = {}
     described: list[_Described] = []
     damaged = 0
-    # Bytes that are no UTF-8 cost the line that they are in and not the log: a message may hold
-    # damage.
+    # Bytes that are not UTF-8 damage only their line, not the log.
     for at, line in enumerate(io.TextIOWrapper(io.BytesIO(data), "utf-8", "replace")):
         name, _, rest = line.rstrip("\n").partition(",")
         name = name.strip()
         if name == "FMT":
             taken = _format_of_line(rest)
             damaged += taken is None
-            # A new firmware may describe its messages otherwise from its boot on.
+            # New firmware may describe its messages differently after a boot.
             if taken is not None and (
                 taken[1].name not in formats or formats[taken[1].name].form != taken[1]
             ):
@@ -494,14 +495,14 @@ def open_dataflash_text(path: Path) -> ChannelLog:
                 formats[taken[1].name] = described[-1]
         elif name in formats:
             form, _, _, places, rows = formats[name]
-            # The last cell may be a message with commas of its own.
+            # The last cell may be a message that contains commas.
             row = [cell.strip() for cell in rest.split(",", len(form.columns) - 1)]
             if len(row) == len(form.columns):
                 places.append(at)
                 rows.append(row)
             else:
                 damaged += 1
-        # Before the first format stand lines of the firmware and the board.
+        # Lines of the firmware and the board come before the first format.
         elif line.strip() and formats:
             damaged += 1
     if not formats:
@@ -516,22 +517,22 @@ def open_dataflash_text(path: Path) -> ChannelLog:
 
 
 def _format_of_line(rest: str) -> tuple[int, Format] | None:
-    """The number and the format that a line FMT describes; None of damage."""
+    """Return the number and the format in a line FMT; None if it is damaged."""
     cells = [cell.strip() for cell in rest.split(",")]
     if len(cells) < _FMT_PARTS or not cells[0].isdigit():
         return None
-    # A line is FMT, type, length, name, kinds, columns. The length is that of the binary message,
-    # which says nothing of a text.
+    # A line is FMT, type, length, name, kinds, columns. The length is that of the binary message
+    # and is not used.
     form = Format(cells[2], cells[3], tuple(cells[_FMT_PARTS - 1 :]))
-    # Of arrays nobody has seen a text.
+    # The text form of arrays is not known.
     if not form.is_valid or "a" in form.kinds:
         return None
-    # Cut, since a damaged cell may hold thousands of digits, which Python refuses to convert.
+    # Cut, because a damaged cell may hold thousands of digits, which Python refuses to convert.
     return int(cells[0][:9]), form
 
 
 def _columns(form: Format, lines: list[list[str]]) -> tuple[np.ndarray, list[int]]:
-    """Lines of one message as a structured array, and which of them hold numbers."""
+    """Return the lines of one message as a structured array, and the indices of the valid ones."""
     good, parsed = [], []
     for i, row in enumerate(lines):
         try:
@@ -542,13 +543,12 @@ def _columns(form: Format, lines: list[list[str]]) -> tuple[np.ndarray, list[int
                 )
             )
             good.append(i)
-        # A row whose cells are no numbers is left out as a whole: what else it holds is as
-        # doubtful.
+        # The whole row is left out: its other cells are doubtful too.
         except ValueError:
             continue
-    # Whatever its letter says, a number in text may have decimals: what the binary log stores as
-    # hundredths is written as what it means.
+    # A number in text may have decimals whatever its kind: the text log holds the value, not
+    # hundredths.
     kinds = [FIELDS[kind][0] if kind in _TEXTS else "<f8" for kind in form.kinds]
-    # A mode is written as its name: a column that never holds a number is text.
+    # A mode is written as its name: a column without any number is text.
     dtype = np.dtype(list(zip(form.columns, kinds, strict=True)))
     return np.array(parsed, dtype), good

@@ -1,7 +1,6 @@
-"""Logs in JSON: records one by one or a line each (.jsonl, .ndjson), or columns by name.
+"""Logs in JSON: records in a list or one per line (.jsonl, .ndjson), or columns by name.
 
-Records within records and lists within them are named by path, `imu.p`, `gyro[0]`, as arrays of
-MATLAB are.
+Nested records and lists are named by path, `imu.p`, `gyro[0]`, like MATLAB's arrays.
 """
 
 import json
@@ -20,15 +19,15 @@ from heli_jax.regular_file import read_regular
 
 _LARGEST = 500 * 10**6
 _OBJECTS = {b",": 32, b"[": 64, b"{": 200, b'"': 30}
-"""bytes of memory that Python takes for what begins or ends with each of these"""
+"""Memory that Python uses for each object that begins or ends with this character [bytes]."""
 _MOST_COLUMNS = 10_000
 _DEEPEST = 8
 _LONGEST_LIST = 16
-"""numbers of a list within a sample"""
+"""Most numbers of a list within a sample."""
 
 
 def open_json(path: Path) -> ArrayTable:
-    """A file of JSON, or of a record a line."""
+    """Read a JSON file, or one with a record per line."""
     where = str(path)
     data = read_regular(path, "a log in JSON", _LARGEST)
     sets = DataSets(Budget(where, len(data)))
@@ -60,7 +59,7 @@ def _parsed(where: str, data: bytes) -> Any:
         raise wrong(where, "is nested too deeply, expected a log") from e
     except ValueError as e:
         whole = e
-    # A record a line; the last may be cut off where a logger lost its power.
+    # One record per line; the last may be cut off if the logger lost its power.
     lines = [(i, line) for i, line in enumerate(text.split("\n"), 1) if line.strip()]
     records = []
     for place, (number, line) in enumerate(lines):
@@ -76,7 +75,7 @@ def _parsed(where: str, data: bytes) -> Any:
 
 
 def _within(where: str, content: Any, budget: Budget) -> Iterator[tuple[str, Any]]:
-    """The lists in records within records by path; numbers that stand alone too, such as a rate."""
+    """Yield the lists in nested records by path; also single numbers, such as a rate."""
     for name, value in _cells(content, "", 0):
         if isinstance(value, dict):
             yield name, list(value.values())
@@ -89,7 +88,7 @@ def _within(where: str, content: Any, budget: Budget) -> Iterator[tuple[str, Any
 
 
 def _of_rows(where: str, rows: list[Any], budget: Budget) -> dict[str, Any]:
-    """Columns of records or rows; what one of them lacks is missing there."""
+    """Return columns of records or rows, with missing values where one lacks a column."""
     if not rows or not isinstance(rows[0], dict):
         return {"data": rows}
     columns: dict[str, list[Any]] = {}
@@ -106,7 +105,7 @@ def _of_rows(where: str, rows: list[Any], budget: Budget) -> dict[str, Any]:
                 if name not in columns:
                     budget.take(8 * len(rows))
                 column = columns.setdefault(name, [])
-                # Rows before that had none of this.
+                # Earlier rows did not have this column.
                 column.extend([None] * (i - len(column)))
                 column.append(cell)
         if len(columns) > _MOST_COLUMNS:
@@ -142,7 +141,7 @@ def _add(sets: DataSets, name: str, values: list[Any], texts: list[str]) -> None
             array = np.array([[_number(x) for x in row] for row in values], np.float64)
         else:
             array = np.array([_number(x) for x in values], np.float64)
-    # Rows of several lengths, or something else than numbers.
+    # Rows of different lengths, or cells that are no numbers.
     except (TypeError, ValueError, OverflowError):
         texts.append(name)
         return

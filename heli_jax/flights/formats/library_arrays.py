@@ -1,5 +1,7 @@
-"""MATLAB (.mat), NetCDF (.nc) and HDF5 (.h5, .hdf5) files, read by SciPy and h5py in a process of
-its own."""
+"""Readers of MATLAB (.mat), NetCDF (.nc) and HDF5 (.h5, .hdf5) files.
+
+SciPy and h5py read them in a separate process.
+"""
 
 import importlib.util
 from collections.abc import Iterator, Mapping
@@ -27,15 +29,15 @@ HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 NETCDF_MAGICS = (b"CDF\x01", b"CDF\x02")
 MATLAB_MAGIC = b"MATLAB "
 _DEEPEST = 10
-"""groups and structures within one another"""
+"""Deepest nesting of groups and structures."""
 _NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
-"""the name that NetCDF 4 gives to a dimension without values, which stands in the file as zeros"""
+"""Name that NetCDF 4 gives to a dimension without values, which the file stores as zeros."""
 
 
 def open_mat(path: Path) -> ArrayTable:
-    """A MATLAB file, of version 7.3 too where h5py is installed."""
+    """Read a MATLAB file; version 7.3 needs h5py."""
     data = read_regular(path, "a MATLAB file", LARGEST)
-    # MATLAB puts 512 bytes of its own in front of the mark of HDF5, which is 8 bytes long.
+    # MATLAB puts 512 bytes in front of HDF5's mark, which is 8 bytes long.
     is_hdf5 = data[:520].find(HDF5_MAGIC) >= 0 or data.startswith(b"MATLAB 7.3")
     if is_hdf5:
         return _read(path, "mat 7.3", read_matlab_73, "HDF5 file", data)
@@ -43,7 +45,7 @@ def open_mat(path: Path) -> ArrayTable:
 
 
 def open_netcdf(path: Path) -> ArrayTable:
-    """A NetCDF file, of version 4 where h5py is installed; errors as of `open_mat`."""
+    """Read a NetCDF file; version 4 needs h5py. Errors are as in `open_mat`."""
     data = read_regular(path, "a NetCDF file", LARGEST)
     if data.startswith(HDF5_MAGIC):
         return _read(path, "netcdf", read_hdf5, "HDF5 file", data)
@@ -53,7 +55,7 @@ def open_netcdf(path: Path) -> ArrayTable:
 
 
 def open_hdf5(path: Path) -> ArrayTable:
-    """An HDF5 file, where h5py is installed; errors as of `open_mat`."""
+    """Read an HDF5 file, which needs h5py. Errors are as in `open_mat`."""
     data = read_regular(path, "an HDF5 file", LARGEST)
     if not data.startswith(HDF5_MAGIC):
         raise wrong(str(path), "is no HDF5 file, expected one that begins with its mark")
@@ -61,7 +63,7 @@ def open_hdf5(path: Path) -> ArrayTable:
 
 
 def _read(path: Path, kind: str, reader: Reader, what: str, data: bytes) -> ArrayTable:
-    """The file as its reader reads it in a process of its own."""
+    """Read the file with its reader in a separate process."""
     if what == "HDF5 file" and importlib.util.find_spec("h5py") is None:
         problem = "is an HDF5 file, which needs h5py: pip install 'heli_jax[logs]'"
         raise wrong(str(path), problem)
@@ -84,14 +86,14 @@ def read_netcdf_3(path: Path, budget: Budget) -> Content:
         for name, variable in file.variables.items():
             values: Any = variable.data
             values = np.asarray(values)
-            # In the vehicle's own order of bytes.
+            # In the computer's own byte order.
             values = values.astype(values.dtype.newbyteorder("="))
             sets.add(str(name), values, variable._attributes)
     return _content(sets)
 
 
 def read_matlab(path: Path, budget: Budget) -> Content:
-    """Read the arrays of a MATLAB file, those of structures and cells too."""
+    """Read the arrays of a MATLAB file, also in structures and cells."""
     from scipy.io import loadmat
 
     sets, objects = DataSets(budget), dict[str, str]()
@@ -103,7 +105,7 @@ def read_matlab(path: Path, budget: Budget) -> Content:
         if kind.names and "_Class" in kind.names:
             objects[name] = str(value.ravel()[0]["_Class"])  # a table, a timetable, ...
         elif kind.names or kind.kind == "O":
-            # Structures, or cells; in MATLAB's order, the columns first.
+            # Structures or cells, in MATLAB's column-major order.
             elements = value.ravel("F")[:MOST_ELEMENTS]
             for path, element in zip(_indexed(name, value.size), elements, strict=False):
                 for field in kind.names or ():
@@ -128,7 +130,7 @@ def read_matlab(path: Path, budget: Budget) -> Content:
 
 
 def _indexed(name: str, count: int) -> list[str]:
-    """A path for each element of a list; the name itself of a single one."""
+    """Return a path for each element of a list; the name itself for a single one."""
     return [name] if count == 1 else [f"{name}[{i}]" for i in range(min(count, MOST_ELEMENTS))]
 
 
@@ -138,16 +140,16 @@ def read_matlab_73(path: Path, budget: Budget) -> Content:
 
 
 def read_hdf5(path: Path, budget: Budget, between: str = "/") -> Content:
-    """Read the numbers of a file by the path of groups that leads to them, `log/roll`."""
+    """Read the numbers of a file by their path of groups, `log/roll`."""
     import h5py as library  # pyright: ignore[reportMissingImports]
 
     sets = DataSets(budget)
 
-    h5py: Any = library  # whose classes have no annotations
+    h5py: Any = library  # its classes have no annotations
     seen: set[int] = set()
 
     def visit(item: Any, name: str, depth: int) -> None:
-        """A group with all that is in it, or a data set; each object once, whatever leads to it."""
+        """Visit a group with its content, or a data set; each object once, whatever links to it."""
         address = h5py.h5o.get_info(item.id).addr
         if address in seen or depth > _DEEPEST:
             return
@@ -156,13 +158,13 @@ def read_hdf5(path: Path, budget: Budget, between: str = "/") -> Content:
             _data_set(path, sets, item, name)
         for key in item if isinstance(item, h5py.Group) else ():
             link = item.get(key, getlink=True)
-            # Of a damaged file a name need be no text.
+            # In a damaged file a name may be no text.
             leaf = key if isinstance(key, bytes) else key.encode("utf-8", "surrogateescape")
             leaf = leaf.decode("utf-8", "replace")
             if isinstance(link, h5py.ExternalLink):
                 problem = f"links to another file, {shown(link.filename)}: expected all data in one"
                 raise wrong(str(path), problem, shown(leaf))
-            # MATLAB keeps cells and arrays of structures in a group of its own, by numbers.
+            # MATLAB keeps cells and arrays of structures in a separate group, by numbers.
             if isinstance(link, h5py.HardLink) and not leaf.startswith("#"):
                 visit(item[key], f"{name}{between}{leaf}" if name else leaf, depth + 1)
 
@@ -177,7 +179,7 @@ def read_hdf5(path: Path, budget: Budget, between: str = "/") -> Content:
 
 
 def _data_set(path: Path, sets: DataSets, item: Any, name: str) -> None:
-    """Take in the numbers of one data set."""
+    """Add the numbers of one data set."""
     size, kind = int(item.size or 0), item.dtype
     if item.is_virtual or item.external:
         problem = "is kept in another file, expected its numbers in this one"
@@ -187,10 +189,10 @@ def _data_set(path: Path, sets: DataSets, item: Any, name: str) -> None:
     if not holds_numbers(kind, item.ndim):
         sets.leave_out(name, kind, item.shape)
     elif not text_of(item.attrs.get("NAME", "")).startswith(_NO_VARIABLE):
-        # A data set in pieces is unpacked a whole piece at a time.
+        # A chunked data set is unpacked one whole chunk at a time.
         sets.budget.require(int(np.prod(item.chunks or (0,), dtype=object)) * kind.itemsize)
         sets.budget.require(size * kind.itemsize)
-        # Other attributes are not read: they may be of types that h5py does not know.
+        # Other attributes are not read: they may have types that h5py does not know.
         counting = (*PACKING, *UNIT_ATTRIBUTES)
         attributes = {n: item.attrs[n] for n in counting if n in item.attrs}
         for field, values, own in _fields(name, np.asarray(item[()]), attributes):
@@ -200,13 +202,12 @@ def _data_set(path: Path, sets: DataSets, item: Any, name: str) -> None:
 def _fields(
     name: str, values: np.ndarray, attributes: Mapping[str, Any]
 ) -> Iterator[tuple[str, np.ndarray, Mapping[str, Any]]]:
-    """A data set, or the fields of its table as data sets in a group of its name, each with the
-    attributes that are its own."""
+    """Yield a data set, or the fields of its table as data sets, each with its own attributes."""
     names = values.dtype.names
     if names is None:
         yield name, values, attributes
         return
-    # What stands beside a table is of none of its fields, unless it is as many texts.
+    # A table's attribute belongs to its fields only if it has one text for each.
     stated = next((attributes[n] for n in UNIT_ATTRIBUTES if n in attributes), ())
     units = list(np.ravel(stated)) if np.size(stated) == len(names) else [""] * len(names)
     for field, unit in zip(names, units, strict=True):

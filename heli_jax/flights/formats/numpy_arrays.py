@@ -1,4 +1,4 @@
-"""Files of NumPy (.npy, .npz), without objects of Python."""
+"""NumPy files (.npy, .npz), without Python objects."""
 
 import io
 import zipfile
@@ -23,9 +23,9 @@ _MOST_ARRAYS = 1000
 
 
 def open_numpy(path: Path) -> ArrayTable:
-    """A file of NumPy: one array (.npy), or several by name (.npz).
+    """Read a NumPy file: one array (.npy), or several by name (.npz).
 
-    Without pickle, which would run what a file says: arrays of Python's objects are passed over.
+    Pickle is off, because it would run code in a file. Arrays of Python objects are left out.
     """
     where = str(path)
     data = read_regular(path, "a file of NumPy", LARGEST)
@@ -39,7 +39,7 @@ def open_numpy(path: Path) -> ArrayTable:
             shape, _, dtype = (header or np.lib.format.read_array_header_2_0)(file)
             if dtype.hasobject:
                 objects.append(name)
-            # What is claimed beyond the bytes that there are would be allocated.
+            # Sizes beyond the actual bytes are refused before they are allocated.
             elif np.prod(shape, dtype=object) * dtype.itemsize > len(content) or not dtype.itemsize:
                 raise ValueError("cut off")
             else:
@@ -56,7 +56,7 @@ def open_numpy(path: Path) -> ArrayTable:
 
 
 def _arrays(data: bytes, budget: Budget) -> Iterator[tuple[str, bytes]]:
-    """The arrays of a file by name, each as a .npy file has it."""
+    """Yield the arrays of a file by name, each as the content of a .npy file."""
     if data.startswith(MAGIC):
         yield "data", data
         return
@@ -79,7 +79,7 @@ def _add(sets: DataSets, name: str, array: np.ndarray) -> None:
             ticks = array.astype(np.int64).astype(np.float64)
             sets.add(name, np.where(np.isnat(array), np.nan, ticks), {"units": unit})
     elif holds_numbers(array.dtype, array.ndim):
-        # In the vehicle's own order of bytes.
+        # In the computer's own byte order.
         sets.add(name, array.astype(array.dtype.newbyteorder("=")), {})
     else:
         sets.leave_out(name, array.dtype, array.shape)

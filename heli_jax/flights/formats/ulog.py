@@ -1,4 +1,4 @@
-"""PX4 ULog files (.ulg), read by pyulog in a process of its own."""
+"""PX4 ULog files (.ulg), read by pyulog in a separate process."""
 
 import hashlib
 from collections.abc import Mapping
@@ -15,17 +15,17 @@ from heli_jax.regular_file import read_regular
 MAGIC = b"ULog\x01\x12\x35"
 _LARGEST = 2 * 10**9
 _FAR = 86_400_000_000
-"""us: a row whose stamp is a day from its topic's others is damage"""
+"""Distance [us] of a damaged stamp from its topic's others: a day."""
 _COMMANDS = ("actuator_", "vehicle_torque_setpoint", "vehicle_thrust_setpoint")
-"""topics whose `timestamp_sample` is that of the gyro's sample that they answer; commands act from
-when they are published"""
+"""Topics whose `timestamp_sample` is that of the gyro sample they react to; commands act when they
+are published."""
 
 
 def open_ulog(path: Path) -> ChannelLog:
     """Open the flight of a ULog file.
 
-    The times of a topic are `timestamp_sample`, when the sample was taken, if the topic has it;
-    otherwise, and for commands, `timestamp`, when it was published.
+    The times of a topic are `timestamp_sample`, when the sample was taken, if the topic has it.
+    Otherwise, and for commands, they are `timestamp`, when it was published.
     """
     data = read_regular(path, "a ULog file", _LARGEST)
     if len(data) < 16 or not data.startswith(MAGIC):
@@ -52,7 +52,7 @@ def open_ulog(path: Path) -> ChannelLog:
 
 
 def read_ulog(path: Path, budget: Budget) -> Content:
-    """Read all topics; their columns follow one another in the order of the facts' `topics`."""
+    """Read all topics; their columns are in the order of the facts' `topics`."""
     from pyulog import ULog
     from pyulog.exceptions import ULogIncompatibleFlagException
 
@@ -74,7 +74,7 @@ def read_ulog(path: Path, budget: Budget) -> Content:
         parts.setdefault((data.name, data.multi_id), []).append(columns)
     topics, arrays = [], []
     for (name, instance), rows in parts.items():
-        # A topic may be subscribed to more than once; its rows then follow one another.
+        # A topic may be subscribed to more than once; its rows are then joined.
         columns = {n: np.concatenate([part[n] for part in rows]) for n in rows[0]}
         several = sum(other == name for other, _ in parts) > 1
         shown = f"{name}[{instance}]" if several or instance else name
