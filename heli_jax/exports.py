@@ -1,5 +1,4 @@
-"""Results as the objects of other libraries: pandas, xarray, arviz; each imported where it is
-used.
+"""Results as the objects of other libraries: pandas, xarray; each imported where it is used.
 
 The classes whose methods call this import it, so that it imports none of them: their objects are
 `Any` here.
@@ -83,29 +82,3 @@ def trajectory_dataset(run: Any) -> "xr.Dataset":
     precision, cost = precision_of(run)
     attributes = {"precision": precision} | ({"precision_note": cost} if cost else {})
     return xr.Dataset(variables, coordinates, attributes)
-
-
-# arviz is an extra, so its class cannot be named here.
-def posterior_tree(
-    draws: Mapping[str, np.ndarray], statistics: Mapping[str, np.ndarray] | None = None
-) -> Any:
-    """Posterior draws, each (chains, draws), as arviz' inference data.
-
-    Args:
-        draws: of the group `posterior`.
-        statistics: of the group `sample_stats`; none unless given.
-
-    Raises:
-        ValueError: arviz is not installed.
-    """
-    try:
-        import arviz  # pyright: ignore[reportMissingImports]
-    except ImportError as e:
-        raise ValueError(
-            "to_arviz: arviz is not installed, expected the extra bayes: "
-            "pip install 'heli_jax[bayes]'"
-        ) from e
-    groups = {"posterior": dict(draws)}
-    if statistics:
-        groups["sample_stats"] = dict(statistics)
-    return arviz.from_dict(groups)

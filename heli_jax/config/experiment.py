@@ -385,7 +385,7 @@ def _found_by_fit(config: Config) -> tuple[str, ...]:
     """The parameters that a fit finds without any value at hand."""
     # A regression of the records needs no start, so neither the configuration nor the vehicle has
     # to have one.
-    if config.fit is None or config.fit.start.method == "given":
+    if config.fit is None or config.fit.start == "given":
         return ()
     return tuple(config.fit.free)
 

@@ -297,13 +297,13 @@ def _first_guesses(
     assert config is not None
     # Before its start is asked for: of what the model does not have there is none.
     known = naming.names(experiment.model.Params)
-    found = config.start.method == "equation-error"
+    found = config.start == "equation-error"
     asked = [n for n, f in free.items() if found or math.isnan(f.start)]
     words = f"model {experiment.model.name} has no parameter"
     require_known(asked, known, f"{path}: fit.free", words)
     # NaN stands for a start that was left out, and no optimiser gets anywhere from it.
     # In frequency a fit begins where it is told to; what it finds takes the place of that later.
-    if config.start.method != "equation-error":
+    if config.start != "equation-error":
         free = _from_vehicle(experiment, free)
         missing = [n for n, f in free.items() if math.isnan(f.start)]
         if missing:
@@ -316,13 +316,8 @@ def _first_guesses(
     # Not before it is needed: it takes a second to import.
     from heli_jax.identification.equation_error.start import equation_error_start
 
-    # Without stepwise selection every term stays in: to leave one out is a change of the model,
-    # which has to be asked for.
-    limits = (config.start.f_enter, config.start.f_remove) if config.start.stepwise else None
     with experiment.located("fit"):
-        guess = equation_error_start(
-            experiment.model, experiment.vehicle.params, flights, free, stepwise=limits
-        )
+        guess = equation_error_start(experiment.model, experiment.vehicle.params, flights, free)
     # A start and nothing more: noise and gusts bias a regression, so that bounds and priors stay as
     # they were stated.
     return {n: f._replace(start=guess.values[n].value) for n, f in free.items()}, guess
@@ -356,7 +351,7 @@ def _instrument_for(config: FitConfig, method: str) -> tuple[str, ...] | None:
     Args:
         config: whose `instrument` may be meant for the start, or for a method of `also`.
     """
-    others = [m for m in (config.start.method, *config.also) if m in METHODS]
+    others = [m for m in (config.start, *config.also) if m in METHODS]
     if objective_of(method).noise_model == "spectrum" or not any(
         objective_of(m).noise_model == "spectrum" for m in others
     ):
@@ -367,7 +362,7 @@ def _instrument_for(config: FitConfig, method: str) -> tuple[str, ...] | None:
 def _started_in_frequency(experiment: Experiment, problem: Problem) -> Problem:
     """The problem with the starts that `fit.start: frequency-error` finds; else as it is."""
     config = experiment.config.fit
-    if config is None or config.start.method != "frequency-error":
+    if config is None or config.start != "frequency-error":
         return problem
     # Not before it is needed: it imports the optimiser, which takes a second.
     from heli_jax.identification.frequency_start import frequency_error_start, started

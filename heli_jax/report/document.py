@@ -37,7 +37,6 @@ from heli_jax.identification.equation_error.start import (
     Equation,
     EquationErrorStart,
     StartValue,
-    Step,
 )
 from heli_jax.identification.estimation.multistart import StartRow
 from heli_jax.identification.fit import Fit
@@ -283,14 +282,6 @@ class HandlingToo(TypedDict):
     """null where no response was asked for"""
 
 
-class Stepwise(TypedDict):
-    """The terms that stepwise regression chose."""
-
-    selected: list[str]
-    steps: list[Step]
-    f_ratios: dict[str, float]
-
-
 class EquationErrorContent(TypedDict):
     """First guesses by equation error."""
 
@@ -299,7 +290,6 @@ class EquationErrorContent(TypedDict):
     smoothing_half_width_s: Annotated[float, "half_width"]
     not_measured: Annotated[list[str], "hidden"]
     """states that nothing measured shows"""
-    stepwise: Annotated[Stepwise | None, "selection"]
     sentences: Annotated[list[str], lambda start: sentences(start.findings)]
 
 
@@ -426,7 +416,7 @@ class FitFile(TypedDict):
     """predicted one sample ahead, of the flights that were fitted"""
     one_step_validation: Annotated[dict[str, Metrics], "fit.one_step_validation"]
     """the same of flights held out"""
-    acceptance: Annotated[list[Gate], lambda a: card(a.problem, a.fit, a.supplementary.responses)]
+    acceptance: Annotated[list[Gate], lambda a: card(a.fit, a.supplementary.responses)]
     """the lines of the acceptance card"""
     models: Annotated[CandidatesCompared | None, "supplementary.choice"]
     methods: Annotated[MethodsCompared | None, "supplementary.methods"]

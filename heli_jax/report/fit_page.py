@@ -95,7 +95,7 @@ def render(
         problem=problem,
         baseline=analysis.baseline,
         more=analysis.supplementary,
-        card=card(problem, fit, analysis.supplementary.responses),
+        card=card(fit, analysis.supplementary.responses),
         summary=summary,
         # The template asks this module for its rows.
         lines=lines(fit),

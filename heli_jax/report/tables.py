@@ -347,14 +347,13 @@ def choice(selection: Choice) -> Table:
     return Table(head, rows)
 
 
-def acceptance(lines: tuple[Gate, ...]) -> Table:
-    """The acceptance card: what, of what, value, gate, passed or failed, remark."""
-    words = {True: "✓ passed", False: "✗ failed", None: NOTHING}
+def acceptance(gates: tuple[Gate, ...]) -> Table:
+    """Return the acceptance card: name, subject, value, limit, passed or failed."""
     rows = [
-        (g.what, g.of, page_sentence(shown(g)), g.gate or NOTHING, words[g.passed], g.remark)
-        for g in lines
+        (g.what, g.of, page_sentence(shown(g)), g.gate, "✓ passed" if g.passed else "✗ failed")
+        for g in gates
     ]
-    return Table(("", "of", "value", "gate", "", "remark"), rows)
+    return Table(("", "of", "value", "gate", ""), rows)
 
 
 def residuals(fit: Fit, problem: Problem) -> Table:
@@ -505,12 +504,8 @@ def first_guess(start: Start) -> Table:
     """Return the table of start values, with the method that found each."""
     rows = []
     for name, v in start.values.items():
-        shown = with_sd(v.value, v.sd) if v.sd else number(v.value, 4)
-        ratio = NOTHING
-        if start.selection is not None and name in start.selection.f_ratios:
-            ratio = number(start.selection.f_ratios[name], 3)
-        rows.append((name, shown, v.unit, v.origin, ratio))
-    return Table(("parameter", "start", "unit", "from", "F-ratio"), rows)
+        rows.append((name, number(v.value, 4), v.unit, v.origin))
+    return Table(("parameter", "start", "unit", "from"), rows)
 
 
 def methods(comparison: MethodComparison) -> Table:

@@ -1,4 +1,4 @@
-"""Bootstrap: records about the estimated vehicle's response are identified again, many times."""
+"""Parametric bootstrap, and refits of a fit to other records."""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -25,19 +25,18 @@ from heli_jax.identification.uncertainty.autocorrelated_residuals import drawn
 from heli_jax.identification.unknowns.layout import Data, Layout, Solution, unpack, value_of
 
 _STEPS = 200
-"""of the optimiser at most, in frequency"""
+"""steps of the optimiser in frequency, at most"""
 
 
 class Refits(NamedTuple):
     """Estimates of many records."""
 
     values: dict[str, np.ndarray]
-    """by free parameter, (records,); NaN where a record did not converge"""
+    """by free parameter, (records,); NaN if a record did not converge"""
     converged: np.ndarray
-    """(records,); False too where an output has fewer than 8 measured samples"""
+    """(records,); False too if an output has fewer than 8 measured samples"""
     cost: np.ndarray
-    """(records,) sum of squares over the number of measured samples, by the noise of the fit: 1
-    where a record is as noisy, more where the model explains it less; NaN with too few samples"""
+    """(records,) mean square of the residuals over the fit's noise; NaN with too few samples"""
 
 
 def refit(
@@ -46,21 +45,19 @@ def refit(
     *,
     say: Callable[[str], None] = lambda _: None,
 ) -> Refits:
-    """Estimate the parameters of a fit anew from other records, side by side.
+    """Estimate the parameters of a fit from other records, in one batch.
 
-    Each record has the flights of the fit, of the same length and rate, with inputs and outputs of
-    its own; all else is the fit's, and all searches begin at its optimum. No verdict is made of a
-    record, and no interval.
+    Each record has flights of the same length and rate as the fit, with their own inputs and
+    outputs. All searches begin at the optimum of the fit.
 
     Args:
-        fit: with output error or filter error.
+        fit: by output error or filter error.
         records: each a Flight, or as many as the fit has.
-        say: called with a sentence where many records are not fitted by programs of machine code.
+        say: called with a sentence if many records are not fitted by compiled programs.
 
     Raises:
-        TypeError: a record that is no flights.
-        ValueError: a record is not like that of the fit, with what differs; a method that estimates
-            the noise's spectrum.
+        TypeError: a record is no flights.
+        ValueError: a record is unlike that of the fit, or the method is one in frequency.
     """
     at = fit.reached
     if at.layout.noise_model == "spectrum":
@@ -92,7 +89,7 @@ def refit(
 
 
 def _values(at: Solution, z: Any) -> dict[str, np.ndarray]:
-    """Return by free parameter (records,) at the unknowns (records, q)."""
+    """Return the free parameters (records,) at the unknowns z (records, q)."""
     z = jnp.asarray(z)
     return {
         n: np.asarray(value_of(at.layout, at.data, i, z[:, i]))
@@ -101,7 +98,7 @@ def _values(at: Solution, z: Any) -> dict[str, np.ndarray]:
 
 
 def _like(at: Solution, record: Any, where: str) -> list[Flight]:
-    """Return the flights of a record, which have to be like the fit's."""
+    """Return the flights of a record; raise if they are unlike those of the fit."""
     flights = [record] if isinstance(record, Flight) else record
     if not isinstance(flights, Sequence) or not all(isinstance(f, Flight) for f in flights):
         raise TypeError(f"{where}: expected a Flight or a list of them, got {record!r:.80}")
@@ -131,7 +128,7 @@ class Bootstrap(NamedTuple):
     failures: int
     """runs that did not converge"""
     records: tuple[int, ...] = ()
-    """the numbers of the records that these are of"""
+    """numbers of the records in `values`"""
 
     def interval(self, name: str) -> tuple[float, float]:
         """Return 2.5 and 97.5 % of the values."""
@@ -142,18 +139,18 @@ class Bootstrap(NamedTuple):
 def bootstrap(
     fit: Fit, runs: int = 200, *, seed: int = 0, say: Callable[[str], None] = lambda _: None
 ) -> Bootstrap:
-    """Refit records simulated with the estimates: same inputs, same missing samples, new noise.
+    """Refit records simulated with the estimates: same inputs and missing samples, new noise.
 
-    Filter error draws the disturbance anew. Output error adds white noise, or where its residuals
-    are autocorrelated, noise with their covariance over time and between outputs. Frequency error
-    draws residuals line by line, and estimates the spectrum anew.
+    Filter error draws a new disturbance. Output error adds white noise, or noise with the
+    covariance of autocorrelated residuals over time and between outputs. Frequency error draws
+    residuals line by line, and estimates the spectrum again.
 
     Args:
-        say: called with a sentence where many records are not fitted by programs of machine code.
+        say: called with a sentence if many records are not fitted by compiled programs.
 
     Raises:
-        ValueError: no run; the time shift is free in a fit in time, the data do not determine every
-            parameter, or responses are fitted, which have no residual at lines.
+        ValueError: no run, a free time shift in a fit in time, a parameter that is not
+            identifiable, or a fit of frequency responses.
     """
     if runs < 1:
         raise ValueError(f"bootstrap: expected at least 1 run, got {runs}")
@@ -166,7 +163,7 @@ def bootstrap(
     if fit.not_identifiable:
         raise ValueError(f"bootstrap: the data do not determine {', '.join(fit.not_identifiable)}")
     rng = np.random.default_rng(seed)
-    # Priors are measurements too, of another kind: their means are drawn anew as well.
+    # Priors are measurements: their means are drawn too.
     values = np.array([fit.estimates[n].value for n in at.layout.free])
     prior_sd = np.where(np.isfinite(at.data.prior_sd), at.data.prior_sd, 0.0)
     records = () if in_frequency else _records(fit, at, runs, seed, rng)
@@ -184,7 +181,7 @@ def bootstrap(
     else:
         optima = optimise_many(at, data, runs, (records, means), say)
         z, converged = optima.z, np.asarray(optima.converged)
-    # No nuisances: weak priors hold them, which are not drawn anew.
+    # Without the nuisances, whose weak priors are not drawn.
     fitted = np.flatnonzero(converged)
     estimates = _values(at, np.asarray(z)[fitted])
     return Bootstrap(estimates, runs - fitted.size, tuple(map(int, fitted)))
@@ -193,7 +190,7 @@ def bootstrap(
 def _records(
     fit: Fit, at: Solution, runs: int, seed: int, rng: np.random.Generator
 ) -> tuple[dict[str, Array], ...]:
-    """Draw by flight and output (runs, N); NaN where the record has it."""
+    """Return simulated outputs by flight, (runs, N); NaN where the record has it."""
     u = unpack(at.layout, at.data, at.z)
     noise_free = at.layout.objective.records(at, u, runs, seed)
     records = []
@@ -218,15 +215,15 @@ def _records(
 def _fit_by_lines(
     at: Solution, means: Float[Array, "runs p"], rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "runs q"], Bool[np.ndarray, " runs"]]:
-    """Fit drawn records one by one, each with its means of the priors and its own spectrum; return
-    the unknowns, and whether they converged."""
+    """Fit drawn records one by one, each with its own means of priors and spectrum; return the
+    unknowns and convergence."""
     z, converged = [], []
     begun = Optimum(
         at.z, jnp.zeros((), at.z.dtype), np.asarray(0), np.asarray(True), np.asarray(np.inf)
     )
     for mean, data in zip(means, _spectrum_records(at, rng), strict=False):
         search = _FromOptimum(at.layout, data._replace(prior_mean=mean))
-        # Steps of its search are none of the stage's, which counts records.
+        # The outer stage counts records.
         with stages.stage("one record", shown=False):
             best = relax_noise_covariance(search, at.noise, begun).best
         z.append(np.asarray(best.z))
@@ -236,7 +233,7 @@ def _fit_by_lines(
 
 
 class _FromOptimum(Search):
-    """The optimiser in the coordinates in which a fit ended, over other numbers."""
+    """The search in the final coordinates of a fit, with other data."""
 
     def __init__(self, layout: Layout, data: Data) -> None:
         self.problem: Any = None
@@ -245,19 +242,19 @@ class _FromOptimum(Search):
 
 
 def _spectrum_records(at: Solution, rng: np.random.Generator) -> Iterator[Data]:
-    """Yield the numbers of the problem, again and again with other noise.
+    """Yield the data of the problem with other noise, without end.
 
-    The model's response and the ends of each record stay, and every line gets a whitened residual
-    that another one had, with any phase, at the size that the spectrum gives it there (Franke and
-    Härdle, 1992, On bootstrapping kernel spectral estimates). Nothing is simulated in time.
+    The model's response and the ends of each record stay. Every line gets the whitened residual of
+    a random line, with a random phase, scaled by the spectrum (Franke and Härdle, 1992, On
+    bootstrapping kernel spectral estimates). Nothing is simulated in time.
     """
     layout, noise = at.layout, at.noise
     errors = jax.device_get(errors_of_lines(layout, at.data, noise, at.z).errors)
     records = records_of(layout)
-    # What the unknowns fit of the noise is missing in the residual.
+    # The residual lacks what the unknowns fit of the noise.
     rows = sum(2 * e.size for e in errors)
     freedom = (rows / max(rows - len(layout.of_interest), 1)) ** 0.5
-    # Flights of the same outputs share what is drawn from.
+    # Flights with the same outputs share one pool.
     white: dict[tuple[str, ...], list[np.ndarray]] = {}
     for record, e, W in zip(records, errors, noise.whitening, strict=True):
         whitened = (np.asarray(W) @ e[:, :, None])[:, :, 0]
