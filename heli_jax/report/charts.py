@@ -175,15 +175,6 @@ _STEPS = 65534
 """resolution of an array's range: far below a pixel, and below a hundredth of a percent"""
 
 
-class Logged(NamedTuple):
-    """Scale of a signal in the log: SI times a factor, plus an offset."""
-
-    unit: str
-    """or the column's name, where the log's numbers have no unit"""
-    factor: float
-    offset: float = 0.0
-
-
 class Numbers:
     """Arrays, charts and scenes of one page."""
 
@@ -191,11 +182,11 @@ class Numbers:
         self.arrays: list[dict[str, Any]] = []
         self.scenes: list[dict[str, Any]] = []
         self._known: dict[bytes, int] = {}
-        self._charts: list[tuple[Chart, dict[str, Logged]]] = []
+        self._charts: list[Chart] = []
 
-    def add_chart(self, chart: Chart, logged: dict[str, Logged] | None = None) -> int:
+    def add_chart(self, chart: Chart) -> int:
         """Keep a chart; its number on the page."""
-        self._charts.append((chart, logged or {}))
+        self._charts.append(chart)
         return len(self._charts) - 1
 
     def content(self) -> dict[str, Any]:
@@ -204,12 +195,12 @@ class Numbers:
         # lines there are. An input that five charts show counts once.
         lines = {
             hashlib.sha256(np.ascontiguousarray(s.y).tobytes()).digest(): s.y.size
-            for chart, _ in self._charts
+            for chart in self._charts
             for p in chart.panels
             for s in p.series
         }
         most = _most(list(lines.values()))
-        charts = [self._chart(chart, logged, most) for chart, logged in self._charts]
+        charts = [self._chart(chart, most) for chart in self._charts]
         return {"arrays": self.arrays, "charts": charts, "scenes": self.scenes}
 
     def array(self, values: np.ndarray, *, exact: bool = False) -> int:
@@ -226,13 +217,12 @@ class Numbers:
             self.arrays.append(_uniform(values) or (_single(values) if exact else _coarse(values)))
         return self._known[key]
 
-    def _chart(self, chart: Chart, logged: dict[str, Logged], most: int) -> dict[str, Any]:
+    def _chart(self, chart: Chart, most: int) -> dict[str, Any]:
         panels = []
         for p in chart.panels:
-            name, _, unit = p.label.partition(" [")
-            own = [unit.rstrip("]"), *logged[name]] if name in logged else None
+            name = p.label.partition(" [")[0]
             series = [self._series(s, most, name) for s in p.series if s.x.size]
-            content = {"series": series, "logged": own, "height": round(p.height * PIXELS)}
+            content = {"series": series, "height": round(p.height * PIXELS)}
             panels.append({**p._asdict(), **content})
         return {**chart._asdict(), "panels": panels}
 

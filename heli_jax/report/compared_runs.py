@@ -45,8 +45,8 @@ class ComparedRuns(NamedTuple):
 
     @property
     def estimates(self) -> Table:
-        """Each parameter's estimate and sd by run, those of each combination that a run determines
-        and of what flights share beside them, with the differences from the first."""
+        """Estimate and sd by run of parameters, determined combinations and shared nuisances, with
+        the differences from the first run."""
         first = self.labels[0]
         several = [f"{label} - {first} [sd]" for label in self.labels[1:]]
         rows, of_runs = [], self._by_run()
@@ -57,7 +57,6 @@ class ComparedRuns(NamedTuple):
                 _measured(e, run, with_unit=len(units) > 1)
                 for e, run in zip(estimates, self.runs, strict=True)
             ]
-            # Where an optimiser stopped on its way there is nothing to compare.
             pairs = zip(estimates, self.runs, strict=True)
             first_one, *others = (e if _arrived(run) else None for e, run in pairs)
             apart = [_difference(first_one, other) for other in others]
@@ -65,19 +64,19 @@ class ComparedRuns(NamedTuple):
         return Table(("parameter", *self.labels, *several, "unit"), rows)
 
     def _by_run(self) -> list[dict[str, Estimate]]:
-        """Each run's estimates, the combinations that one of the runs determines, then what all its
-        flights share beside them: gains, a time shift, the disturbance."""
+        """Return each run's estimates, the combinations that one of the runs determines, then
+        gains, the time shift and the disturbance."""
         by_run = []
         for run, combined in zip(self.runs, _combinations(self.runs), strict=True):
-            # What belongs to a flight has FLIGHT/ before its name.
+            # The name of a flight's own nuisance is FLIGHT/NAME.
             shared = {n: e for n, e in run.nuisance.items() if "/" not in n}
             by_run.append({**run.estimates, **combined, **shared})
         return by_run
 
     @property
     def agreement(self) -> Table:
-        """VAF, NRMSE fit and Theil's coefficient of every output by run, the held-out flights by
-        themselves."""
+        """VAF, NRMSE fit and Theil's coefficient by output and run, of fitted and held-out
+        flights."""
         rows = []
         for held_out in (False, True):
             of = [run.validation if held_out else run.metrics for run in self.runs]
@@ -90,15 +89,13 @@ class ComparedRuns(NamedTuple):
 
     @property
     def verdicts(self) -> Table:
-        """By run whether it converged, what the data determine, and whether the model is
-        adequate."""
+        """Convergence, identifiability and adequacy by run."""
         rows = [
             (
                 label,
                 run.model,
                 method_of(run),
                 run.status,
-                # What the data determine is a property of an optimum.
                 "No optimum was reached."
                 if run.status == "not-converged"
                 else " ".join(filter(None, (run.verdict, run.distrust))),
@@ -111,19 +108,13 @@ class ComparedRuns(NamedTuple):
 
     @property
     def notes(self) -> tuple[Finding, ...]:
-        """Notes on the differences and doubts about runs; subjects are labels of runs."""
+        """Notes and doubts; their subjects are labels of runs."""
         words = (
             "± is one standard deviation (sd), a 95 % interval about twice as far. Differences are "
-            "from the first run, in the sd that the two have together if nothing is common to them."
+            "from the first run, in the joint sd of independent estimates: runs that share a log "
+            "have correlated estimates, which differ by less by chance."
         )
-        notes, first, label = [note("compared.joint-sd", words)], self.runs[0], self.labels[0]
-        for other, run in zip(self.labels[1:], self.runs[1:], strict=True):
-            if _share_a_log(first, run):
-                words = (
-                    f"{label} and {other} share a log: their estimates are correlated, and differ "
-                    "by less than that by chance."
-                )
-                notes.append(note("compared.one-log", words, label, other))
+        notes, first = [note("compared.joint-sd", words)], self.runs[0]
         for label, run in zip(self.labels, self.runs, strict=True):
             doubts = {}
             if not _arrived(run):
@@ -143,20 +134,19 @@ class ComparedRuns(NamedTuple):
         return tuple(notes)
 
     def to_dataframe(self) -> "pd.DataFrame":
-        """Long: a row for each run and parameter, and for each combination that a run determines;
-        NaN where the data do not determine it or the fit did not converge."""
+        """Return a row for each run and parameter, or determined combination; NaN if it is not
+        identifiable or the fit did not converge."""
         from heli_jax.exports import runs_frame
 
         estimates = self._usable()
         return runs_frame(dict(zip(self.labels, estimates, strict=True)))
 
     def to_csv(self) -> str:
-        """As `to_dataframe`, as text; cells of what is not determined are empty, and those of fits
-        that did not converge."""
+        """Return `to_dataframe` as CSV."""
         return self.to_dataframe().to_csv(index=False, lineterminator="\n")
 
     def to_latex(self) -> str:
-        """The estimates as a table for a paper, with booktabs; its first line says what ± is."""
+        """Return the estimates as a LaTeX table (booktabs)."""
         head, rows = self.estimates
         lines = [
             "% estimate ± one standard deviation; [sd]: difference in joint standard deviations",
@@ -171,7 +161,7 @@ class ComparedRuns(NamedTuple):
         return "\n".join(lines) + "\n"
 
     def _usable(self) -> list[dict[str, Estimate]]:
-        """By run what `_by_run` has, without intervals where the optimiser stopped on its way."""
+        """Return `_by_run` without intervals of runs that did not converge."""
         none = {"sd": None, "lower95": None, "upper95": None}
         return [
             of_run if _arrived(run) else {name: e._replace(**none) for name, e in of_run.items()}
@@ -191,10 +181,10 @@ class ComparedRuns(NamedTuple):
 
 
 def compare_runs(runs: Sequence[str | Path | SavedFit]) -> ComparedRuns:
-    """Fits side by side.
+    """Compare fits.
 
     Args:
-        runs: run directories, or what `load_fit` read; two at least. Differences are from the
+        runs: run directories, or results of `load_fit`; two at least. Differences are from the
             first.
 
     Raises:
@@ -213,15 +203,14 @@ def _labels(directories: Sequence[Path]) -> tuple[str, ...]:
         labels = ["/".join(p[-depth:]) for p in paths]
         if len(set(labels)) == len(labels):
             return tuple(labels)
-    # The same directory twice: by their place.
+    # The same directory twice.
     return tuple(f"{p[-1]} ({i})" for i, p in enumerate(paths, 1))
 
 
 def _combinations(runs: Sequence[SavedFit]) -> list[dict[str, Estimate]]:
-    """By run the combinations that any of them determines without determining their parts.
+    """Return for each run the combinations that any of them determines.
 
-    A run that determines the parts themselves has them by its estimates, their correlations, and
-    the constants that it took as known; one that has neither lacks that entry.
+    A run that determines the parameters has them by its estimates, correlations and constants.
     """
     stated = [_stated(run) for run in runs]
     every = {n: c for of in stated for n, c in of.items()}
@@ -245,7 +234,7 @@ _NUMBERS = ("value", "sd", "lower95", "upper95")
 
 # Any: what fit.json holds.
 def _stated(run: SavedFit) -> dict[str, dict[str, Any]]:
-    """Return the combinations that a fit states to be determined; nothing without an optimum."""
+    """Return the determined combinations of a fit; none if it did not converge."""
     every = run.content.get("determined_combinations") or ()
     known = (c for c in every if all(c.get(key) is not None for key in _NUMBERS))
     return {c["name"]: c for c in known if _arrived(run)}
@@ -257,7 +246,7 @@ def _in_order(mappings: Any) -> list[str]:
 
 
 def method_of(run: SavedFit) -> str:
-    """The method, and by which inputs' instruments: such a fit is another estimator."""
+    """Return the method with the inputs that were taken by their instruments."""
     inputs = run.content.get("instruments") or ()
     return f"{run.method} by instrument ({', '.join(inputs)})" if inputs else run.method
 
@@ -272,7 +261,7 @@ def _measured(e: Estimate | None, run: SavedFit, *, with_unit: bool) -> str:
     if not _arrived(run):
         return NOT_CONVERGED
     if e.sd is None:
-        # Of a disturbance that does not show the size is zero.
+        # An insignificant disturbance has size zero.
         return "0" if e.at_bound and e.value == 0.0 else NOT_DETERMINED
     return with_sd(e.value, e.sd) + (f" {pretty(e.unit)}" if with_unit else "")
 
@@ -293,26 +282,8 @@ def _agreement(m: Metrics | None, key: str, text: Callable[[float | None], str])
     return text(getattr(m, key, None))
 
 
-def _share_a_log(first: SavedFit, second: SavedFit) -> bool:
-    """True if both runs were fitted to the same samples of a log, or to some of them."""
-    ours, others = (
-        [f for f in run.content["data"] if f.get("sha256") and not f.get("hold_out")]
-        for run in (first, second)
-    )
-    return any(
-        a["sha256"] == b["sha256"] and _overlap(a.get("window"), b.get("window"))
-        for a in ours
-        for b in others
-    )
-
-
-def _overlap(a: list[float] | None, b: list[float] | None) -> bool:
-    """True if two windows of a log overlap, or if one of them was not stored."""
-    return a is None or b is None or min(a[1], b[1]) > max(a[0], b[0])
-
-
 def _latex(text: str) -> str:
-    """Text of a page for LaTeX, as the copy button of a page's tables writes it."""
+    """Return text for LaTeX, as the copy button of a page's tables does."""
 
     def raised(m: re.Match[str]) -> str:
         return f"${r'\cdot 10' if m[1] else ''}^{{{lowered(m[2])}}}$"
@@ -324,7 +295,7 @@ _FILES = ("report.html", "fit.json", "signals.csv", "config.yaml")
 
 
 def write_page(path: Path, compared: ComparedRuns) -> None:
-    """The page, self-contained."""
+    """Write the self-contained page."""
 
     def link(file: Path) -> str:
         return urllib.parse.quote(os.path.relpath(file.absolute(), path.absolute().parent))

@@ -10,8 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heli_jax import units
-from heli_jax.flights.flight import Signal
 from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.identifiability.verdict import FACTOR
 from heli_jax.identification.problem import Problem
@@ -25,7 +23,7 @@ from heli_jax.identification.validation.metrics import metrics
 from heli_jax.numbers import measured, percent, vaf_percent
 from heli_jax.report import figures, tables
 from heli_jax.report.card import card, summary
-from heli_jax.report.charts import Logged, Numbers
+from heli_jax.report.charts import Numbers
 from heli_jax.report.figures.estimates import MOST
 from heli_jax.report.files import Analysis as Analysis
 from heli_jax.report.fitted_responses import FittedPair
@@ -62,11 +60,10 @@ def write_report(
     """
     folder = directory / "figures"
     folder.mkdir(parents=True, exist_ok=True)
-    numbers, shown, logged = Numbers(), list[Picture](), logged_units(analysis)
+    numbers, shown = Numbers(), list[Picture]()
     # Drawn here, one after the other: of many flights' figures one canvas is in memory at a time.
     for name, draw in drawings(analysis).items():
-        units = logged.get(name)
-        made = picture(name, draw, numbers, folder=folder, logged=units, png=png)
+        made = picture(name, draw, numbers, folder=folder, png=png)
         if made is not None:
             shown.append(made._replace(alt=alt_text(made, analysis)))
     page = render(analysis, title, vehicle_constants, shown, numbers, origin)
@@ -223,45 +220,6 @@ def _parts(flights: list[str]) -> list[str]:
 
 def _of(baseline: Baseline | None, pair: FittedPair) -> bool:
     return baseline is not None and (baseline.input, baseline.output) == (pair.input, pair.output)
-
-
-def logged_units(analysis: Analysis) -> dict[str, dict[str, Logged]]:
-    """By figure and signal how the log has it; signals that it has in SI are left out."""
-    fit, problem, _, _ = analysis
-    # In the order of the signals: the fitted flights first.
-    flights = [*problem.training, *(f for f in problem.flights if f.hold_out)]
-    parts, by_figure = _parts([s.flight for s in fit.signals]), {}
-    for signals, flight, part in zip(fit.signals, flights, parts, strict=True):
-        if flight.source is None:
-            continue
-        listed = {**flight.source.inputs, **flight.source.outputs}
-        factors = {n: logged for n, s in listed.items() if (logged := as_logged(s))}
-        for output in signals.measured:
-            own = factors.get(output)
-            # A difference of two numbers has no offset.
-            residual = {"residual": own._replace(offset=0.0)} if own else {}
-            by_figure[f"response{part}_{output}"] = factors | residual
-    return by_figure
-
-
-def as_logged(signal: Signal) -> Logged | None:
-    """Return the scale of a signal in the log; None if it is constant, or logged in SI."""
-    if signal.constant is not None:
-        return None
-    if signal.scale == 1.0 and not signal.offset and not signal.invert:
-        factor = from_si(signal)
-        return None if factor == 1.0 else Logged(signal.unit, factor)
-    # The configuration's unit is not the log's, as metres of a pulse width: the column says which.
-    zero, one = map(float, signal.from_si(np.array([0.0, 1.0])))
-    return Logged(signal.name, one - zero, zero)
-
-
-def from_si(signal: Signal) -> float:
-    """Return the factor from SI to the unit that the configuration states for a signal."""
-    try:
-        return 1.0 / units.factor(signal.unit, signal.si)
-    except ValueError:  # of no known unit: it was never converted
-        return 1.0
 
 
 def caption(picture: Picture) -> str:

@@ -200,17 +200,6 @@ def test_a_parameter_that_something_is_divided_by(tmp_path, vehicle):
     assert found["K"] == pytest.approx(-terms["Lda"] / terms["Lp"], rel=1e-4)
 
 
-def test_equations_that_are_finite_nowhere_are_said(tmp_path, monkeypatch):
-    (tmp_path / "lag.yaml").write_text(LAG)
-    model = linear_model(tmp_path / "lag.yaml").model
-    flight = record(n=300)
-    only = replace(flight, outputs={"p": flight.outputs["p"]})
-    monkeypatch.setattr("heli_jax.identification.equation_error.start._TRIED", (0.0,))
-    free = {"tau": UNKNOWN, "K": UNKNOWN}
-    with pytest.raises(ValueError, match="tau, K"):
-        equation_error_start(model, model.Params(math.nan, math.nan), [only], free)
-
-
 class Total(NamedTuple):
     total: Annotated[Scalar, "rad", "of both states"]
 

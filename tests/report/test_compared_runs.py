@@ -78,17 +78,6 @@ def test_what_did_not_converge_is_not_compared_and_one_log_is_said(tmp_path: Pat
     assert compared.estimates.rows[0][3] == "–"
     said = [(n.code, n.subjects) for n in compared.notes]
     assert ("compared.not-converged", ("a2",)) in said
-    assert ("compared.one-log", ("a1", "a2")) in said
-
-
-@pytest.mark.parametrize(("window", "shared"), [([10.0, 20.0], False), ([9.0, 20.0], True)])
-def test_parts_of_a_log_without_a_common_sample_are_independent(tmp_path, window, shared) -> None:
-    def run(name: str, part: list[float]) -> Path:
-        data = [{"flight": "flight 1", "hold_out": False, "sha256": "a", "window": part}]
-        return write_run(tmp_path / name, {"Ixx": (0.02, 0.001)}, data=data)
-
-    compared = compare_runs([run("a", [0.0, 10.0]), run("b", window)])
-    assert ("compared.one-log" in {n.code for n in compared.notes}) == shared
 
 
 def test_what_is_not_to_be_trusted_is_said_of_compared_and_listed_fits(tmp_path, capsys) -> None:

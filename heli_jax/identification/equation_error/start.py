@@ -219,9 +219,6 @@ _ROUNDS = 3
 """of regression, each with the residuals of the last for weights"""
 _NULL = 1e-5
 """singular value of unit columns below which parameters are exchangeable"""
-_TRIED = (1.0, 0.1, 10.0, 0.01, 100.0, -1.0, -0.1, -10.0)
-"""start values if none is known and the equations are not finite at zero"""
-
 Origin = Literal["equation error", "frequency error", "as stated", "vehicle"]
 
 
@@ -360,10 +357,8 @@ def _regression(
     }
     names = tuple(n for n in free if n not in constants)
     if not any(s.rows for s in structures):
-        if any(s.shown for s in structures):
-            raise _nothing("no equation of a measured state has a free parameter")
         measured = ", ".join({n: None for f in flights for n in f.outputs})
-        raise _nothing(f"no output ({measured}) shows a state by itself", ", or other outputs")
+        raise _nothing(f"no equation of a state that {measured} show has a free parameter")
     if not names:
         raise _nothing("all that is free are delays, or time constants of hidden states")
     for n, why in reasons.items():
@@ -381,10 +376,10 @@ def _regression(
     return Regression(model, base, names, records), half, reasons
 
 
-def _nothing(why: str, remedy: str = "") -> ValueError:
+def _nothing(why: str) -> ValueError:
     return ValueError(
         f"start: equation-error: nothing can be regressed, since {why}: expected a start of each "
-        f"free parameter{remedy}"
+        "free parameter"
     )
 
 
@@ -416,7 +411,6 @@ def _optimum(regression: Regression, keep_sign: set[str]) -> _Optimum:
     for _ in range(_ROUNDS - 1):
         rows = optimum.rows
         weights = {
-            # The floor bounds the weight of an equation without residual.
             name: w / max(float(np.sqrt(np.mean(rows.r[rows.equation == i] ** 2))), 1e-9)
             for i, (name, w) in enumerate(weights.items())
         }
@@ -430,24 +424,17 @@ def _optimum(regression: Regression, keep_sign: set[str]) -> _Optimum:
 def _first_search(
     regression: Regression, keep: np.ndarray, weights: Mapping[str, float]
 ) -> _Optimum:
-    """Return the best of searches from zero and from the known values."""
+    """Return the best of searches from zero, from the known values, and from one."""
     at_hand = np.array([regression.base[n] for n in regression.names])
-    known = np.isfinite(at_hand) & (at_hand != 0)
-    # Products of parameters may have two optima.
-    starts = [np.where(keep, np.where(known, at_hand, 1.0), 0.0)]
-    if known.any():
-        starts.append(np.where(known, at_hand, starts[0]))
-    runs = [search(regression, x, keep, weights) for x in starts]
-    if None in runs:
-        # A parameter is a divisor.
-        tries = [np.where(keep, np.where(known, at_hand, abs(x)), x) for x in _TRIED]
-        runs += [search(regression, x, keep, weights) for x in tries]
+    known = np.where(np.isfinite(at_hand) & (at_hand != 0), at_hand, 1.0)
+    # Products of parameters may have two optima, and a parameter may be a divisor.
+    starts = [np.where(keep, known, 0.0), known, np.where(keep, known, 1.0)]
+    runs = [search(regression, start, keep, weights) for start in starts]
     finite = [run for run in runs if run is not None]
     if not finite:
         raise ValueError(
-            "start: equation-error: the equations are not finite at any value tried of "
-            f"{', '.join(regression.names)} (zero, the vehicle's, {_TRIED[0]:g} and others): "
-            "expected a start of each free parameter"
+            "start: equation-error: the equations are not finite at zero, one and the vehicle's "
+            f"values of {', '.join(regression.names)}: expected a start of each free parameter"
         )
     return min(finite, key=lambda run: run.rows.cost)
 

@@ -102,7 +102,7 @@ def descend(
 SAME = 3.84
 """excess of the squares up to which a point fits as well: 95 % point of chi-squared"""
 _FACTOR = 1.5
-"""by which each unknown is moved, up and down"""
+"""by which each unknown is moved"""
 _MOVED = 0.3
 """least change of the logarithms of a combination's parameters"""
 _STAYS = 0.02
@@ -204,15 +204,14 @@ class Valley(NamedTuple):
             if not onto[i, i] > 1e-2:
                 continue
             powers = onto[i] / onto[i, i]
-            for factor in (_FACTOR, 1.0 / _FACTOR):
-                guess = {
-                    other.name: other.value * factor**power
-                    for other, power in zip(unknowns, powers.tolist(), strict=True)
-                    if other.name != u.name and abs(power) > 1e-6
-                }
-                point = self.visit({u.name: u.value * factor}, guess, same=True)
-                if point is not None and point.excess <= SAME:
-                    points.append(point.values)
+            guess = {
+                other.name: other.value * _FACTOR**power
+                for other, power in zip(unknowns, powers.tolist(), strict=True)
+                if other.name != u.name and abs(power) > 1e-6
+            }
+            point = self.visit({u.name: u.value * _FACTOR}, guess, same=True)
+            if point is not None and point.excess <= SAME:
+                points.append(point.values)
         return points
 
 

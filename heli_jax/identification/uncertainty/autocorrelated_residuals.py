@@ -77,9 +77,9 @@ def sandwich(
     whole = bread @ (J[first:].T @ J[first:] + sum(p.meat for p in parts)) @ bread
     plain = np.diag(whole)
     variance = plain + sum(p.variance - np.diag(bread @ p.meat @ bread) for p in parts)
-    uncertainty = sum(p.variance**2 / p.freedom for p in parts)
-    # Priors alone have a known variance.
-    freedom = variance**2 / np.maximum(uncertainty, 1e-12 * np.maximum(variance**2, 1e-300))
+    # A variance by priors alone is known.
+    positive = np.where(variance > 0, variance, 1.0)
+    freedom = 1.0 / np.maximum(sum((p.variance / positive) ** 2 / p.freedom for p in parts), 1e-12)
     # The corrected variances, with the correlations of the sandwich.
     factor = np.sqrt(np.divide(variance, plain, out=np.zeros_like(plain), where=plain > 0))
     by_white = np.where(np.diag(white) > 0, np.diag(white), 1.0)
