@@ -69,7 +69,7 @@ class Picture(NamedTuple):
     name: str
     title: str
     alt: str
-    """what the figure shows, in words and numbers"""
+    """text alternative"""
     chart: int | None = None
     """its number among the page's charts; None of an image"""
     image: str = ""

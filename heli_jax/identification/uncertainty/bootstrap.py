@@ -1,6 +1,6 @@
-"""Parametric bootstrap, and refits of a fit to other records."""
+"""Parametric bootstrap."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from heli_jax import naming, stages
-from heli_jax.flights.flight import Flight
+from heli_jax import stages
 from heli_jax.identification.estimation.frequency_lines import (
     errors_of_lines,
     in_time_of,
@@ -19,73 +18,12 @@ from heli_jax.identification.estimation.levenberg_marquardt import Optimum
 from heli_jax.identification.estimation.many_runs import optimise_many
 from heli_jax.identification.estimation.multistart import Search
 from heli_jax.identification.estimation.noise_covariance import relax_noise_covariance
-from heli_jax.identification.problem import FEWEST_SEEN
 from heli_jax.identification.result import Fit
 from heli_jax.identification.uncertainty.autocorrelated_residuals import drawn
 from heli_jax.identification.unknowns.layout import Data, Layout, Solution, unpack, value_of
 
 _STEPS = 200
 """steps of the optimiser in frequency, at most"""
-
-
-class Refits(NamedTuple):
-    """Estimates of many records."""
-
-    values: dict[str, np.ndarray]
-    """by free parameter, (records,); NaN if a record did not converge"""
-    converged: np.ndarray
-    """(records,); False too if an output has fewer than 8 measured samples"""
-    cost: np.ndarray
-    """(records,) mean square of the residuals over the fit's noise; NaN with too few samples"""
-
-
-def refit(
-    fit: Fit,
-    records: Sequence[Sequence[Flight] | Flight],
-    *,
-    say: Callable[[str], None] = lambda _: None,
-) -> Refits:
-    """Estimate the parameters of a fit from other records, in one batch.
-
-    Each record has flights of the same length and rate as the fit, with their own inputs and
-    outputs. All searches begin at the optimum of the fit.
-
-    Args:
-        fit: by output error or filter error.
-        records: each a Flight, or as many as the fit has.
-        say: called with a sentence if many records are not fitted by compiled programs.
-
-    Raises:
-        TypeError: a record is no flights.
-        ValueError: a record is unlike that of the fit, or the method is one in frequency.
-    """
-    at = fit.reached
-    if at.layout.noise_model == "spectrum":
-        raise ValueError(f"refit: not available with method {fit.method}")
-    if not records:
-        raise ValueError("refit: expected one record at least, got none")
-    flights = [_like(at, r, f"refit, record {k}") for k, r in enumerate(records)]
-
-    def stacked(signals: list[np.ndarray]) -> Array:
-        return jnp.asarray(np.stack(signals), at.z.dtype)
-
-    inputs, outputs = [], []
-    for i, own in enumerate(at.data.flights):
-        names = naming.names(at.layout.model.Inputs)
-        driven = {n: stacked([r[i].inputs[n] for r in flights]) for n in names}
-        inputs.append(at.layout.model.Inputs(**driven))
-        outputs.append({n: stacked([r[i].outputs[n] for r in flights]) for n in own.outputs})
-
-    def data(record: Any) -> Data:
-        each = zip(at.data.flights, *record, strict=True)
-        return at.data._replace(flights=tuple(f._replace(outputs=y, inputs=u) for f, y, u in each))
-
-    optima = optimise_many(at, data, len(flights), (tuple(outputs), tuple(inputs)), say)
-    seen = [[np.isfinite(y).sum() for f in r for y in f.outputs.values()] for r in flights]
-    enough = np.array([min(counts) >= FEWEST_SEEN for counts in seen])
-    converged = np.asarray(optima.converged) & enough
-    values = {n: np.where(converged, v, np.nan) for n, v in _values(at, optima.z).items()}
-    return Refits(values, converged, np.where(enough, np.asarray(optima.cost), np.nan))
 
 
 def _values(at: Solution, z: Any) -> dict[str, np.ndarray]:
@@ -95,29 +33,6 @@ def _values(at: Solution, z: Any) -> dict[str, np.ndarray]:
         n: np.asarray(value_of(at.layout, at.data, i, z[:, i]))
         for i, n in enumerate(at.layout.free)
     }
-
-
-def _like(at: Solution, record: Any, where: str) -> list[Flight]:
-    """Return the flights of a record; raise if they are unlike those of the fit."""
-    flights = [record] if isinstance(record, Flight) else record
-    if not isinstance(flights, Sequence) or not all(isinstance(f, Flight) for f in flights):
-        raise TypeError(f"{where}: expected a Flight or a list of them, got {record!r:.80}")
-    if len(flights) != len(at.data.flights):
-        raise ValueError(f"{where}: expected {len(at.data.flights)} flights, got {len(flights)}")
-    names = naming.names(at.layout.model.Inputs)
-    for flight, own, hold in zip(flights, at.data.flights, at.layout.holds, strict=True):
-        expected = {
-            "samples": (next(iter(own.outputs.values())).shape[0], flight.n_samples),
-            "dt": (float(own.dt), float(flight.dt)),
-            "inputs": (list(names), [n for n in names if n in flight.inputs]),
-            "outputs": (sorted(own.outputs), sorted(flight.outputs)),
-            "hold": (list(hold), [flight.hold.get(n) for n in names]),
-            "known": tuple({n: float(v) for n, v in f.known.items()} for f in (own, flight)),
-        }
-        for name, (value, got) in expected.items():
-            if value != got:
-                raise ValueError(f"{where}: expected {name} {value} as the fit has, got {got}")
-    return list(flights)
 
 
 class Bootstrap(NamedTuple):

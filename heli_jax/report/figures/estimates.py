@@ -105,16 +105,6 @@ def _interval_lines(draw: Callable[..., object], e: Estimate) -> None:
             draw(end, color=style.BLUE, lw=0.8, ls=":")
 
 
-def logarithmic(e: Estimate) -> bool:
-    """True if an estimate's interval reaches by equal factors and not by equal amounts."""
-    if e.lower95 is None or e.upper95 is None or not min(e.lower95, e.upper95) * e.value > 0:
-        return False
-    if not max(e.lower95, e.upper95) * e.value > 0:
-        return False
-    by_factors = abs(np.log(e.upper95 / e.value) + np.log(e.lower95 / e.value))
-    return bool(by_factors < abs(e.upper95 + e.lower95 - 2.0 * e.value) / abs(e.value))
-
-
 def gaussian_ellipse(fit: Fit, x: str, y: str) -> Float[np.ndarray, "2 n"] | None:
     """The curve within which 95 % of the fit's Gaussian approximation lie, of two parameters.
 
@@ -133,5 +123,7 @@ def gaussian_ellipse(fit: Fit, x: str, y: str) -> Float[np.ndarray, "2 n"] | Non
     curve = []
     for away, e in zip(unit, pair, strict=True):
         reach = _RADIUS * float(e.sd or 0.0) * away
-        curve.append(e.value * np.exp(reach / abs(e.value)) if logarithmic(e) else e.value + reach)
+        # By factors if the interval does not hold zero.
+        one_sign = (e.lower95 or 0.0) * (e.upper95 or 0.0) > 0.0
+        curve.append(e.value * np.exp(reach / abs(e.value)) if one_sign else e.value + reach)
     return np.array(curve)
