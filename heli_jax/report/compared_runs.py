@@ -58,7 +58,7 @@ class ComparedRuns(NamedTuple):
                 for e, run in zip(estimates, self.runs, strict=True)
             ]
             pairs = zip(estimates, self.runs, strict=True)
-            first_one, *others = (e if _arrived(run) else None for e, run in pairs)
+            first_one, *others = (e if _converged(run) else None for e, run in pairs)
             apart = [_difference(first_one, other) for other in others]
             rows.append((name, *cells, *apart, units.pop() if len(units) == 1 else ""))
         return Table(("parameter", *self.labels, *several, "unit"), rows)
@@ -117,15 +117,15 @@ class ComparedRuns(NamedTuple):
         notes, first = [note("compared.joint-sd", words)], self.runs[0]
         for label, run in zip(self.labels, self.runs, strict=True):
             doubts = {}
-            if not _arrived(run):
+            if not _converged(run):
                 doubts["not-converged"] = " did not converge: its numbers are no result."
                 if run is first:
                     doubts["not-converged"] += " Name one first that did: differences are from it."
             elif run.distrust:
                 doubts["not-trusted"] = f": {run.distrust}"
-            if _arrived(run) and run.adequate is False:
+            if _converged(run) and run.adequate is False:
                 doubts["not-adequate"] = " is not adequate: its intervals may be too narrow."
-            elif _arrived(run) and run.overconfident:
+            elif _converged(run) and run.overconfident:
                 doubts["overconfident"] = ": its sd are too small: its residuals are not white."
             notes += [
                 Finding(f"compared.{what}", "doubt", f"{label}{words}", subjects=(label,))
@@ -164,7 +164,7 @@ class ComparedRuns(NamedTuple):
         """Return `_by_run` without intervals of runs that did not converge."""
         none = {"sd": None, "lower95": None, "upper95": None}
         return [
-            of_run if _arrived(run) else {name: e._replace(**none) for name, e in of_run.items()}
+            of_run if _converged(run) else {name: e._replace(**none) for name, e in of_run.items()}
             for run, of_run in zip(self.runs, self._by_run(), strict=True)
         ]
 
@@ -237,7 +237,7 @@ def _stated(run: SavedFit) -> dict[str, dict[str, Any]]:
     """Return the determined combinations of a fit; none if it did not converge."""
     every = run.content.get("determined_combinations") or ()
     known = (c for c in every if all(c.get(key) is not None for key in _NUMBERS))
-    return {c["name"]: c for c in known if _arrived(run)}
+    return {c["name"]: c for c in known if _converged(run)}
 
 
 # Any: mappings of estimates or of metrics by name.
@@ -251,14 +251,14 @@ def method_of(run: SavedFit) -> str:
     return f"{run.method} by instrument ({', '.join(inputs)})" if inputs else run.method
 
 
-def _arrived(run: SavedFit) -> bool:
+def _converged(run: SavedFit) -> bool:
     return run.status != "not-converged"
 
 
 def _measured(e: Estimate | None, run: SavedFit, *, with_unit: bool) -> str:
     if e is None:
         return NOTHING
-    if not _arrived(run):
+    if not _converged(run):
         return NOT_CONVERGED
     if e.sd is None:
         # An insignificant disturbance has size zero.

@@ -1,7 +1,8 @@
 """fit.json: one table of its keys, by which it is written, checked and documented.
 
 A section is a class whose fields are keys. The value of a key is the attribute of its name, unless
-`Annotated` states another attribute or a function. `model_of` makes its pydantic model. A number that is not finite is null in the file.
+`Annotated` states another attribute or a function. `model_of` makes the pydantic model of a
+section. A number that is not finite is null in the file.
 """
 
 import functools
@@ -459,7 +460,7 @@ class FitFile(TypedDict):
     seed: Annotated[int, "fit.seed"]
 
 
-TOO: dict[type, type] = {
+ADDED_KEYS: dict[type, type] = {
     Estimate: Fixed,
     Feedback: FeedbackToo,
     ResponseAgreement: ResponsesToo,
@@ -482,8 +483,10 @@ def _shown(estimates: Mapping[str, Estimate], status: Status) -> dict[str, Any]:
     # A value along a null direction is arbitrary. Values of a fit that did not converge stay: they
     # may be the start of another.
     none: dict[str, Any] = dict.fromkeys(("value", "sd_white", "sd_alone"))
-    arrived = status != "not-converged"
-    return {n: e._replace(**none) if arrived and e.sd is None else e for n, e in estimates.items()}
+    converged = status != "not-converged"
+    return {
+        n: e._replace(**none) if converged and e.sd is None else e for n, e in estimates.items()
+    }
 
 
 def _adequate(fit: Fit) -> bool | None:
@@ -675,8 +678,8 @@ def _read(kind: Any) -> _Read:
 def _fields(section: Any) -> dict[str, tuple[Any, Callable[[Any], Any]]]:
     """Return by key its kind and the source of its value."""
     hints = typing.get_type_hints(section, include_extras=True)
-    if section in TOO:
-        hints |= typing.get_type_hints(TOO[section], include_extras=True)
+    if section in ADDED_KEYS:
+        hints |= typing.get_type_hints(ADDED_KEYS[section], include_extras=True)
     fields = {}
     for name, kind in hints.items():
         source: Any = name
@@ -748,7 +751,9 @@ def matching(text: str) -> list[Key]:
 
 
 def _walk(section: Any, path: str) -> Iterator[Key]:
-    stated = naming.texts(section) | (naming.texts(TOO[section]) if section in TOO else {})
+    stated = naming.texts(section) | (
+        naming.texts(ADDED_KEYS[section]) if section in ADDED_KEYS else {}
+    )
     for name, (kind, _) in _fields(section).items():
         place, read = f"{path}.{name}" if path else name, _read(kind)
         yield Key(place, read.words, stated.get(name, ""))

@@ -84,7 +84,10 @@ def plan_next_flight(problem: Problem, at: Solution, e: Evaluation) -> Plan | No
     candidates = _candidates(flight, m)
     if not candidates:
         return None
-    now, each = sensitivity_at(problem, at.layout, e), _flown(problem, at, i, candidates, m)
+    now, each = (
+        sensitivity_at(problem, at.layout, e),
+        _candidate_rows(problem, at, i, candidates, m),
+    )
     flights = layout.objective.tags(layout, at.data, len(now.shared)).flight
     once_more = now.part(flights == i)
     lacking = verdict_of(problem, layout, e).not_identifiable
@@ -114,7 +117,7 @@ def plan_next_flight(problem: Problem, at: Solution, e: Evaluation) -> Plan | No
     )
 
 
-def _flown(
+def _candidate_rows(
     problem: Problem, at: Solution, i: int, candidates: list[Candidate], m: int
 ) -> list[Sensitivity]:
     """Return the rows of each candidate, a flight of m samples that begins as the i-th one does."""

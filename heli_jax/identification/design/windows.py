@@ -174,7 +174,7 @@ def rank_windows(
         if layout.noise_model == "white":
             cut = tuple((-(-f.n_samples // m), m) for f, m in zip(flights, sizes, strict=True))
             layout = dataclasses.replace(layout, windows=cut, initial_state=True)
-            e = evaluate(layout, at.data, at.noise, _on_record(layout, at))
+            e = evaluate(layout, at.data, at.noise, _window_states(layout, at))
     s = sensitivity_at(problem, layout, e)
     s = s._replace(own=s.own / _prior_weights(layout, flights, samples, shooting=shooting))
     unknown = np.array([u.name in lacking for u in s.unknowns])
@@ -194,7 +194,7 @@ def rank_windows(
     if not usable:
         excluded = windows[0][0].excluded
         raise ValueError(f"no window of {samples} samples may be used: {excluded}")
-    taken, all_sd = _chosen(s.unknowns, usable, unknown)
+    taken, all_sd = _take_windows(s.unknowns, usable, unknown)
     sds = list(zip(every, flights, at.noise.sd, strict=True))
     return Ranking(
         tuple(u.name for u in s.unknowns),
@@ -227,7 +227,7 @@ def why_excluded(flight: Flight, first: int, last: int) -> str:
     return ""
 
 
-def _on_record(layout: Layout, at: Solution) -> Float[Array, " q"]:
+def _window_states(layout: Layout, at: Solution) -> Float[Array, " q"]:
     """Return the unknowns with each window's initial state from the simulation of the record."""
     z, every = np.asarray(at.z), naming.names(layout.model.State)
     own, of_states = [z[: layout.first_nuisance]], [every.index(n) for n in layout.states]
@@ -254,7 +254,7 @@ def _prior_weights(
     return np.concatenate(weights)
 
 
-def _chosen(
+def _take_windows(
     unknowns: tuple[Unknown, ...],
     usable: list[tuple[Window, np.ndarray]],
     unknown: Float[np.ndarray, " q"],

@@ -88,7 +88,7 @@ class Regression(NamedTuple):
             try:
                 with np.errstate(all="ignore"):
                     matrices = coefficients(self.model, known, self.names, values)
-                    x = _of_flight(flight, matrices, weight)
+                    x = _flight_residuals(flight, matrices, weight)
             except (ValueError, np.linalg.LinAlgError):  # an infinite matrix or signal
                 return None
             index = [self.equations.index(n) for n in equations]
@@ -98,7 +98,7 @@ class Regression(NamedTuple):
             return rows if np.isfinite(rows.cost) and np.isfinite(rows.J).all() else None
 
 
-def _of_flight(
+def _flight_residuals(
     record: Record, matrices: Float[np.ndarray, "r c 1+q"], weight: Float[np.ndarray, "e 1 1"]
 ) -> Float[np.ndarray, "en 1+q"]:
     """Return the weighted residuals of a flight and their derivatives, equation by equation."""
@@ -312,7 +312,7 @@ def equation_error_start(
         _require_value(regression.base, name, reasons[name])
         regression = regression._replace(names=tuple(n for n in regression.names if n != name))
         if not regression.names:
-            raise _nothing("the equations determine none of the free parameters")
+            raise _no_regression("the equations determine none of the free parameters")
         optimum = _optimum(regression, keep)
     structures, rows = [one.structure for one in regression.records], optimum.rows
     equations = []
@@ -358,9 +358,9 @@ def _regression(
     names = tuple(n for n in free if n not in constants)
     if not any(s.rows for s in structures):
         measured = ", ".join({n: None for f in flights for n in f.outputs})
-        raise _nothing(f"no equation of a state that {measured} show has a free parameter")
+        raise _no_regression(f"no equation of a state that {measured} show has a free parameter")
     if not names:
-        raise _nothing("all that is free are delays, or time constants of hidden states")
+        raise _no_regression("all that is free are delays, or time constants of hidden states")
     for n, why in reasons.items():
         _require_value(base, n, why)
     half, records = kernel_width(flights), []
@@ -369,14 +369,14 @@ def _regression(
         records.append(record(model, flight, shown, half, late))
     records = tuple(one for one in records if one.segments and one.structure.rows)
     if not records:
-        raise _nothing(
+        raise _no_regression(
             "no stretch without missing samples is as long as the smoothing needs "
             f"({shortest(half)} samples)"
         )
     return Regression(model, base, names, records), half, reasons
 
 
-def _nothing(why: str) -> ValueError:
+def _no_regression(why: str) -> ValueError:
     return ValueError(
         f"start: equation-error: nothing can be regressed, since {why}: expected a start of each "
         "free parameter"

@@ -4,9 +4,7 @@ It works in relative coordinates: log |value| for parameters of one sign, value 
 those that may be zero. Initial states and biases are projected out first.
 """
 
-import math
-from collections.abc import Collection, Mapping
-from types import MappingProxyType
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -21,8 +19,8 @@ from heli_jax.identification.identifiability.directions import (
     projected,
     row_reduced,
     unit_vector,
-    with_further,
-    with_too_wide,
+    with_new_directions,
+    with_wide_intervals,
     without_effect,
 )
 from heli_jax.identification.identifiability.equivalents import Valley
@@ -136,8 +134,6 @@ class Around(NamedTuple):
     """tests combinations far from the point; without it there are none"""
     one_sided: tuple[str, ...] = ()
     """the parameters that the likelihood does not bound within the factor of ten"""
-    limits: Mapping[str, tuple[float, float]] = MappingProxyType({})
-    """95 % interval by the likelihood of parameters for which it is not quadratic"""
     reported: np.ndarray | None = None
     """covariance (q, q) of the reported intervals if residuals are not white, in the optimiser's
     coordinates; for `analyse` in relative ones"""
@@ -203,16 +199,18 @@ def analyse(
     if not total.null:
         # The intervals are those of the fit, with the weak priors.
         covariance = directions(np.vstack([sensitivity, np.diag(own)]), scale, 0.0).covariance
-    null = with_too_wide(total.null, total.covariance, unknowns)
-    null = with_further(null, _further(total.covariance, covariance, unknowns, around))
+    null = with_wide_intervals(total.null, total.covariance, unknowns)
+    null = with_new_directions(
+        null, _additional_null_directions(total.covariance, covariance, unknowns, around)
+    )
     reported = covariance
     if around.reported is not None:
         reported = around.reported
-        null = with_too_wide(null, reported, unknowns)
+        null = with_wide_intervals(null, reported, unknowns)
     # Without a null direction: those that the data alone leave.
     resting = []
     if not null and own.any():
-        resting = with_too_wide(data.null, data.covariance, unknowns)
+        resting = with_wide_intervals(data.null, data.covariance, unknowns)
     dead = without_effect(sensitivity, unknowns)
     of_rows = (sensitivity, without_weak)
     groups = _groups(null, reported, unknowns, of_rows, around, dead)
@@ -248,13 +246,14 @@ def analyse(
         roughly=tuple(
             u.name
             for u, sd in zip(unknowns, sds, strict=True)
-            if u.name not in (*undetermined, *dead) and _is_rough(u, sd, around.limits)
+            if u.name not in (*undetermined, *dead)
+            and ((u.logarithmic and sd > _ROUGHLY) or (u.symmetric and Z95 * sd >= u.distance))
         ),
         second=around.second,
     )
 
 
-def _further(
+def _additional_null_directions(
     bare: np.ndarray, covariance: np.ndarray, unknowns: tuple[Unknown, ...], around: Around
 ) -> list[np.ndarray]:
     """Return null directions whose intervals are short, by covariances (q, q) without the weak
@@ -299,7 +298,7 @@ def _groups(
         mine, members = list(rows[labels == k]), parts[labels == k].any(axis=0)
         tied, exchanged = (), []
         if around.valley is not None:
-            tied = around.valley.tied(mine, covariance, unknowns)
+            tied = around.valley.determined_combinations(mine, covariance, unknowns)
         if without_weak is not None:
             exchanged = [n for v in mine for n in without_weak.exchanged(v, sensitivity)]
         names = tuple(unknowns[i].name for i in np.flatnonzero(members))
@@ -322,13 +321,3 @@ def _prior_share(covariance: np.ndarray, bare: np.ndarray) -> np.ndarray:
     of_data = np.sum((bare @ covariance) ** 2, axis=0)
     share = 1.0 - of_data / np.where(variance > 0, variance, 1.0)
     return np.clip(np.where(variance > 0, share, 0.0), 0.0, 1.0)
-
-
-def _is_rough(u: Unknown, sd: float, limits: Mapping[str, tuple[float, float]]) -> bool:
-    """True if a 95 % interval (that of `limits`, if any) is wide or holds zero."""
-    low, high = limits.get(u.name, (math.nan, math.nan))
-    if u.symmetric and (low <= 0.0 <= high if u.name in limits else Z95 * sd >= u.distance):
-        return True
-    if u.name in limits and u.logarithmic:
-        sd = max(abs(math.log(end / u.value)) for end in (low, high)) / Z95
-    return u.logarithmic and sd > _ROUGHLY

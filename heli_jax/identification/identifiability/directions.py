@@ -85,7 +85,7 @@ def without_effect(sensitivity: np.ndarray, unknowns: tuple[Unknown, ...]) -> tu
     return tuple(u.name for u, s in zip(unknowns, sizes, strict=True) if not s > least)
 
 
-def with_too_wide(
+def with_wide_intervals(
     null: list[np.ndarray], covariance: np.ndarray, unknowns: tuple[Unknown, ...]
 ) -> list[np.ndarray]:
     """Return the null directions, and those of unknowns whose 95 % interval by the covariance
@@ -98,10 +98,10 @@ def with_too_wide(
     ]
     # The widest first. Its column is the regression of the others on it.
     far.sort(key=lambda i: -covariance[i, i])
-    return with_further(null, [covariance[:, i] for i in far])
+    return with_new_directions(null, [covariance[:, i] for i in far])
 
 
-def with_further(null: list[np.ndarray], others: list[np.ndarray]) -> list[np.ndarray]:
+def with_new_directions(null: list[np.ndarray], others: list[np.ndarray]) -> list[np.ndarray]:
     """Return the null directions, and those others whose largest component is in none of them."""
     for v in map(unit_vector, others):
         if all(abs(w[np.argmax(np.abs(v))]) <= TAKES_PART for w in null):

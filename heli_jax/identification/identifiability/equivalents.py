@@ -2,8 +2,8 @@
 
 One search serves all: some values are set elsewhere, all other unknowns follow (`Valley.visit`),
 and the sum of squares shows whether the point fits as well. The values come from null directions
-(`Valley.tied`), from an exchange of two modes (`second_solutions`), or from the aliases of a fast
-mode (`validation.logging_rate`).
+(`Valley.determined_combinations`), from an exchange of two modes (`second_solutions`), or from the
+aliases of a fast mode (`validation.logging_rate`).
 """
 
 import itertools
@@ -174,7 +174,7 @@ class Valley(NamedTuple):
         expected = squares_of(np.asarray(self.e.J, np.float64) @ (z - np.asarray(self.at.z)))
         return Point({n: float(v) for n, v in zip(names, values, strict=True)}, excess, expected)
 
-    def tied(
+    def determined_combinations(
         self, null: Sequence[np.ndarray], covariance: np.ndarray, unknowns: tuple[Unknown, ...]
     ) -> tuple[Combination, ...]:
         """Return the products of powers, else the sums, that are constant along null directions,

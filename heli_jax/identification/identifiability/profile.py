@@ -16,7 +16,7 @@ import numpy as np
 
 from heli_jax.identification.estimation.evaluation import Evaluation, pseudoinverse
 from heli_jax.identification.estimation.levenberg_marquardt import measured_count
-from heli_jax.identification.identifiability.analysis import Around, unknowns_of
+from heli_jax.identification.identifiability.analysis import unknowns_of
 from heli_jax.identification.identifiability.equivalents import (
     Rows,
     descend,
@@ -135,21 +135,24 @@ def _line(at: Solution, here: Rows, i: int) -> _Line:
     return _Line(at, i, along / along[i], math.sqrt(along[i]), squares_of(here.r))
 
 
-def beyond_slopes(
+def profile_wide_intervals(
     problem: Problem,
     at: Solution,
     e: Evaluation,
     verdict: Verdict,
     reaches: np.ndarray,
-    around: Around,
-) -> Around:
-    """Profile the parameters whose intervals are wide; return `around` itself if there are none.
+) -> tuple[dict[str, tuple[float, float]], tuple[str, ...]]:
+    """Profile the parameters whose intervals are wide.
 
     Args:
         reaches: (q,) sds of white residuals that a 95 % interval of each unknown reaches.
+
+    Returns:
+        95 % intervals of parameters for which the likelihood is not quadratic, and parameters that
+        it does not bound within the factor of ten.
     """
     if not (np.isfinite(e.r).all() and np.isfinite(e.J).all()):
-        return around
+        return {}, ()
     lacking = verdict.not_identifiable
     sds = np.sqrt(np.maximum(np.diag(verdict.covariance), 0.0))
     # What is open already follows any other unknown.
@@ -169,9 +172,7 @@ def beyond_slopes(
         elif any(abs(t) != reach * line.sd for t in bounded):
             low, high = sorted(line.value(t) for t in bounded)
             limits[u.name] = (low, high)
-    if not (limits or one_sided):
-        return around
-    return around._replace(limits=limits, one_sided=tuple(one_sided))
+    return limits, tuple(one_sided)
 
 
 def _is_wide(problem: Problem, u: Unknown, reach: float) -> bool:

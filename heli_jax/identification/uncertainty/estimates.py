@@ -64,7 +64,7 @@ def size_deviations(at: Solution, e: Evaluation) -> dict[str, float]:
     return dict(zip(layout.sizes, map(float, sds), strict=True))
 
 
-_SAYS_NOTHING = 1e3
+_UNBOUNDED = 1e3
 """factor to either side of an interval from which on a disturbance's parameter is not
 identifiable"""
 _LARGEST = 700.0
@@ -154,7 +154,7 @@ def flight_nuisances(
     for i, name in enumerate(layout.noises, len(layout.of_interest)):
         value, factor = float(disturbance[name]), float(np.exp(min(reaches[i], _LARGEST)))
         numbers = (value * float(sds[i]), value / factor, value * factor)
-        if factor >= _SAYS_NOTHING:
+        if factor >= _UNBOUNDED:
             numbers = (None, None, None)
         unit = naming.unit(layout.model.Params, name) or ""
         estimates[name] = Estimate(value, *numbers, unit, starts[name].start, 0.0, False)

@@ -22,7 +22,7 @@ from jaxtyping import Float
 from heli_jax.identification.estimation.evaluation import Evaluation, deviations, evaluate
 from heli_jax.identification.identifiability.analysis import Around, verdict_of
 from heli_jax.identification.identifiability.equivalents import Valley
-from heli_jax.identification.identifiability.profile import beyond_slopes
+from heli_jax.identification.identifiability.profile import profile_wide_intervals
 from heli_jax.identification.identifiability.verdict import Z95, SecondSolution, Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.uncertainty.autocorrelated_residuals import (
@@ -32,7 +32,7 @@ from heli_jax.identification.uncertainty.autocorrelated_residuals import (
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.messages import sentence
 
-_LEFT = 10.0
+_DIVERGES = 10.0
 """variance of a simulation's error over that of the signal from which on it diverges"""
 _MORE = 1.5
 """sd by the inputs alone over that by all rows from which on the disturbance has information"""
@@ -82,7 +82,7 @@ def standard_errors(
     if inputs is not None:
         plain = around._replace(valley=None)
         by_all, by_inputs = (verdict_of(problem, at.layout, rows, plain) for rows in (e, inputs))
-        resting, more = by_disturbance(by_all, by_inputs)
+        resting, more = resting_on_disturbance(by_all, by_inputs)
         # A disturbance of one output moves the others, which respond to a measured motion. With one
         # output only its spectrum is known.
         spectrum_alone = all(len(outputs) == 1 for outputs in at.layout.outputs)
@@ -97,14 +97,14 @@ def standard_errors(
     errors = _by_slopes(problem, at, by, before, around, white=white)
     if optimum:
         reaches = errors.wider * errors.quantiles
-        beyond = beyond_slopes(problem, at, e, errors.verdict, reaches, around)
+        limits, one_sided = profile_wide_intervals(problem, at, e, errors.verdict, reaches)
         if by is not e:
             # The likelihood has the information of the disturbance too.
-            limits = {n: ends for n, ends in beyond.limits.items() if n not in more}
-            beyond = beyond._replace(limits=limits)
-        if beyond is not around:
-            errors = _by_slopes(problem, at, by, before, beyond, white=white)
-            errors = errors._replace(limits=beyond.limits)
+            limits = {n: ends for n, ends in limits.items() if n not in more}
+        if one_sided:
+            around = around._replace(one_sided=one_sided)
+            errors = _by_slopes(problem, at, by, before, around, white=white)
+        errors = errors._replace(limits=limits)
     verdict = replace(errors.verdict, remarks=remarks)
     return errors._replace(verdict=verdict, by=None if by is e else by)
 
@@ -151,7 +151,7 @@ def through_inputs(at: Solution, e: Evaluation) -> Evaluation | None:
         return None
     pairs = list(zip(at.data.flights, e.simulated, strict=True))
     if any(
-        _left(np.asarray(y), np.asarray(simulated[n]))
+        _diverges(np.asarray(y), np.asarray(simulated[n]))
         for flight, simulated in pairs
         for n, y in flight.outputs.items()
         if np.nanstd(np.asarray(y)) > 0
@@ -186,7 +186,7 @@ def through_inputs(at: Solution, e: Evaluation) -> Evaluation | None:
     return e._replace(J=np.vstack([*alone, J]))
 
 
-def by_disturbance(by_all: Verdict, by_inputs: Verdict) -> tuple[list[str], list[str]]:
+def resting_on_disturbance(by_all: Verdict, by_inputs: Verdict) -> tuple[list[str], list[str]]:
     """Return the parameters that only all rows determine, and those with a far larger sd by the
     inputs alone."""
     known, alone = by_all.not_identifiable, by_inputs.not_identifiable
@@ -197,8 +197,8 @@ def by_disturbance(by_all: Verdict, by_inputs: Verdict) -> tuple[list[str], list
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def _left(measured: np.ndarray, simulated: np.ndarray) -> bool:
+def _diverges(measured: np.ndarray, simulated: np.ndarray) -> bool:
     """True if a simulation (N,) diverges from the measurement (N,), NaN where missing."""
     seen = ~np.isnan(measured)
     error = (measured - simulated)[seen]
-    return not float(np.var(error)) <= _LEFT * float(np.var(measured[seen]))
+    return not float(np.var(error)) <= _DIVERGES * float(np.var(measured[seen]))
