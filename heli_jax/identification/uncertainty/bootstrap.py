@@ -26,15 +26,6 @@ _STEPS = 200
 """steps of the optimiser in frequency, at most"""
 
 
-def _values(at: Solution, z: Any) -> dict[str, np.ndarray]:
-    """Return the free parameters (records,) at the unknowns z (records, q)."""
-    z = jnp.asarray(z)
-    return {
-        n: np.asarray(value_of(at.layout, at.data, i, z[:, i]))
-        for i, n in enumerate(at.layout.free)
-    }
-
-
 class Bootstrap(NamedTuple):
     """Estimates from simulated records."""
 
@@ -98,7 +89,11 @@ def bootstrap(
         z, converged = optima.z, np.asarray(optima.converged)
     # Without the nuisances, whose weak priors are not drawn.
     fitted = np.flatnonzero(converged)
-    estimates = _values(at, np.asarray(z)[fitted])
+    z = jnp.asarray(np.asarray(z)[fitted])
+    estimates = {
+        n: np.asarray(value_of(at.layout, at.data, i, z[:, i]))
+        for i, n in enumerate(at.layout.free)
+    }
     return Bootstrap(estimates, runs - fitted.size, tuple(map(int, fitted)))
 
 
