@@ -33,11 +33,11 @@ class Ablation(NamedTuple):
     """of the same arguments"""
 
 
-def _untied(valley: Any, null: Any, covariance: Any, unknowns: Any) -> Any:
+def _untied(valley: Any, null: Any, spread: Any, unknowns: Any) -> Any:
     """What slopes alone say, without a look far from the optimum."""
     from heli_jax.identification.identifiability.directions import combinations
 
-    return combinations(null, covariance, unknowns)
+    return combinations(null, spread, unknowns)
 
 
 ABLATIONS: tuple[Ablation, ...] = (

@@ -4,6 +4,7 @@ It works in relative coordinates: log |value| for parameters of one sign, value 
 those that may be zero. Initial states and biases are projected out first.
 """
 
+import math
 from collections.abc import Collection
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ from heli_jax.flights.flight import labels
 from heli_jax.identification.estimation.evaluation import NULL, Evaluation
 from heli_jax.identification.identifiability.directions import (
     TAKES_PART,
+    Spread,
     WithoutWeakPriors,
     directions,
     projected,
@@ -213,8 +215,18 @@ def analyse(
         resting = with_wide_intervals(data.null, data.covariance, unknowns)
     dead = without_effect(sensitivity, unknowns)
     of_rows = (sensitivity, without_weak)
-    groups = _groups(null, reported, unknowns, of_rows, around, dead)
-    resting_groups = _groups(resting, data.covariance, unknowns, of_rows, around)
+
+    def spread(C: np.ndarray) -> Spread:
+        """Return the sd of a sum, as much wider as the reported one is."""
+
+        def sd(along: np.ndarray) -> float:
+            wider = (along @ reported @ along) / max(along @ covariance @ along, 1e-300)
+            return math.sqrt(max(0.0, float(wider * (along @ C @ along))))
+
+        return sd
+
+    groups = _groups(null, spread(covariance), unknowns, of_rows, around, dead)
+    resting_groups = _groups(resting, spread(data.covariance), unknowns, of_rows, around)
     moved = np.abs(null).max(axis=0) if null else np.zeros(len(unknowns))
     changed = {n for other in around.second for n in other.changed}
     undetermined = [
@@ -274,7 +286,7 @@ def _additional_null_directions(
 
 def _groups(
     null: list[np.ndarray],
-    covariance: np.ndarray,
+    spread: Spread,
     unknowns: tuple[Unknown, ...],
     of_rows: tuple[np.ndarray, WithoutWeakPriors | None],
     around: Around,
@@ -298,7 +310,7 @@ def _groups(
         mine, members = list(rows[labels == k]), parts[labels == k].any(axis=0)
         tied, exchanged = (), []
         if around.valley is not None:
-            tied = around.valley.determined_combinations(mine, covariance, unknowns)
+            tied = around.valley.determined_combinations(mine, spread, unknowns)
         if without_weak is not None:
             exchanged = [n for v in mine for n in without_weak.exchanged(v, sensitivity)]
         names = tuple(unknowns[i].name for i in np.flatnonzero(members))

@@ -6,7 +6,7 @@ than a factor of ten.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -147,18 +147,18 @@ _LARGEST = 700.0
 """log of the largest value: exp overflows at 709"""
 
 
+type Spread = Callable[[np.ndarray], float]
+"""standard deviation of a weighted sum (q,) of relative coordinates"""
+
+
 def combinations(
     null: Sequence[np.ndarray],
-    covariance: np.ndarray,
+    spread: Spread,
     unknowns: tuple[Unknown, ...],
     units: Mapping[str, str | None] | None = None,
 ) -> tuple[Combination, ...]:
     """Return the products of powers that do not change along the null directions (q,), or with
-    `units` the sums of parameters of one unit.
-
-    Args:
-        covariance: (q, q) in relative coordinates.
-    """
+    `units` the sums of parameters of one unit."""
     # From a relative coordinate to log |value|, or for sums to the value.
     to = np.array([u.per_log for u in unknowns])
     if units is not None:
@@ -192,9 +192,7 @@ def combinations(
         by_name = {u.name: float(w) for u, w in zip(unknowns, weights, strict=True) if w}
         values = {u.name: u.value for u in members}
         made = _product if units is None else _sum
-        along = weights * to
-        sd = math.sqrt(max(0.0, float(along @ covariance @ along)))
-        found.append(made(by_name, values, sd))
+        found.append(made(by_name, values, spread(weights * to)))
     return tuple(c for c in found if c.is_bounded)
 
 

@@ -20,7 +20,7 @@ from heli_jax.analysis.linear import linearize
 from heli_jax.analysis.operating_point import operating_point
 from heli_jax.identification.estimation.evaluation import Evaluation, named
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
-from heli_jax.identification.identifiability.directions import combinations
+from heli_jax.identification.identifiability.directions import Spread, combinations
 from heli_jax.identification.identifiability.verdict import Combination, SecondSolution, Unknown
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
@@ -175,19 +175,15 @@ class Valley(NamedTuple):
         return Point({n: float(v) for n, v in zip(names, values, strict=True)}, excess, expected)
 
     def determined_combinations(
-        self, null: Sequence[np.ndarray], covariance: np.ndarray, unknowns: tuple[Unknown, ...]
+        self, null: Sequence[np.ndarray], spread: Spread, unknowns: tuple[Unknown, ...]
     ) -> tuple[Combination, ...]:
         """Return the products of powers, else the sums, that are constant along null directions,
-        at the optimum and far from it.
-
-        Args:
-            covariance: (q, q) in relative coordinates.
-        """
+        at the optimum and far from it."""
         params = self.problem.model.Params
         units = {u.name: naming.unit(params, u.name) for u in unknowns if u.is_parameter}
         found = [
-            *combinations(null, covariance, unknowns),
-            *combinations(null, covariance, unknowns, units),
+            *combinations(null, spread, unknowns),
+            *combinations(null, spread, unknowns, units),
         ]
         points = self._far_points(null, unknowns) if found else []
         stays = [c for c in found if _stays(c, unknowns, points)]
