@@ -2,7 +2,6 @@
 
 import math
 import os
-import re
 import urllib.parse
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -12,7 +11,7 @@ from heli_jax.errors import InputError
 from heli_jax.finding import Finding, note, sentences
 from heli_jax.identification.result import Estimate
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
-from heli_jax.numbers import NOTHING, lowered, number, vaf_percent, with_sd
+from heli_jax.numbers import NOTHING, number, vaf_percent, with_sd
 from heli_jax.report.origin import origin
 from heli_jax.report.page import filled
 from heli_jax.report.saved_fit import SavedFit, load_fit
@@ -29,12 +28,6 @@ _METRICS: tuple[tuple[str, str, Callable[[float | None], str]], ...] = (
     ("fit", "nrmse_fit_percent", lambda v: vaf_percent(None if v is None else v / 100)),
     ("TIC", "tic", lambda v: number(v, 3)),
 )
-_LATEX = str.maketrans(
-    {"_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "^": r"\^{}", "–": "--", "±": r"$\pm$"}
-    | {"−": "$-$"}
-    | {"$": r"\$", "{": r"\{", "}": r"\}", "~": r"\~{}", "\\": r"\textbackslash{}"}
-)
-_RAISED = re.compile(r"(·10)?([⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)")
 
 
 class ComparedRuns(NamedTuple):
@@ -144,21 +137,6 @@ class ComparedRuns(NamedTuple):
     def to_csv(self) -> str:
         """Return `to_dataframe` as CSV."""
         return self.to_dataframe().to_csv(index=False, lineterminator="\n")
-
-    def to_latex(self) -> str:
-        """Return the estimates as a LaTeX table (booktabs)."""
-        head, rows = self.estimates
-        lines = [
-            "% estimate ± one standard deviation; [sd]: difference in joint standard deviations",
-            r"\begin{tabular}{l" + "r" * (len(head) - 2) + "l}",
-            r"\toprule",
-            " & ".join(map(_latex, head)) + r" \\",
-            r"\midrule",
-            *(" & ".join(map(_latex, row)) + r" \\" for row in rows),
-            r"\bottomrule",
-            r"\end{tabular}",
-        ]
-        return "\n".join(lines) + "\n"
 
     def _usable(self) -> list[dict[str, Estimate]]:
         """Return `_by_run` without intervals of runs that did not converge."""
@@ -280,15 +258,6 @@ def _agreement(m: Metrics | None, key: str, text: Callable[[float | None], str])
     if m is not None and diverges(m, FAR):
         return "diverges"
     return text(getattr(m, key, None))
-
-
-def _latex(text: str) -> str:
-    """Return text for LaTeX, as the copy button of a page's tables does."""
-
-    def raised(m: re.Match[str]) -> str:
-        return f"${r'\cdot 10' if m[1] else ''}^{{{lowered(m[2])}}}$"
-
-    return _RAISED.sub(raised, text.translate(_LATEX)).replace("·", r"$\cdot$")
 
 
 _FILES = ("report.html", "fit.json", "signals.csv", "config.yaml")

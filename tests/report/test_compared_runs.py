@@ -62,7 +62,6 @@ def test_differences_are_in_the_joint_sd(tmp_path: Path) -> None:
     assert rows["If"][1:3] == ("–", "–")
     assert rows["a"][0] == "not determined"
     assert rows["a"][2] == "–"
-    assert r"K\_1" in compared.to_latex()
     read = list(csv.DictReader(io.StringIO(compared.to_csv())))
     undetermined = next(r for r in read if r["run"] == "a" and r["parameter"] == "a")
     assert (undetermined["value"], undetermined["sd"]) == ("", "")
@@ -187,15 +186,3 @@ def test_damaged_signals_end_in_a_sentence(tmp_path: Path, signals: bytes) -> No
     (run / "signals.csv").write_bytes(signals)
     with pytest.raises(InputError):
         load_fit(run)
-
-
-def test_latex_has_powers_of_ten_and_no_bare_special_characters(tmp_path: Path) -> None:
-    runs = [tmp_path / "a_1", tmp_path / "b%2"]
-    for k, run in enumerate(runs):
-        write_run(run, {"K_1": (1.7e-4 * (1 + k), 1.2e-5)})
-    table = compare_runs(runs).to_latex()
-    assert r"1.70$\cdot 10^{-4}$ $\pm$ 0.12$\cdot 10^{-4}$" in table
-    assert r"a\_1" in table
-    assert r"b\%2" in table
-    body = table.split("\n", 1)[1]
-    assert body.count("$") % 2 == 0
