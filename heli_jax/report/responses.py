@@ -313,27 +313,24 @@ def _measured(c: Coefficient, factor: float = 1.0) -> str:
 def longest_band(
     hz: Float[np.ndarray, " k"], good: Bool[np.ndarray, " k"]
 ) -> tuple[float, float] | None:
-    """Return the widest band (in octaves) without a hole; None where nothing is good.
+    """Return the widest band (in octaves) without a gap; None if nothing is good.
 
     Args:
         hz: rising, any unit.
     """
-    edges = np.diff(np.concatenate([[0], good.astype(int), [0]]))
-    begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
-    if not begins.size:
-        return None
-    widest = int(np.argmax(hz[ends] / hz[begins]))
-    return float(hz[begins[widest]]), float(hz[ends[widest]])
+    bands = np.ma.clump_masked(np.ma.array(hz, mask=good))
+    ends = [(float(hz[b.start]), float(hz[b.stop - 1])) for b in bands]
+    return max(ends, key=lambda e: e[1] / e[0], default=None)
 
 
 def useful_band(omega: np.ndarray, pair: Pair) -> tuple[str, str, str]:
-    """Mean coherence, and the widest band in which it stays above 0.6 and the error below what that
-    makes of few averages, as text."""
+    """Return as text the mean coherence, and the widest band with coherence above 0.6 and a small
+    random error."""
     seen = np.isfinite(pair.coherence)
     if not seen.any():
         return "not determined", "–", "–"
     mean = f"{np.mean(pair.coherence[seen]):.2f}"
-    # On the flanks of a sine coherence is high, and the window brings it from another frequency.
+    # Beside a sine the window's leakage is coherent too.
     with np.errstate(invalid="ignore"):
         sure = pair.sd < _SURE * np.abs(pair.H)
     band = longest_band(omega, (np.where(seen, pair.coherence, 0.0) > COHERENT) & sure)

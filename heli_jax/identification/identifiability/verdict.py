@@ -227,9 +227,9 @@ def _sentences(v: Verdict) -> list[str]:
         lines.append(sentence("verdict.determined", well=well, wide=wide, both=bool(well and wide)))
     if by_prior:
         lines.append(sentence("verdict.by-prior", names=by_prior))
-    if v.pairs:
-        words = [f"{p.first} with {p.second} ({p.correlation:+.5f})" for p in v.pairs]
-        names = dict.fromkeys(n for p in v.pairs for n in (p.first, p.second))
+    if pairs := [p for p in v.pairs if not {p.first, p.second} <= named]:
+        words = [f"{p.first} with {p.second} ({p.correlation:+.5f})" for p in pairs]
+        names = dict.fromkeys(n for p in pairs for n in (p.first, p.second))
         lines.append(sentence("verdict.correlated", pairs=words, way_out=_way_out([*names])))
     return lines
 

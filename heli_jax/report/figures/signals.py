@@ -244,9 +244,8 @@ def _over_time(run: Trajectory, title: str, groups: Sequence[_Shown]) -> Chart:
     if left:
         note = f"shaded where the model's range is left: {', '.join(left)}"
         outside = np.any([np.asarray(run.outside[name]) for name in left], axis=0)
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], outside.astype(int), [0]])))
-        for begin, end in edges.reshape(-1, 2).tolist():
-            shades.append((float(t[begin]), float(t[min(end, t.size - 1)])))
+        for stretch in np.ma.clump_masked(np.ma.array(t, mask=outside)):
+            shades.append((float(t[stretch.start]), float(t[min(stretch.stop, t.size - 1)])))
     panels = []
     for unit, values in groups:
         series = [
