@@ -244,8 +244,10 @@ def _over_time(run: Trajectory, title: str, groups: Sequence[_Shown]) -> Chart:
     if left:
         note = f"shaded where the model's range is left: {', '.join(left)}"
         outside = np.any([np.asarray(run.outside[name]) for name in left], axis=0)
-        for stretch in np.ma.clump_masked(np.ma.array(t, mask=outside)):
-            shades.append((float(t[stretch.start]), float(t[min(stretch.stop, t.size - 1)])))
+        shades = [
+            (float(t[stretch.start]), float(t[min(stretch.stop, t.size - 1)]))
+            for stretch in np.ma.clump_masked(np.ma.array(t, mask=outside))
+        ]
     panels = []
     for unit, values in groups:
         series = [
