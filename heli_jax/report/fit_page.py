@@ -1,5 +1,4 @@
-"""The report of a fit: one HTML file that holds everything, its figures, their words, and the three
-statements at its head."""
+"""The report of a fit: one HTML file with figures, captions and the three statements."""
 
 import functools
 import math
@@ -61,7 +60,7 @@ def write_report(
     folder = directory / "figures"
     folder.mkdir(parents=True, exist_ok=True)
     numbers, shown = Numbers(), list[Picture]()
-    # Drawn here, one after the other: of many flights' figures one canvas is in memory at a time.
+    # One after the other, for memory.
     for name, draw in drawings(analysis).items():
         made = picture(name, draw, numbers, folder=folder, png=png)
         if made is not None:
@@ -133,11 +132,11 @@ GROUPS = {
     "intervals' sd; 95 % of it lie within a curve. Where the dots do not follow it, neither do "
     "intervals and correlations.",
 }
-"""what a figure shows, after its title, by what its name begins with"""
+"""caption of a figure after its title, by the beginning of its name"""
 
 
 def worst_output(fit: Fit) -> tuple[Signals, str] | None:
-    """The fitted flight and output that the simulation explains least; None where none moves."""
+    """Return the fitted flight and output that the simulation explains least; None if none moves."""
     shares = {
         (i, output): metrics(measured, s.simulated[output]).vaf
         for i, s in enumerate(fit.signals)
@@ -152,8 +151,7 @@ def worst_output(fit: Fit) -> tuple[Signals, str] | None:
 
 
 def drawings(analysis: Analysis) -> dict[str, Draw]:
-    """Every figure of the report by its file name, not yet drawn."""
-    # Drawn when it is asked for: `FitRun.figure` wants one of them and draws no other.
+    """Return functions that draw the figures, by file name."""
     later = functools.partial
     fit, problem, baseline, supplementary = analysis
     model, drawings = problem.model, dict[str, Draw]()
@@ -167,7 +165,6 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
         s, part = fit.signals[i], parts[i]
         for output in s.measured:
             drawings[f"response{part}_{output}"] = later(figures.response, s, output, model)
-            # The fit did nothing to make the residuals of a flight held out white.
             if not s.hold_out:
                 drawings[f"residual{part}_{output}"] = later(
                     figures.residual_correlation,
@@ -198,8 +195,7 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
 
 
 def _drawn(hold_out: list[bool]) -> list[int]:
-    """Return the indices of the flights that get figures. If there are too many, half of them
-    are held-out flights, although the fitted ones come first."""
+    """Return the indices of the flights with figures, at most half of them held out."""
     held = [i for i, out in enumerate(hold_out) if out][: MOST_FLIGHTS // 2]
     fitted = [i for i, out in enumerate(hold_out) if not out][: MOST_FLIGHTS - len(held)]
     rest = [i for i in range(len(hold_out)) if i not in {*held, *fitted}]
@@ -207,11 +203,10 @@ def _drawn(hold_out: list[bool]) -> list[int]:
 
 
 def _parts(flights: list[str]) -> list[str]:
-    """Return the parts that tell the flights' file names apart; nothing for one flight."""
+    """Return the parts of file names by flight; empty for one flight."""
     if len(flights) == 1:
         return [""]
-    # Names come from logs and may hold slashes, and two may be equal but for what is left out: the
-    # number keeps their files apart.
+    # Names of logs may have any letters; the number makes them unique.
     return [
         f"_{i + 1}_{re.sub('[^A-Za-z0-9]+', '-', f).strip('-')[:40]}".rstrip("_")
         for i, f in enumerate(flights)
@@ -260,11 +255,11 @@ class Line(NamedTuple):
 
 
 _SPEAK_AGAINST = ("adequacy", "dynamics", "units", "timing", "quality")
-"""topics whose doubts speak against a model that is adequate"""
+"""topics of doubts about an adequate model"""
 
 
 def lines(fit: Fit) -> tuple[Line, Line, Line]:
-    """Did the optimiser converge; what do the data determine; is the model adequate."""
+    """Return the statements on convergence, identifiability and adequacy."""
     if fit.status == "not-converged":
         stopped = "The optimiser stopped before an optimum, and these numbers are no result."
         return (
@@ -307,9 +302,7 @@ def lines(fit: Fit) -> tuple[Line, Line, Line]:
 
 
 def model_remark(problem: Problem) -> str:
-    """Remark that an inertia found with the paper's model is a number of that model; empty for
-    other models."""
-    # A model with parameters of its own need not have the paper's equations 14 and 15.
+    """Return a remark on inertias of the paper's model; empty for other models."""
     if not of_helicopter(problem.model.Params):
         return ""
     factor = float(np.asarray(problem.vehicle.cyclic_moment))
