@@ -136,7 +136,7 @@ GROUPS = {
 
 
 def worst_output(fit: Fit) -> tuple[Signals, str] | None:
-    """Return the fitted flight and output that the simulation explains least; None if none moves."""
+    """Return the fitted flight and output with the smallest VAF; None if none moves."""
     shares = {
         (i, output): metrics(measured, s.simulated[output]).vaf
         for i, s in enumerate(fit.signals)

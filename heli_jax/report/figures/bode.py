@@ -24,8 +24,8 @@ _TURN = 2.0 * np.pi
 """rad/s of 1 Hz"""
 _DB = 20.0 / np.log(10.0)
 SEEN, BEYOND_CHANCE = 0.1, 0.3
-"""mean coherence over an octave below which it is chance, and from which on it is not; the axis ends
-at the last bin of the second"""
+"""mean coherence over an octave below which it is chance, and from which on it is not; the axis
+ends at the last bin of the second"""
 _WIDE, _WIDE_DATA = 1.0, 0.5
 """relative random error above which a measured response, and one beside a model, is not drawn"""
 _BY_CHANCE = 2.0
@@ -128,8 +128,8 @@ def _room(values: np.ndarray, margin: float, series: Sequence[Series]) -> tuple[
 
 
 def match(pair: FittedPair, unit: str, note: str, baseline: Baseline | None = None) -> Chart:
-    """Draw gain, phase and partial coherence of data and model, and their ratio, with 95 % intervals
-    and the envelopes of unnoticeable dynamics.
+    """Draw gain, phase and partial coherence of data and model, and their ratio, with 95 %
+    intervals and the envelopes of unnoticeable dynamics.
 
     Args:
         baseline: the recursive least squares of this input and output, as a further curve.
