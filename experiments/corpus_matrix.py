@@ -55,7 +55,11 @@ ABLATIONS: tuple[Ablation, ...] = (
         f"{_IDENTIFICATION}.identifiability.equivalents:second_solutions",
         lambda *_, **__: (),
     ),
-    Ablation("valley", f"{_IDENTIFICATION}.identifiability.equivalents:Valley.tied", _untied),
+    Ablation(
+        "valley",
+        f"{_IDENTIFICATION}.identifiability.equivalents:Valley.determined_combinations",
+        _untied,
+    ),
 )
 
 

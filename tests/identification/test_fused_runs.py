@@ -13,11 +13,11 @@ from heli_jax.fused.code import UnsupportedError
 from heli_jax.identification.estimation import many_runs
 from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.filter_error import OBJECTIVE as FILTER_ERROR
-from heli_jax.identification.estimation.many_runs import FusedRuns, Own
+from heli_jax.identification.estimation.many_runs import FusedRuns, Own, optimise_many
 from heli_jax.identification.estimation.residual import residual_and_jacobian
-from heli_jax.identification.uncertainty.bootstrap import bootstrap, refit
+from heli_jax.identification.uncertainty.bootstrap import bootstrap
 from heli_jax.identification.uncertainty.comparison import intervals
-from heli_jax.identification.unknowns.layout import Noise, layout_of
+from heli_jax.identification.unknowns.layout import Noise, layout_of, value_of
 from tests.identification.bench import BENCH, record, response, vehicle
 
 FREE = {"Ixx": Free(0.03), "If": Free(2e-4), "a": Free(5.0, prior=Prior(5.5, 0.5))}
@@ -132,26 +132,23 @@ def fitted():
     return fit(problem([record(BENCH, seed=3, n=150)]))
 
 
-def test_records_fitted_together_are_as_each_by_itself(fitted):
-    records = [record(BENCH, seed=k, n=150) for k in range(5, 8)]
-    found = refit(fitted, [*records, *records, *[[r] for r in records * 6]])
-    assert found.converged.all()
-    for k, flight in enumerate(records):
-        alone = fit(problem([flight]))
-        for name, e in alone.estimates.items():
-            # Noise levels and weak priors are those of the first record.
-            assert abs(found.values[name][k] - e.value) < 0.1 * e.sd
-            np.testing.assert_allclose(found.values[name][k::3], found.values[name][k], rtol=1e-6)
-
-
 @pytest.mark.slow
 def test_many_records_are_fitted_as_scipy_fits_them():
     free = {"Ixx": Free(0.03), "If": Free(2e-4)}
     flights = [record(BENCH, seed=k, n=150) for k in range(24)]
     notes: list[str] = []
-    found = refit(fit(problem(flights[:1], free, nuisance=NONE)), flights, say=notes.append)
+    at = fit(problem(flights[:1], free, nuisance=NONE)).reached
+    [own] = at.data.flights
+    u = at.layout.model.Inputs(x_roll=jnp.stack([f.inputs["x_roll"] for f in flights]))
+    y = {"roll": jnp.stack([f.outputs["roll"] for f in flights])}
+
+    def data(each):
+        return at.data._replace(flights=(own._replace(inputs=each[0], outputs=each[1]),))
+
+    found = optimise_many(at, data, len(flights), (u, y), notes.append)
     assert found.converged.all()
     assert notes == []  # as programs of machine code
+    values = {n: value_of(at.layout, at.data, i, found.z[:, i]) for i, n in enumerate(free)}
     for k, flight in enumerate(flights[:6]):
         u, y = flight.inputs["x_roll"], flight.outputs["roll"]
         alone = scipy.optimize.least_squares(
@@ -160,24 +157,7 @@ def test_many_records_are_fitted_as_scipy_fits_them():
         )  # fmt: skip
         sd = np.sqrt(np.diag(np.linalg.inv(alone.jac.T @ alone.jac)) * 2.0 * alone.cost / 148)
         for name, value, spread in zip(free, alone.x, sd, strict=True):
-            assert abs(found.values[name][k] - value) < 1e-2 * spread
-
-
-def test_records_unlike_the_fits_are_refused(fitted):
-    good = record(BENCH, seed=5, n=150)
-    cases = (
-        record(BENCH, seed=5, n=140),
-        record(BENCH, seed=5, n=150, dt=0.01),
-        record(BENCH, seed=5, n=150, known={"kappa": 5.0}),
-        [good, good],
-    )
-    for flight in cases:
-        with pytest.raises(ValueError, match=r"^refit, record 1: "):
-            refit(fitted, [good, flight])
-    with pytest.raises(ValueError, match="one record"):
-        refit(fitted, [])
-    with pytest.raises(TypeError, match=r"^refit, record 0: "):
-        refit(fitted, [None])
+            assert abs(values[name][k] - value) < 1e-2 * spread
 
 
 def test_many_records_that_are_no_program_are_run_one_by_one(fitted, monkeypatch):
