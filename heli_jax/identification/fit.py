@@ -25,7 +25,7 @@ from heli_jax.identification.estimation.disturbance_search import likely_gusts
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import measured_count
 from heli_jax.identification.estimation.multistart import FirstGuess, StartRow
-from heli_jax.identification.estimation.noise_covariance import first_noise, unless_stuck
+from heli_jax.identification.estimation.noise_covariance import first_noise
 from heli_jax.identification.estimation.objective import noise_unknowns
 from heli_jax.identification.identifiability.analysis import Around, verdict_of
 from heli_jax.identification.identifiability.equivalents import Valley, second_solutions
@@ -56,7 +56,7 @@ def _with_likely_gusts(problem: Problem) -> FirstGuess:
     guess = first_guess(problem)
     if not (unstated_gusts(problem) and guess.layout.disturbance):
         return guess
-    z, e = likely_gusts(Solution(*guess[:4]), guess.e)
+    z, e = likely_gusts(Solution(*guess[:4]))
     return guess._replace(z=z, e=e)
 
 
@@ -199,7 +199,6 @@ def _where_ended(
     """Return the Context at the end of the search."""
     layout, data, optimum = ended.search.layout, ended.search.data, ended.optimum
     e = evaluate(layout, data, optimum.noise, optimum.best.z)
-    optimum = unless_stuck(layout, optimum, e, problem.free)
 
     def context() -> Context:
         at = Solution(layout, data, optimum.noise, optimum.best.z)
@@ -208,7 +207,7 @@ def _where_ended(
     c = context()
     if c.rounding:
         # No diagnostic may use a likelihood that is rounding.
-        optimum = optimum._replace(best=optimum.best._replace(converged=np.asarray(False)))
+        optimum = optimum._replace(best=optimum.best._replace(converged=False))
         c = context()
     return c
 

@@ -63,35 +63,75 @@ class Alternatives(NamedTuple):
     nested: tuple[tuple[str, str], ...]
 
 
+class _Form(NamedTuple):
+    """What a candidate assumes."""
+
+    axes: tuple[str, ...]
+    """disturbed axes or states"""
+    poles: int
+    stand: bool
+
+
 def alternatives(
     problem: Problem,
     model: Model,
-    axis: str,
+    names: Sequence[str],
     *,
+    stated: Sequence[str] = (),
     without_stand: Model | None = None,
 ) -> Alternatives:
-    """List candidates by filter error: no disturbance, one pole and two poles on `axis`.
+    """List candidates by filter error: no disturbance, one and two poles on the named axes, and of
+    several axes also each one left out.
 
     Args:
+        problem: what it says of disturbances (starts, what is fixed) holds for the candidates that
+            have them.
         model: the model without disturbance.
+        names: axes or states that may be disturbed.
+        stated: those of a configuration, which are a candidate of their own.
         without_stand: the same vehicle without its stand, where that is in question too.
+
+    Raises:
+        ValueError: one of them cannot be disturbed.
     """
-    problems: dict[str, Problem] = {}
-    nested = []
-    vehicles = {"": (model, problem)}
+    names = tuple(names)
+    one, two = "one pole", "two poles"
+    forms = {"no disturbance": _Form((), 1, True)}
+    if len(names) > 1:
+        one, two = (f"all: {', '.join(names)}{end}" for end in ("", "; two poles"))
+        for name in names:
+            rest = tuple(n for n in names if n != name)
+            forms[f"without {name}: {', '.join(rest)}"] = _Form(rest, 1, True)
+        if 0 < len(stated) < len(names) - 1:
+            forms[f"only {', '.join(stated)}"] = _Form(tuple(stated), 1, True)
+    forms |= {one: _Form(names, 1, True), two: _Form(names, 2, True)}
     free = {n: f for n, f in problem.free.items() if n not in ("kappa", "zeta")}
     if without_stand is not None and free:
-        vehicles[", no stand"] = (without_stand, replace(problem, free=free))
-    for ending, (vehicle, base) in vehicles.items():
-        for words, poles in (("no disturbance", 0), ("one pole", 1), ("two poles", 2)):
-            problems[words + ending] = _by_filter_error(base, vehicle, (axis,), poles)
-            # One pole is no special case of two: both of these have the same time constant.
-            if poles:
-                nested.append((f"no disturbance{ending}", words + ending))
-            # Free flight is the stand without stiffness and damping, where these may go to zero.
-            if ending and _stand_may_vanish(problem):
-                nested.append((words + ending, words))
-    return Alternatives(problems, tuple(nested))
+        forms |= {f"{name}, no stand": f._replace(stand=False) for name, f in forms.items()}
+    bare, problems = replace(problem, free=free) if free else problem, {}
+    for name, form in forms.items():
+        base, vehicle = (problem, model) if form.stand else (bare, without_stand)
+        assert vehicle is not None
+        problems[name] = _by_filter_error(
+            base, vehicle, form.axes or names[:1], form.poles if form.axes else 0
+        )
+    vanishes = _stand_may_vanish(problem)
+    pairs = [
+        (small, large)
+        for small, a in forms.items()
+        for large, b in forms.items()
+        if small != large and _is_nested(a, b, vanishes)
+    ]
+    return Alternatives(problems, tuple(pairs))
+
+
+def _is_nested(small: _Form, large: _Form, stand_may_vanish: bool) -> bool:
+    """Return True if one form is a special case of another by one assumption."""
+    if small.stand != large.stand:
+        # Free flight is the stand without stiffness and damping, where these may go to zero.
+        return stand_may_vanish and large.stand and small[:2] == large[:2]
+    # One pole is no special case of two: both have the same time constant.
+    return set(small.axes) < set(large.axes) and (not small.axes or small.poles == large.poles)
 
 
 def _by_filter_error(problem: Problem, model: Model, on: Sequence[str], poles: int = 1) -> Problem:
@@ -182,8 +222,6 @@ def choose(
 
 _BELOW = 0.05
 """log-likelihood by which a model may end below one that is nested in it: the optimiser's rest"""
-_FAR = 10.0
-"""the same for one with the same parameters and another disturbance, which is not nested"""
 
 
 def _none_below_its_part(
@@ -193,45 +231,32 @@ def _none_below_its_part(
     report: Callable[[str], None],
     fit_options: dict[str, Any],
 ) -> list[str]:
-    """Fit again, from the better optimum, what ended below a model that is nested in it, or far
-    below one that has the same parameters; `fits` is changed, and the words are returned."""
+    """Fit again, from the better optimum, what ended below a model that is nested in it; `fits` is
+    changed, and the words are returned."""
     sentences = []
-    for (a, b), least in [*((p, _BELOW) for p in nested), *((p, _FAR) for p in _alike(problems))]:
-        before, other = fits[b].log_likelihood, fits[a].log_likelihood
-        if not before < other - least:
+    for a, b in nested:
+        before, least = fits[b].log_likelihood, fits[a].log_likelihood - _BELOW
+        if not before < least:
             continue
         report(f"comparing models: {b} again, from {a}")
         try:
             again = fit(begun_from(problems[b], problems[a], fits[a]), **fit_options)
         except ValueError:  # it may be unstable at parameters that suit the other one
             again = fits[b]
-        if again.log_likelihood > before + least:
+        if again.log_likelihood > before + _BELOW:
             fits[b] = again
-        reached, part = fits[b].log_likelihood, (a, b) in nested
-        where = f"far below {a}, which has the same parameters"
-        where = f"below {a}, which is nested in it" if part else where
+        reached = fits[b].log_likelihood
+        where = f"below {a}, which is nested in it (log-likelihood {before:.1f} for {least:.1f})"
         if reached > before:
             sentences.append(
-                f"{b} first ended {where} (log-likelihood {before:.1f} for {other:.1f}): begun "
-                f"anew from that optimum it reaches {reached:.1f}."
+                f"{b} first ended {where}: begun anew from that optimum it reaches {reached:.1f}."
             )
-        if part and reached < other - least:
+        if reached < least:
             sentences.append(
-                f"{b} ends {where} (log-likelihood {reached:.1f} for {other:.1f}), also when it "
-                "begins there: its own optimum was not found, and its test means nothing."
+                f"{b} ends {where}, also when it begins there: its own optimum was not found, and "
+                "its test means nothing."
             )
     return sentences
-
-
-def _alike(problems: Mapping[str, Problem]) -> list[tuple[str, str]]:
-    """Return pairs of models with the same parameters and disturbances of another kind on the same
-    states: neither is nested, but a disturbance seldom moves parameters far."""
-    same = {
-        name: (problem.free, {d.state for d in disturbances_of(problem.model)})
-        for name, problem in problems.items()
-        if problem.noise
-    }
-    return [(a, b) for a in same for b in same if a != b and same[a] == same[b]]
 
 
 _ALL_BUT_NOTHING = 1e-3
@@ -318,40 +343,6 @@ def undisturbed_too(model: Model, names: Sequence[str]) -> tuple[str, ...]:
     """Return the named axes and states, then the model's other axes."""
     rest = [axis.name for axis in axes_of(model) if not {axis.name, axis.rate} & set(names)]
     return (*names, *rest)
-
-
-def disturbed_sets(
-    problem: Problem, model: Model, names: Sequence[str], stated: Sequence[str] = ()
-) -> Alternatives:
-    """List candidates by filter error: no disturbance, each one left out, all, and all with two
-    poles.
-
-    Args:
-        problem: what it says of disturbances (starts, what is fixed) holds for the candidates that
-            have them.
-        model: the model without disturbance.
-        names: two and more axes or states that may be disturbed.
-        stated: those of a configuration, which are a candidate of their own.
-
-    Raises:
-        ValueError: one of them cannot be disturbed, or there are fewer than two.
-    """
-    if len(names) < 2:
-        raise ValueError(f"expected two disturbances or more to choose from, got {len(names)}")
-    smaller = {}
-    for name in names:
-        rest = [n for n in names if n != name]
-        smaller[f"without {name}: {', '.join(rest)}"] = rest, 1
-    if 0 < len(stated) < len(names) - 1:
-        smaller[f"only {', '.join(stated)}"] = stated, 1
-    everything = f"all: {', '.join(names)}"
-    # Two poles are no extension of one: the two are compared by AIC and not by a test.
-    disturbed = {**smaller, everything: (names, 1), f"{everything}; two poles": (names, 2)}
-    nested = [("no disturbance", name) for name in disturbed]
-    nested += [(name, everything) for name in smaller]
-    sets = {"no disturbance": (names[:1], 0), **disturbed}
-    problems = {n: _by_filter_error(problem, model, *of) for n, of in sets.items()}
-    return Alternatives(problems, tuple(nested))
 
 
 APART = 2.0

@@ -1,6 +1,6 @@
 """Bootstrap: records about the estimated vehicle's response are identified again, many times."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -15,8 +15,7 @@ from heli_jax.identification.estimation.frequency_lines import (
     in_time_of,
     records_of,
 )
-from heli_jax.identification.estimation.levenberg_marquardt import Optimum
-from heli_jax.identification.estimation.many_runs import optimise_many
+from heli_jax.identification.estimation.levenberg_marquardt import Optimum, optimise
 from heli_jax.identification.estimation.multistart import Search
 from heli_jax.identification.estimation.noise_covariance import relax_noise_covariance
 from heli_jax.identification.problem import FEWEST_SEEN
@@ -26,6 +25,8 @@ from heli_jax.identification.unknowns.layout import Data, Layout, Solution, unpa
 
 _STEPS = 200
 """of the optimiser at most, in frequency"""
+_STEPS_IN_TIME = 60
+"""the same in time: a run that began near its optimum"""
 
 
 class Refits(NamedTuple):
@@ -40,13 +41,8 @@ class Refits(NamedTuple):
     where a record is as noisy, more where the model explains it less; NaN with too few samples"""
 
 
-def refit(
-    fit: Fit,
-    records: Sequence[Sequence[Flight] | Flight],
-    *,
-    say: Callable[[str], None] = lambda _: None,
-) -> Refits:
-    """Estimate the parameters of a fit anew from other records, side by side.
+def refit(fit: Fit, records: Sequence[Sequence[Flight] | Flight]) -> Refits:
+    """Estimate the parameters of a fit anew from other records.
 
     Each record has the flights of the fit, of the same length and rate, with inputs and outputs of
     its own; all else is the fit's, and all searches begin at its optimum. No verdict is made of a
@@ -55,7 +51,6 @@ def refit(
     Args:
         fit: with output error or filter error.
         records: each a Flight, or as many as the fit has.
-        say: called with a sentence where many records are not fitted by programs of machine code.
 
     Raises:
         TypeError: a record that is no flights.
@@ -69,26 +64,35 @@ def refit(
         raise ValueError("refit: expected one record at least, got none")
     flights = [_like(at, r, f"refit, record {k}") for k, r in enumerate(records)]
 
-    def stacked(signals: list[np.ndarray]) -> Array:
-        return jnp.asarray(np.stack(signals), at.z.dtype)
+    def data(record: list[Flight]) -> Data:
+        names, dtype = naming.names(at.layout.model.Inputs), at.z.dtype
+        numbers = [
+            of_fit._replace(
+                inputs=at.layout.model.Inputs(**{n: np.asarray(f.inputs[n], dtype) for n in names}),
+                outputs={n: np.asarray(f.outputs[n], dtype) for n in of_fit.outputs},
+            )
+            for of_fit, f in zip(at.data.flights, record, strict=True)
+        ]
+        return at.data._replace(flights=tuple(numbers))
 
-    inputs, outputs = [], []
-    for i, own in enumerate(at.data.flights):
-        names = naming.names(at.layout.model.Inputs)
-        driven = {n: stacked([r[i].inputs[n] for r in flights]) for n in names}
-        inputs.append(at.layout.model.Inputs(**driven))
-        outputs.append({n: stacked([r[i].outputs[n] for r in flights]) for n in own.outputs})
-
-    def data(record: Any) -> Data:
-        each = zip(at.data.flights, *record, strict=True)
-        return at.data._replace(flights=tuple(f._replace(outputs=y, inputs=u) for f, y, u in each))
-
-    optima = optimise_many(at, data, len(flights), (tuple(outputs), tuple(inputs)), say)
+    optima = _optima(at, map(data, flights))
     seen = [[np.isfinite(y).sum() for f in r for y in f.outputs.values()] for r in flights]
     enough = np.array([min(counts) >= FEWEST_SEEN for counts in seen])
-    converged = np.asarray(optima.converged) & enough
-    values = {n: np.where(converged, v, np.nan) for n, v in _values(at, optima.z).items()}
-    return Refits(values, converged, np.where(enough, np.asarray(optima.cost), np.nan))
+    converged = np.array([o.converged for o in optima]) & enough
+    values = _values(at, np.stack([o.z for o in optima]))
+    cost = np.where(enough, [o.cost for o in optima], np.nan)
+    return Refits({n: np.where(converged, v, np.nan) for n, v in values.items()}, converged, cost)
+
+
+def _optima(at: Solution, records: Iterable[Data]) -> list[Optimum]:
+    """Return the optimum of each record, searched from one optimum."""
+    optima = []
+    for numbers in records:
+        # Steps of its search are none of the stage's, which counts records.
+        with stages.stage("one record", shown=False):
+            optima.append(optimise(at.layout, numbers, at.noise, at.z, _STEPS_IN_TIME))
+        stages.advance()
+    return optima
 
 
 def _values(at: Solution, z: Any) -> dict[str, np.ndarray]:
@@ -139,17 +143,12 @@ class Bootstrap(NamedTuple):
         return float(low), float(high)
 
 
-def bootstrap(
-    fit: Fit, runs: int = 200, *, seed: int = 0, say: Callable[[str], None] = lambda _: None
-) -> Bootstrap:
+def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
     """Refit records simulated with the estimates: same inputs, same missing samples, new noise.
 
     Filter error draws the disturbance anew. Output error adds white noise, or where its residuals
     are autocorrelated, noise with their covariance over time and between outputs. Frequency error
     draws residuals line by line, and estimates the spectrum anew.
-
-    Args:
-        say: called with a sentence where many records are not fitted by programs of machine code.
 
     Raises:
         ValueError: no run; the time shift is free in a fit in time, the data do not determine every
@@ -171,28 +170,29 @@ def bootstrap(
     prior_sd = np.where(np.isfinite(at.data.prior_sd), at.data.prior_sd, 0.0)
     records = () if in_frequency else _records(fit, at, runs, seed, rng)
     means = values + prior_sd * rng.standard_normal((runs, values.size))
-    means = jnp.asarray(means, at.z.dtype)
+    means = means.astype(at.z.dtype)
 
-    def data(record: Any) -> Data:
-        outputs, mean = record
-        each = zip(at.data.flights, outputs, strict=True)
-        flights = tuple(f._replace(outputs=y) for f, y in each)
-        return at.data._replace(flights=flights, prior_mean=mean)
+    def data(k: int) -> Data:
+        flights = tuple(
+            f._replace(outputs={n: y[k] for n, y in outputs.items()})
+            for f, outputs in zip(at.data.flights, records, strict=True)
+        )
+        return at.data._replace(flights=flights, prior_mean=means[k])
 
     if in_frequency:
         z, converged = _fit_by_lines(at, means, rng)
     else:
-        optima = optimise_many(at, data, runs, (records, means), say)
-        z, converged = optima.z, np.asarray(optima.converged)
+        optima = _optima(at, map(data, range(runs)))
+        z, converged = np.stack([o.z for o in optima]), np.array([o.converged for o in optima])
     # No nuisances: weak priors hold them, which are not drawn anew.
     fitted = np.flatnonzero(converged)
-    estimates = _values(at, np.asarray(z)[fitted])
+    estimates = _values(at, z[fitted])
     return Bootstrap(estimates, runs - fitted.size, tuple(map(int, fitted)))
 
 
 def _records(
     fit: Fit, at: Solution, runs: int, seed: int, rng: np.random.Generator
-) -> tuple[dict[str, Array], ...]:
+) -> tuple[dict[str, np.ndarray], ...]:
     """Draw by flight and output (runs, N); NaN where the record has it."""
     u = unpack(at.layout, at.data, at.z)
     noise_free = at.layout.objective.records(at, u, runs, seed)
@@ -210,7 +210,7 @@ def _records(
                 noise = coloured[:, at.layout.outputs[i].index(n)]
             record = np.asarray(outputs[n]) + float(u.biases[i][n]) + noise
             record = np.where(np.isnan(np.asarray(y)), np.nan, record)
-            by_output[n] = jnp.asarray(record, at.z.dtype)
+            by_output[n] = record.astype(at.z.dtype)
         records.append(by_output)
     return tuple(records)
 
@@ -221,9 +221,7 @@ def _fit_by_lines(
     """Fit drawn records one by one, each with its means of the priors and its own spectrum; return
     the unknowns, and whether they converged."""
     z, converged = [], []
-    begun = Optimum(
-        at.z, jnp.zeros((), at.z.dtype), np.asarray(0), np.asarray(True), np.asarray(np.inf)
-    )
+    begun = Optimum(at.z, 0.0, 0, True)
     for mean, data in zip(means, _spectrum_records(at, rng), strict=False):
         search = _FromOptimum(at.layout, data._replace(prior_mean=mean))
         # Steps of its search are none of the stage's, which counts records.
@@ -240,7 +238,7 @@ class _FromOptimum(Search):
 
     def __init__(self, layout: Layout, data: Data) -> None:
         self.problem: Any = None
-        self.layout = self.bounded = layout
+        self.layout = layout
         self.data, self.max_steps = data, _STEPS
 
 

@@ -5,7 +5,6 @@ noise of sensors before filters and of outputs, then for each flight the initial
 and the offsets of the inputs.
 """
 
-import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -262,13 +261,9 @@ class Noise(NamedTuple):
     by_instrument: Any = ()
     """frequency error: 1 where instruments weigh the errors, 0 where the model's own response does,
     as it does until the search by instrument has somewhere to begin"""
-    scale_slopes: Any = ()
-    """filter error: derivatives of the sum of log(innovation variance) by the scale errors that are
-    unknown (k,), see `noisy_scales`; () where the model has none"""
-    own: Any = ()
-    """filter error: by parameter of a sensor model's own process noise the derivative of what the
-    parameters of the mean take up by its logarithm, and that logarithm (2,), see
-    `restricted_likelihood`; () where there is none"""
+    corrections: Any = ()
+    """filter error: by parameter the slope of a correction of the likelihood, and where it is zero
+    (2,), see `noise_scales`; () where the model integrates no sensor"""
 
 
 class Solution(NamedTuple):
@@ -307,7 +302,7 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...]) -> Layout:
     return Layout(
         model=with_sensor_noise(problem.model, tuple(problem.filtered_noise)),
         free=tuple(problem.free),
-        kinds=tuple(transforms.plain_kind(f) for f in problem.free.values()),
+        kinds=tuple(transforms.kind(f) for f in problem.free.values()),
         gains=naming.names(problem.model.Inputs) if nuisance.input_gain else (),
         shift=nuisance.time_shift,
         initial_state=nuisance.initial_state,
@@ -330,12 +325,6 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...]) -> Layout:
         one_covariance=_one_covariance(problem, flights),
         flight_facts=objective.flight_facts(problem, flights),
     )
-
-
-def within_bounds(layout: Layout, problem: Problem) -> Layout:
-    """The layout whose free parameters are kept within their bounds by logit coordinates."""
-    kinds = tuple(transforms.kind(f) for f in problem.free.values())
-    return layout if kinds == layout.kinds else dataclasses.replace(layout, kinds=kinds)
 
 
 def _holds(model: Model, flight: Flight) -> tuple[str, ...]:

@@ -1,5 +1,5 @@
-"""Free parameters as unbounded coordinates: log, linear where the sign is open, or logit between
-bounds."""
+"""Free parameters as coordinates: log, linear where the sign is open, or logit between bounds of
+different sign."""
 
 import math
 
@@ -13,24 +13,22 @@ from heli_jax.identification.problem import Free
 type Real = Array | np.ndarray | np.floating | float
 """real numbers of any shape, traced or not"""
 
-KINDS = ("log", "linear", "above", "below", "logit-log", "logit")
-"""log: x = sign e^z. linear: x = scale z. above, below: a bound on one side. logit-log: between two
-bounds of one sign, uniform in log x. logit: between any two bounds."""
+KINDS = ("log", "linear", "logit")
+"""log: x = sign e^z. linear: x = scale z. logit: between two bounds of different sign."""
 
 
 def kind(free: Free) -> str:
-    """The coordinate that a free parameter gets; without bounds it keeps the start's sign, unless
-    that may be any."""
-    if free.lower is None and free.upper is None:
-        return "linear" if free.sign == "any" else "log"
-    # By `limits`, not by what is stated: one bound on a parameter of one sign makes two with zero.
+    """Return the coordinate of a free parameter: a logarithm unless zero is inside its bounds.
+
+    Other bounds limit the optimiser and do not bend the coordinate: a product of powers that the
+    data determine, such as a/Ixx, is a straight valley in logarithms.
+    """
     low, high = limits(free)
-    if math.isinf(high):
-        return "above"
-    if math.isinf(low):
-        return "below"
-    # A logarithm needs both bounds on one side of zero, and none at zero.
-    return "logit-log" if low * high > 0 else "logit"
+    if low >= 0 or high <= 0:
+        return "log"
+    if math.isfinite(low) and math.isfinite(high):
+        return "logit"
+    return "linear" if free.sign == "any" else "log"
 
 
 def limits(free: Free) -> tuple[float, float]:
@@ -50,23 +48,9 @@ def limits(free: Free) -> tuple[float, float]:
     return low, high
 
 
-def plain_kind(free: Free) -> str:
-    """The coordinate without regard to bounds: log wherever zero is not inside them, linear where
-    the sign may be any and there are not two of them."""
-    # A product of powers that the data determine, such as a/Ixx, is a straight valley in log
-    # coordinates. A logit bends it, and Levenberg-Marquardt then creeps along the bend; so bounds
-    # are looked at only after this search has left them.
-    low, high = limits(free)
-    if low >= 0 or high <= 0:
-        return "log"
-    return "linear" if changes_sign(free) else kind(free)
-
-
 def changes_sign(free: Free) -> bool:
-    """True if a parameter may change its sign, and need not stay between bounds."""
-    low, high = limits(free)
-    bounded = math.isfinite(low) and math.isfinite(high)
-    return bool(free.sign == "any" and low < 0 < high and not bounded)
+    """Return True if a parameter may change its sign, and need not stay between bounds."""
+    return kind(free) == "linear"
 
 
 def scale(free: Free) -> float:
@@ -95,7 +79,7 @@ def inside(free: Free, value: float) -> bool:
 
 
 def coordinates(free: Free, kind: str, values: Real) -> np.ndarray:
-    """The coordinates of values; infinite or NaN of those on the bounds or outside."""
+    """Return the coordinates of values; NaN where there is none."""
     return np.asarray(to_coordinate(kind, values, sign_or_scale(free), *limits(free)))
 
 
@@ -118,44 +102,35 @@ def at_bound(free: Free, value: float) -> bool:
 
 
 def to_value(transform: str, z: Real, sign: Real, low: Real, high: Real) -> Real:
-    """The parameter's value for a coordinate of one of `KINDS`; its sign is its scale where that is
-    linear (`sign_or_scale`), and a bound that is missing is infinite."""
-    # Which branch is taken is known before tracing: the compiled program holds one expression.
+    """Return the value of a coordinate of one of `KINDS`; `sign` is the scale of a linear one
+    (`sign_or_scale`)."""
+    # The branch is known before tracing: the compiled program holds one expression.
     if transform == "log":
         return sign * jnp.exp(z)
     if transform == "linear":
         return sign * z
-    if transform == "above":
-        return low + jnp.exp(z)
-    if transform == "below":
-        # e^z is the distance to the bound, so the value falls as z rises.
-        return high - jnp.exp(z)
-    if transform == "logit":
-        return low + (high - low) * jax.nn.sigmoid(z)
-    # logit-log: a is the logarithm of the lower bound's size, so for two negative bounds a > b and
-    # the value still rises with z.
-    a, b = jnp.log(jnp.abs(low)), jnp.log(jnp.abs(high))
-    return sign * jnp.exp(a + (b - a) * jax.nn.sigmoid(z))
+    return low + (high - low) * jax.nn.sigmoid(z)
 
 
 def to_coordinate(transform: str, x: Real, sign: Real, low: Real, high: Real) -> Real:
-    """The coordinate of a value inside the bounds: the inverse of `to_value`, of numbers alone."""
+    """Return the coordinate of a value inside the bounds: the inverse of `to_value`, of numbers
+    alone."""
     # By NumPy: each step by itself would be a program of JAX's to load.
     x, sign, low, high = (np.asarray(v) for v in (x, sign, low, high))
-    # A value on a bound has an infinite coordinate: callers move it inside first.
+    # A value on a bound of a logit has an infinite coordinate.
     with np.errstate(all="ignore"):
         if transform == "log":
             return np.log(sign * x)
         if transform == "linear":
             return x / sign
-        if transform == "above":
-            return np.log(x - low)
-        if transform == "below":
-            return np.log(high - x)
-        if transform == "logit":
-            share = (x - low) / (high - low)
-        else:
-            a, b = np.log(np.abs(low)), np.log(np.abs(high))
-            share = (np.log(np.abs(x)) - a) / (b - a)
+        share = (x - low) / (high - low)
         # log1p keeps the digits of a share near zero, where 1 - share rounds to 1.
         return np.log(share) - np.log1p(-share)
+
+
+def coordinate_limits(kind: str, sign: Real, low: Real, high: Real) -> np.ndarray:
+    """Return the lowest and the highest coordinate within the bounds (2,)."""
+    ends = np.array([to_coordinate(kind, bound, sign, low, high) for bound in (low, high)])
+    # Zero is no bound of a logarithm on its other side.
+    ends = np.where(np.isnan(ends), -np.inf, ends)
+    return np.sort(ends)
