@@ -31,7 +31,7 @@ class Candidate(NamedTuple):
     aic: float
     bic: float
     white: bool
-    """whether its residuals or innovations look white"""
+    """True if its residuals or innovations are white"""
     estimates: dict[str, float]
 
 
@@ -45,11 +45,12 @@ class Nested(NamedTuple):
     degrees: int
     """unknowns added"""
     p_value: float
-    """of the smaller model; on the safe side where it lies at a bound (sigma_w, kappa >= 0)"""
+    """of the smaller model; too large, so cautious, where that is at a bound (sigma_w, kappa >=
+    0)"""
 
 
 class Choice(NamedTuple):
-    """All candidates, best AIC first, the nested tests, and the outcome in words."""
+    """All candidates, best AIC first, and the nested tests."""
 
     candidates: tuple[Candidate, ...]
     nested: tuple[Nested, ...]
@@ -57,7 +58,7 @@ class Choice(NamedTuple):
 
 
 class Alternatives(NamedTuple):
-    """Problems by name, and which is nested in which: (small, large)."""
+    """Problems by name, and pairs of nested ones: (small, large)."""
 
     problems: dict[str, Problem]
     nested: tuple[tuple[str, str], ...]
@@ -143,11 +144,11 @@ def _by_filter_error(problem: Problem, model: Model, on: Sequence[str], poles: i
     known = {n: vehicle[n] for n in naming.names(model.Params) if n in vehicle and n not in own}
     if not poles:
         [d] = disturbances_of(model)
-        # Not zero, which has no logarithm: a billionth of the motion moves no digit.
+        # A billionth of the motion: zero has no logarithm.
         known |= {d.sigma: jnp.asarray(1e-9 * problem.motion), d.tau: jnp.asarray(1.0)}
         fixed = (d.sigma, d.tau)
     else:
-        # Starts that were stated for a disturbance hold in every candidate that has it.
+        # A stated start of a disturbance holds in every candidate that has it.
         same = same_parameters(model, problem.model)
         known |= {n: vehicle[m] for n, m in same.items()}
         fixed = tuple(n for n, m in same.items() if m in problem.fixed_noise)
@@ -212,7 +213,7 @@ def choose(
         criteria = f.log_likelihood, f.unknowns, f.aic, f.bic
         candidates[name] = Candidate(name, f.status, *criteria, f.white, values)
     compared = [_test(candidates[a], candidates[b]) for a, b in pairs]
-    # Rounded, since a disturbance that does not show leaves the same model: the one named first.
+    # Rounded: with a disturbance that vanishes two models are the same, and the first counts.
     ranked = tuple(
         sorted(candidates.values(), key=lambda c: (c.status == "not-converged", round(c.aic, 1)))
     )
@@ -221,7 +222,7 @@ def choose(
 
 
 _BELOW = 0.05
-"""log-likelihood by which a model may end below one that is nested in it: the optimiser's rest"""
+"""log-likelihood by which a model may end below one that is nested in it, by convergence"""
 
 
 def _none_below_its_part(
@@ -231,8 +232,8 @@ def _none_below_its_part(
     report: Callable[[str], None],
     fit_options: dict[str, Any],
 ) -> list[str]:
-    """Fit again, from the better optimum, what ended below a model that is nested in it; `fits` is
-    changed, and the words are returned."""
+    """Fit models again that ended below one nested in them, from its optimum; change `fits`, and
+    return sentences."""
     sentences = []
     for a, b in nested:
         before, least = fits[b].log_likelihood, fits[a].log_likelihood - _BELOW
@@ -260,7 +261,7 @@ def _none_below_its_part(
 
 
 _ALL_BUT_NOTHING = 1e-3
-"""part of its start at which a parameter begins that the nested model does not have"""
+"""part of the start at which a parameter begins that the nested model lacks"""
 
 
 def begun_from(problem: Problem, nested: Problem, optimum: Fit) -> Problem:
@@ -274,7 +275,7 @@ def begun_from(problem: Problem, nested: Problem, optimum: Fit) -> Problem:
         elif nested.model.name == problem.model.name and getattr(nested.vehicle, name) != 0:
             value = float(getattr(nested.vehicle, name))
         free[name] = parameter._replace(start=_inside(parameter, value))
-    # A disturbance that did not show ended at zero: this one then begins where it always does.
+    # A disturbance that vanished has no value to begin with.
     noise = {
         n: jnp.asarray(optimum.nuisance[m].value)
         for n, m in same_parameters(problem.model, nested.model).items()
@@ -293,7 +294,7 @@ def same_parameters(model: Model, other: Model) -> dict[str, str]:
 
 def _inside(free: Free, value: float) -> float:
     """Return the value, or the nearest that is well inside the bounds."""
-    # An optimum may lie on a bound, where the coordinates of a bounded parameter are at infinity.
+    # An optimum may be at a bound.
     low = -math.inf if free.lower is None else free.lower
     high = math.inf if free.upper is None else free.upper
     size = high - low if math.isfinite(high - low) else abs(value) or abs(free.start)
@@ -346,7 +347,7 @@ def undisturbed_too(model: Model, names: Sequence[str]) -> tuple[str, ...]:
 
 
 APART = 2.0
-"""joint standard deviations from which on two estimates differ"""
+"""joint standard deviations above which two estimates differ"""
 
 
 class MethodResult(NamedTuple):
@@ -356,7 +357,7 @@ class MethodResult(NamedTuple):
     fit: Fit | None
     """None where the method refuses the problem"""
     reason: str
-    """why there are no numbers; empty where there are"""
+    """why there is no result; empty if there is one"""
     seconds: float
 
     @property
@@ -416,7 +417,7 @@ class MethodComparison(NamedTuple):
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Sentences on what agrees and what differs."""
+        """Sentences on agreement and differences."""
         main, *others = self.results
         said = [f"{r.label} has no numbers: {r.reason}" for r in self.results if r.reason]
         if main.fit is None:

@@ -32,17 +32,17 @@ def kind(free: Free) -> str:
 
 
 def limits(free: Free) -> tuple[float, float]:
-    """Lower and upper as numbers: where one is missing, zero or infinity by the start's sign.
+    """Return lower and upper bound; a missing one is zero or infinity by the sign of the start.
 
-    One bound on a parameter of one sign leaves zero as the other: a positive mass below 2 kg lies
-    between 0 and 2. Not so where its sign may be any.
+    A positive mass below 2 kg lies between 0 and 2. Where any sign is allowed missing bounds are
+    infinite.
     """
     if free.sign == "any":
         return (
             -math.inf if free.lower is None else free.lower,
             math.inf if free.upper is None else free.upper,
         )
-    # Zero cannot be crossed in log coordinates, so it bounds the side on which the start lies.
+    # A logarithm cannot cross zero.
     low = free.lower if free.lower is not None else (0.0 if free.start > 0 else -math.inf)
     high = free.upper if free.upper is not None else (0.0 if free.start < 0 else math.inf)
     return low, high
@@ -54,9 +54,8 @@ def changes_sign(free: Free) -> bool:
 
 
 def scale(free: Free) -> float:
-    """The size of a parameter that may have any sign: that of its start, else of its prior or
-    bound, else one unit."""
-    # Of these the first that is not zero: a start of zero says nothing of the parameter's size.
+    """Return the size of a parameter of any sign: that of its start, else of its prior or bound,
+    else one unit."""
     sizes = [abs(free.start)]
     if free.prior is not None:
         sizes += [abs(free.prior.mean), free.prior.sd]
@@ -66,14 +65,13 @@ def scale(free: Free) -> float:
 
 def sign_or_scale(free: Free) -> float:
     """Return the `sign` that `to_value` and `to_coordinate` take."""
-    # Whichever of the two it is, to_value multiplies by it: one array of numbers serves both.
     if changes_sign(free):
         return scale(free)
     return math.copysign(1.0, free.start) if free.start else 1.0
 
 
 def inside(free: Free, value: float) -> bool:
-    """True if a value lies within the bounds."""
+    """Return True if a value lies within the bounds."""
     low, high = limits(free)
     return bool(low <= value <= high)
 
@@ -84,18 +82,18 @@ def coordinates(free: Free, kind: str, values: Real) -> np.ndarray:
 
 
 def coordinate(free: Free, kind: str, value: float) -> float | None:
-    """The coordinate of a value; None where it lies outside the bounds, or has none."""
+    """Return the coordinate of a value; None where it lies outside the bounds, or has none."""
     z = float(coordinates(free, kind, value))
     return z if inside(free, value) and math.isfinite(z) else None
 
 
 def at_bound(free: Free, value: float) -> bool:
-    """True if an estimate ended at a bound that was stated."""
+    """Return True if an estimate is at a stated bound."""
     low, high = free.lower, free.upper
     width = high - low if low is not None and high is not None else abs(value)
     near = 1e-3 * width
-    # Of a small lower bound beside a wide range: near in proportion to the bound itself, since the
-    # search is in logarithms there.
+    # Near a small lower bound of a wide range in proportion to the bound: coordinates are
+    # logarithms.
     by_low = low is not None and value - low < min(near, 1e-3 * abs(low) if low else near)
     by_high = high is not None and high - value < near
     return bool(by_low or by_high)
