@@ -116,7 +116,7 @@ def alternatives(
         problems[name] = _by_filter_error(
             base, vehicle, form.axes or names[:1], form.poles if form.axes else 0
         )
-    vanishes = _stand_may_vanish(problem)
+    vanishes = without_stand is not None and _stand_may_vanish(problem)
     pairs = [
         (small, large)
         for small, a in forms.items()

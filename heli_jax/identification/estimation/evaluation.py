@@ -96,18 +96,10 @@ def combined_deviations(
         no_effect: part of the largest singular value below which a direction has no effect.
         takes_part: part of such a direction from which on a combination is not determined either.
     """
-    J = np.asarray(J, dtype=np.float64)
     # A simulation that diverged determines nothing.
     if not np.isfinite(J).all():
         return np.full(len(combinations), np.inf)
-    # Columns of one size, so that units do not matter.
-    norms = np.linalg.norm(J, axis=0)
-    norms = np.where(norms > 0, norms, 1.0)
-    # Of J and not of J'J, whose small singular values, the squares, are rounding. The triangle has
-    # the same singular values, and q rows instead of n.
-    _, sizes, right = np.linalg.svd(np.linalg.qr(J / norms, mode="r"))
-    # With fewer rows than unknowns there are directions without effect.
-    sizes = np.concatenate([sizes, np.zeros(J.shape[1] - sizes.size)])
+    norms, sizes, right = _svd(J)
     kept = sizes > no_effect * sizes[0]
     along = (combinations / norms) @ right.T
     lengths = np.linalg.norm(combinations / norms, axis=1)
@@ -123,17 +115,27 @@ def directions(J: np.ndarray, least: float = NULL) -> np.ndarray:
         least: part of the largest singular value of columns of one size, below which a direction is
             rounding, or dependent on the others.
     """
-    norms = np.linalg.norm(J, axis=0)
-    J = np.asarray(J, np.float64) / np.where(norms > 0, norms, 1.0)
-    _, sizes, right = np.linalg.svd(np.linalg.qr(J, mode="r"), full_matrices=False)
+    norms, sizes, right = _svd(J)
     seen = sizes > least * max(sizes[0], 1e-300)
-    return J @ (right[seen].T / sizes[seen])
+    return J / norms @ (right[seen].T / sizes[seen])
 
 
 def pseudoinverse(J: np.ndarray) -> np.ndarray:
     """Return the pseudoinverse (q, n) of rows (n, q), with columns brought to one size first."""
-    # Units must not decide which singular values are cut.
+    norms, sizes, right = _svd(J)
+    kept = sizes > NULL * sizes[0]
+    V = right[kept].T / sizes[kept]
+    return V @ (J / norms @ V).T / norms[:, None]
+
+
+def _svd(J: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the norms of the columns of J (n, q), and singular values (q,) and right singular
+    vectors (q, q) of J with columns of size 1, so that units do not matter."""
+    J = np.asarray(J, np.float64)
     norms = np.linalg.norm(J, axis=0)
     norms = np.where(norms > 0, norms, 1.0)
-    Q, R = np.linalg.qr(np.asarray(J, np.float64) / norms)
-    return np.linalg.pinv(R, rcond=NULL) @ Q.T / norms[:, None]
+    # Of J and not of J'J, whose small singular values, the squares, are rounding. The triangle has
+    # the same singular values, and q rows instead of n.
+    _, sizes, right = np.linalg.svd(np.linalg.qr(J / norms, mode="r"))
+    # With fewer rows than unknowns there are directions without effect.
+    return norms, np.concatenate([sizes, np.zeros(J.shape[1] - sizes.size)]), right

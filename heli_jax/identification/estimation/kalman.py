@@ -108,17 +108,6 @@ def _moments_after(
 # The extended filter: a model linearised anew at every estimate (Ozaki's local linearisation).
 
 
-class _Equations(NamedTuple):
-    """A model's equations over vectors, linearised at every estimate."""
-
-    rates: Callable[[Array, Any], Array]
-    """(state (n,), Inputs) -> (n,), per second"""
-    intensity: Float[Array, " n"]
-    """of the process noise, see `Model.noise_intensity`"""
-    explicit: bool
-    """see `Model.explicit`"""
-
-
 def _local(drive: Drive) -> Filter:
     """Return the extended filter: the model linearised at every estimate (Ozaki, 1985)."""
     model, params, inputs, options, linear, measured = drive
@@ -142,7 +131,19 @@ def _local(drive: Drive) -> Filter:
     noise = model.noise_intensity
     none = jnp.zeros(len(naming.names(model.State)), dtype)
     intensity = none if noise is None else naming.ravel(noise(params), dtype)
-    equations = _Equations(rates, intensity, model.explicit)
+
+    def along(estimate: Estimate, part: Segment) -> Estimate:
+        """Return the estimate after a part of an interval, linearised in each of its substeps."""
+        h = part.length / options.substeps
+
+        def step(estimate: Estimate, j: Array) -> tuple[Estimate, None]:
+            now = part.inputs
+            if part.slope is not None:
+                now = jax.tree.map(lambda u, slope: u + slope * (j * h), now, part.slope)
+            after = _moments_after if model.explicit else _linearised_after
+            return after(rates, intensity, estimate, Segment(h, now, part.slope)), None
+
+        return jax.lax.scan(step, estimate, jnp.arange(options.substeps, dtype=dtype))[0]
 
     def measure(x: Array, sample: Any) -> tuple[Array, Array]:
         u = sample[1]
@@ -153,30 +154,21 @@ def _local(drive: Drive) -> Filter:
         held, _, slopes = sample
         estimate = (x, P)
         for part in zip(lengths, held, slopes, strict=True):
-            estimate = _along(equations, estimate, Segment(*part), options.substeps)
+            estimate = along(estimate, Segment(*part))
         return estimate
 
     return Filter((held, acting, slopes if linear else (None,) * len(held)), measure, move)
 
 
-def _along(equations: _Equations, estimate: Estimate, part: Segment, substeps: int) -> Estimate:
-    """Return the estimate after a part of an interval, linearised in each of its substeps."""
-    h = part.length / substeps
-
-    def step(estimate: Estimate, j: Array) -> tuple[Estimate, None]:
-        now = part.inputs
-        if part.slope is not None:
-            now = jax.tree.map(lambda u, slope: u + slope * (j * h), now, part.slope)
-        return _step(equations, estimate, Segment(h, now, part.slope)), None
-
-    return jax.lax.scan(step, estimate, jnp.arange(substeps, dtype=estimate[0].dtype))[0]
-
-
-def _step(equations: _Equations, estimate: Estimate, part: Segment) -> Estimate:
-    """Return the estimate one step on, by the model linearised at the begin of the step."""
-    (x, P), (rates, intensity, explicit) = estimate, equations
-    if explicit:
-        return _moments_after(rates, intensity, estimate, part)
+def _linearised_after(
+    rates: Callable[[Array, Any], Array],
+    intensity: Float[Array, " n"],
+    moments: Estimate,
+    part: Segment,
+) -> Estimate:
+    """Return the moments after one step of the model linearised at its begin; arguments as of
+    `_moments_after`."""
+    x, P = moments
     n, A, f = x.shape[0], jax.jacfwd(rates)(x, part.inputs), rates(x, part.inputs)
     if part.slope is not None:
         # Time is one more state, of rate 1 and without variance: its column of derivatives makes
