@@ -79,11 +79,11 @@ def _costs_at(
 def draw(
     layout: Layout, problem: Problem, z0: Float[Array, " q"], starts: int, seed: int
 ) -> Float[Array, "s q"]:
-    """Starts (s, q): the first is z0, the others differ in the free parameters.
+    """Draw starts (s, q): the first is z0, the others differ in the free parameters.
 
     Between two bounds of one sign the draw is uniform in log, between two of different sign
-    uniform; elsewhere log-normal about the start, a factor of three wide or as wide as the prior,
-    and of either sign where that may be any.
+    uniform; else log-normal about the start, a factor of three wide or as wide as the prior, and of
+    either sign where any is allowed.
     """
     rng = np.random.default_rng(seed)
     rows = np.tile(np.asarray(z0, dtype=np.float64), (max(starts, 1), 1))
@@ -94,7 +94,7 @@ def draw(
 
 
 def _draw_values(free: Free, size: int, rng: np.random.Generator) -> np.ndarray:
-    # Off the bounds, where a bounded coordinate has no slope left.
+    # Not at the bounds.
     share = rng.uniform(0.02, 0.98, size)
     low, high = free.lower, free.upper
     if low is not None and high is not None:
@@ -103,18 +103,18 @@ def _draw_values(free: Free, size: int, rng: np.random.Generator) -> np.ndarray:
         return low + (high - low) * share
     width = 1.1  # e^1.1 is a factor of three
     if free.prior is not None and free.prior.mean:
-        # Twice the prior: a start beyond would only be pulled back.
+        # Twice as wide as the prior: it would pull back a start beyond.
         width = min(width, 2.0 * free.prior.sd / abs(free.prior.mean))
     # Log-normal: a parameter of physics is more likely wrong by a factor than by an amount, and
     # keeps its sign.
     values = free.start * np.exp(width * rng.standard_normal(size))
     if transforms.changes_sign(free):
-        # As large as the start; about the prior's mean where there is one, which knows more.
+        # As large as the start, or about the mean of the prior.
         drawn = rng.standard_normal((2, size))
         values = transforms.scale(free) * np.exp(width * drawn[0]) * np.sign(drawn[1])
         if free.prior is not None:
             values = free.prior.mean + 2.0 * free.prior.sd * drawn[0]
-    # A single bound does not shape the draw: what lies beyond it begins at the start value instead.
+    # A value beyond a single bound is replaced by the start.
     return np.where([transforms.inside(free, float(v)) for v in values], values, free.start)
 
 
@@ -161,7 +161,7 @@ def delay_start(
 
 
 def _grids(problem: Problem, layout: Layout, data: Data, J: np.ndarray) -> dict[int, np.ndarray]:
-    """The coordinates to try by number of the unknown, in increasing order."""
+    """Return the coordinates to try, in increasing order, by number of the unknown."""
     grids = {}
     for name in problem.model.delay_parameters:
         if name not in problem.free:
@@ -190,7 +190,7 @@ def _between(low: float, high: float, step: float) -> np.ndarray:
 
 
 def _step(layout: Layout, data: Data, J: np.ndarray, i: int) -> float:
-    """The step between values of a delay [s], by how fast its effect on the rows changes."""
+    """Return the step between values of a delay [s], by how fast its effect on the rows changes."""
     dt = min(float(f.dt) for f in data.flights)
     if layout.noise_model != "white":
         return dt
