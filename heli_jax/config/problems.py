@@ -227,12 +227,8 @@ def candidate_models(experiment: Experiment, fitted: Problem) -> "Alternatives":
     Raises:
         InputError: no axis of the model can be disturbed.
     """
-    # Imported on demand: the optimiser takes a second to import.
-    from heli_jax.identification.select import (
-        alternatives,
-        disturbed_sets,
-        undisturbed_too,
-    )
+    # Not before it is needed: it imports the optimiser, which takes a second.
+    from heli_jax.identification.select import alternatives, undisturbed_too
 
     model, disturbance = experiment.model, experiment.config.disturbance
     axes = disturbable(model)
@@ -247,13 +243,10 @@ def candidate_models(experiment: Experiment, fitted: Problem) -> "Alternatives":
     asked = (
         stated if disturbance is not None and disturbance.axis else undisturbed_too(model, stated)
     )
-    if len(asked) > 1:
-        with located(f"{experiment.path}: disturbance"):
-            return disturbed_sets(fitted, model, asked, stated)
-    axis = next(iter(asked))
-    # The stand is compared only if its stiffness is free.
-    bare = model.without_stand if "kappa" in fitted.free else None
-    return alternatives(fitted, model, axis, without_stand=bare)
+    # Whether there is a stand is in question only where its stiffness is.
+    bare = model.without_stand if len(asked) == 1 and "kappa" in fitted.free else None
+    with located(f"{experiment.path}: disturbance"):
+        return alternatives(fitted, model, asked, stated=stated, without_stand=bare)
 
 
 # Params are classes of each model, hence Any.

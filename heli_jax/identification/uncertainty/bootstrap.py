@@ -1,6 +1,6 @@
 """Parametric bootstrap."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -14,8 +14,7 @@ from heli_jax.identification.estimation.frequency_lines import (
     in_time_of,
     records_of,
 )
-from heli_jax.identification.estimation.levenberg_marquardt import Optimum
-from heli_jax.identification.estimation.many_runs import optimise_many
+from heli_jax.identification.estimation.levenberg_marquardt import Optimum, optimise
 from heli_jax.identification.estimation.multistart import Search
 from heli_jax.identification.estimation.noise_covariance import relax_noise_covariance
 from heli_jax.identification.result import Fit
@@ -24,6 +23,8 @@ from heli_jax.identification.unknowns.layout import Data, Layout, Solution, unpa
 
 _STEPS = 200
 """steps of the optimiser in frequency, at most"""
+_STEPS_IN_TIME = 60
+"""the same in time, from the fit's optimum"""
 
 
 class Bootstrap(NamedTuple):
@@ -42,17 +43,12 @@ class Bootstrap(NamedTuple):
         return float(low), float(high)
 
 
-def bootstrap(
-    fit: Fit, runs: int = 200, *, seed: int = 0, say: Callable[[str], None] = lambda _: None
-) -> Bootstrap:
+def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
     """Refit records simulated with the estimates: same inputs and missing samples, new noise.
 
     Filter error draws a new disturbance. Output error adds white noise, or noise with the
     covariance of autocorrelated residuals over time and between outputs. Frequency error draws
     residuals line by line, and estimates the spectrum again.
-
-    Args:
-        say: called with a sentence if many records are not fitted by compiled programs.
 
     Raises:
         ValueError: no run, a free time shift in a fit in time, a parameter that is not
@@ -74,19 +70,25 @@ def bootstrap(
     prior_sd = np.where(np.isfinite(at.data.prior_sd), at.data.prior_sd, 0.0)
     records = () if in_frequency else _records(fit, at, runs, seed, rng)
     means = values + prior_sd * rng.standard_normal((runs, values.size))
-    means = jnp.asarray(means, at.z.dtype)
+    means = means.astype(at.z.dtype)
 
-    def data(record: Any) -> Data:
-        outputs, mean = record
-        each = zip(at.data.flights, outputs, strict=True)
-        flights = tuple(f._replace(outputs=y) for f, y in each)
-        return at.data._replace(flights=flights, prior_mean=mean)
+    def data(k: int) -> Data:
+        flights = tuple(
+            f._replace(outputs={n: y[k] for n, y in outputs.items()})
+            for f, outputs in zip(at.data.flights, records, strict=True)
+        )
+        return at.data._replace(flights=flights, prior_mean=means[k])
 
     if in_frequency:
         z, converged = _fit_by_lines(at, means, rng)
     else:
-        optima = optimise_many(at, data, runs, (records, means), say)
-        z, converged = optima.z, np.asarray(optima.converged)
+        optima = []
+        for k in range(runs):
+            # The outer stage counts records.
+            with stages.stage("one record", shown=False):
+                optima.append(optimise(at.layout, data(k), at.noise, at.z, _STEPS_IN_TIME))
+            stages.advance()
+        z, converged = np.stack([o.z for o in optima]), np.array([o.converged for o in optima])
     # Without the nuisances, whose weak priors are not drawn.
     fitted = np.flatnonzero(converged)
     z = jnp.asarray(np.asarray(z)[fitted])
@@ -99,7 +101,7 @@ def bootstrap(
 
 def _records(
     fit: Fit, at: Solution, runs: int, seed: int, rng: np.random.Generator
-) -> tuple[dict[str, Array], ...]:
+) -> tuple[dict[str, np.ndarray], ...]:
     """Return simulated outputs by flight, (runs, N); NaN where the record has it."""
     u = unpack(at.layout, at.data, at.z)
     noise_free = at.layout.objective.records(at, u, runs, seed)
@@ -117,7 +119,7 @@ def _records(
                 noise = coloured[:, at.layout.outputs[i].index(n)]
             record = np.asarray(outputs[n]) + float(u.biases[i][n]) + noise
             record = np.where(np.isnan(np.asarray(y)), np.nan, record)
-            by_output[n] = jnp.asarray(record, at.z.dtype)
+            by_output[n] = record.astype(at.z.dtype)
         records.append(by_output)
     return tuple(records)
 
@@ -128,9 +130,7 @@ def _fit_by_lines(
     """Fit drawn records one by one, each with its own means of priors and spectrum; return the
     unknowns and convergence."""
     z, converged = [], []
-    begun = Optimum(
-        at.z, jnp.zeros((), at.z.dtype), np.asarray(0), np.asarray(True), np.asarray(np.inf)
-    )
+    begun = Optimum(at.z, 0.0, 0, True)
     for mean, data in zip(means, _spectrum_records(at, rng), strict=False):
         search = _FromOptimum(at.layout, data._replace(prior_mean=mean))
         # The outer stage counts records.
@@ -147,7 +147,7 @@ class _FromOptimum(Search):
 
     def __init__(self, layout: Layout, data: Data) -> None:
         self.problem: Any = None
-        self.layout = self.bounded = layout
+        self.layout = layout
         self.data, self.max_steps = data, _STEPS
 
 

@@ -78,7 +78,7 @@ def intervals(
     if runs:
         report(f"bootstrap, {runs} records")
         with stage("bootstrap", total=runs):
-            booted = bootstrap(fit, runs, seed=seed, say=report)
+            booted = bootstrap(fit, runs, seed=seed)
     if draws:
         report(f"NUTS, 4 chains of {draws} draws")
         with stage("NUTS"):
