@@ -67,9 +67,8 @@ class Averages(NamedTuple):
     share: np.ndarray
     """(p, k, m) of each error how much of an independent one it is: errors at neighbouring lines
     are correlated, and responses are smooth"""
-    power: np.ndarray
-    """(k,) of white noise in a window over its density: less than 1 at the first line, of which the
-    mean takes a part"""
+    freedom: np.ndarray
+    """(k, p) squares of white noise of density 1 that no response explains, summed over windows"""
 
 
 def averages(w: Windowed) -> Averages:
@@ -82,14 +81,22 @@ def averages(w: Windowed) -> Averages:
     cases, case = np.unique(w.seen, axis=1, return_inverse=True)
     masks, case = cases.T, case.reshape(-1)
     V = np.array([[_spread(w, a, b, near[0]) for b in masks] for a in masks])
-    P, share = [], []
-    for seen in masks:
+    P, share, freedom = [], [], []
+    # White noise at the first line has a density below 1: the mean takes a part of it.
+    power = np.real(near[0][0])
+    for i, seen in enumerate(masks):
         S = _cross(seen, w.Z, w.U)
         z, u = (np.real(np.einsum("kaa->ka", _cross(seen, v, v))) for v in (w.Z, w.U))
         P.append(inverse(S, z, u))
         share.append(_share(w, seen, np.nan_to_num(P[-1]), near))
-    power = np.real(near[0][0])
-    return Averages(np.stack(P)[case], V[case][:, case], np.stack(share)[case], power)
+        taken = np.real(np.einsum("kab,kba->k", _inverse_power(w, seen), V[i, i]))
+        freedom.append(np.maximum(np.sum(seen) * (power - taken), 0.5))
+    return Averages(
+        np.stack(P)[case],
+        V[case][:, case],
+        np.stack(share)[case],
+        np.stack(freedom, axis=1)[:, case],
+    )
 
 
 def _cross(seen: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -180,7 +187,8 @@ def noise_density(
     width = np.clip(least, 0.5 * _WIDEST, _WIDEST) * np.maximum(1.0, _PART * w.lines)
     kernel = np.exp(-0.5 * ((w.lines[:, None] - w.lines[None, :]) / width[:, None]) ** 2)
     kernel = kernel / np.sum(kernel, axis=1, keepdims=True)
-    own = np.maximum(np.real(np.einsum("kii->ki", _left(w, E, w.seen))), floor)
+    own = np.sum(np.abs(_unexplained(w, E, w.seen)) ** 2, axis=0) / at.freedom
+    own = np.maximum(own, floor)
     # The mean over lines of a steep spectrum is too large: it is taken of the spectrum over its
     # geometric mean (Blackman and Tukey, 1958, prewhitening).
     shape = np.exp(kernel @ np.log(own))
@@ -189,31 +197,31 @@ def noise_density(
     if w.together:
         # Coherences are taken from windows that all outputs have: those of pairs would contradict
         # one another, and the matrix would not be positive definite.
-        S = _left(w, E, np.repeat(w.common[:, None], p, axis=1))
-        S = S / np.sqrt(shape[:, :, None] * shape[:, None, :])
-        S = np.einsum("kl,lij->kij", kernel, S)
+        D = _unexplained(w, E, np.repeat(w.common[:, None], p, axis=1)) / np.sqrt(shape)
+        S = np.einsum("kl,wli,wlj->kij", kernel, D, np.conj(D), optimize=True)
         root = np.sqrt(np.maximum(np.real(np.einsum("kii->ki", S)), _ROUNDING))
         R = S / (root[:, :, None] * root[:, None, :])
-    return _definite(R * size[:, :, None] * size[:, None, :], floor) / at.power[:, None, None]
+    return _definite(R * size[:, :, None] * size[:, None, :], floor)
 
 
-def _left(w: Windowed, E: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """(k, p, p) spectral matrix of what inputs (their instruments) leave of errors in the windows
-    seen (W, p); of outputs with different windows only the diagonal is sound."""
-    P = []
-    for mask in seen.T:
-        # By what follows the instruments in the errors themselves, not by a response by instrument:
-        # that one is anything where the excitation has no power, and what it left would be as well.
-        S_zz = _cross(mask, w.Z, w.Z)
-        power = np.real(np.einsum("kaa->ka", S_zz))
-        P.append(np.nan_to_num(inverse(S_zz, power, power)))
+def _unexplained(
+    w: Windowed, E: Complex[np.ndarray, "W k p"], seen: Float[np.ndarray, "W p"]
+) -> Complex[np.ndarray, "W k p"]:
+    """Return the part of errors that no response to the instruments explains, in the windows
+    seen."""
+    # By regression on the instruments and not by the response: that one is unbounded where the
+    # excitation has no power.
+    P = np.stack([_inverse_power(w, mask) for mask in seen.T])
     S_ze = np.einsum("wp,wkz,wkp->kpz", seen, np.conj(w.Z), E, optimize=True)
-    part = np.einsum("pkmz,kpz->kpm", np.stack(P), S_ze / np.sum(seen, axis=0)[None, :, None])
-    D = (E - np.einsum("wkm,kpm->wkp", w.Z, part, optimize=True)) * seen[:, None, :]
-    # Each input takes one of the independent averages for its own response.
-    freedom = np.maximum(np.sum(seen, axis=0) - PER_AVERAGE * len(w.inputs), 0.5)
-    S = np.einsum("wki,wkj->kij", D, np.conj(D), optimize=True)
-    return S / np.sqrt(freedom[:, None] * freedom[None, :])
+    part = np.einsum("pkmz,kpz->kpm", P, S_ze / np.sum(seen, axis=0)[None, :, None])
+    return (E - np.einsum("wkm,kpm->wkp", w.Z, part, optimize=True)) * seen[:, None, :]
+
+
+def _inverse_power(w: Windowed, seen: Float[np.ndarray, " W"]) -> Complex[np.ndarray, "k m m"]:
+    """Return the inverse of the instruments' spectral matrix; zero where they move as one."""
+    S_zz = _cross(seen, w.Z, w.Z)
+    power = np.real(np.einsum("kaa->ka", S_zz))
+    return np.nan_to_num(inverse(S_zz, power, power))
 
 
 def _definite(S: np.ndarray, floor: np.ndarray) -> np.ndarray:
