@@ -2,10 +2,9 @@
 
     .venv/bin/python experiments/response_weights.py [RUNS] [WINDOW] [FIRST]
 
-The records of experiments/frequency_response.py with gusts and pilot steps. `frequency-response`
-uses four spectra. One is known: the mean over 150 records of gusts and noise in the same windows.
-One is estimated. One is a mean over lines without the vehicle's response to gusts. One is a mean
-over two lines of the window for any number of averages.
+The records of experiments/frequency_response.py with gusts and pilot steps. `frequency-response` is
+given the spectrum, the mean of that of gusts and noise alone over 150 records in the same windows;
+estimates it; and estimates it by a mean over two lines of the window whatever the averages.
 """
 
 from unittest import mock
@@ -39,19 +38,13 @@ def density(window: float) -> np.ndarray:
 def main(runs: int, window: float, first: int) -> None:
     known = density(window)
 
-    def told(w, at, E, described=None) -> np.ndarray:
-        return known / at.power[:, None, None]
+    def given(w, at, E) -> np.ndarray:
+        return known
 
-    # Without a vehicle model of the gusts' spectrum.
-    alone = mock.patch.object(frequency_response, "gusts_through", return_value=None)
     cases = {
-        "known": [mock.patch.object(m, "noise_density", told) for m in MODULES],
+        "known": [mock.patch.object(m, "noise_density", given) for m in MODULES],
         "estimated": [],
-        "mean alone": [alone],
-        "mean alone, over two lines": [
-            alone,
-            mock.patch.object(response_weights, "_ENOUGH", np.inf),
-        ],
+        "estimated over two lines": [mock.patch.object(response_weights, "_ENOUGH", np.inf)],
     }
     print("| spectrum | " + " | ".join(NAMES) + " |\n|---|" + "---|" * len(NAMES))
     for name, patches in cases.items():

@@ -14,11 +14,6 @@ from heli_jax.identification.estimation.frequency_noise import (
     smoothed,
     whitening_by,
 )
-from heli_jax.identification.validation.closed_loop_trust import (
-    Loop,
-    Moved,
-    untrusted,
-)
 from heli_jax.identification.validation.follows_response import Feedback
 
 DT, N = 0.02, 4500
@@ -89,26 +84,27 @@ def test_a_state_that_no_output_shows_takes_no_part_in_the_spectrum():
 
 
 def test_a_closed_loop_is_said_only_of_inputs_without_an_instrument():
-    moved = {"Mm": Moved(0.6), "Ll": Moved(0.1, 0.2), "Lp": Moved(0.0)}
+    moved = {"Mm": 0.6, "Ll": 0.3, "Lp": 0.1}
     loops = [Feedback("one", n, "p", 0.3, (0.1, 0.1), 1e-6) for n in ("lat", "lon")]
-    assert untrusted(moved, Loop(loops)) == ("Mm", "Ll")
-    assert untrusted(moved, Loop(loops, ("lat", "lon"))) == ()
-    assert trust(moved, Loop(loops, ("lat", "lon"))) == []
-    [found] = trust({"Mm": moved["Mm"]}, Loop(loops, ("lat",)))
+    [found] = trust(moved, loops)
     assert (found.code, found.severity) == ("loop.no-instrument", "doubt")
-    assert found.distrusts == ("Mm",)
-    [found] = trust({"Lp": Moved(0.003)}, Loop(loops))
+    assert found.distrusts == ("Mm", "Ll")
+    assert trust(moved, loops, ("lat", "lon")) == []
+    [found] = trust(moved, loops, ("lat",))
+    assert found.distrusts == ("Mm", "Ll", "Lp")
+    [found] = trust({"Lp": 0.003}, loops)
     assert (found.severity, found.value, found.distrusts) == ("note", 0.003, ())
     # However coherent the residual is with the response: no loop was found.
     open_loop = [one._replace(p_value=0.5) for one in loops]
-    assert untrusted(moved, Loop(open_loop)) == ()
-    assert trust(moved, Loop(open_loop)) == []
-    [found] = trust(moved, Loop(open_loop, held=True))
+    assert trust(moved, open_loop) == []
+    [found] = trust(moved, open_loop, held=True)
     assert found.distrusts == ("Mm", "Ll")
 
 
-def trust(moved, loop):
-    """What a fit with such a loop says of its estimates."""
-    follows = any(one.present for one in loop.found)
-    fitted = SimpleNamespace(moved=moved, loop=loop, instruments=loop.instruments, follows=follows)
-    return list(moved_by_feedback(fitted))
+def trust(moved, feedback, instruments=(), *, held=False):
+    """Return the findings of a fit with such a loop."""
+    follows = any(one.present for one in feedback)
+    context = SimpleNamespace(
+        moved=moved, feedback=feedback, instruments=instruments, held=held, follows=follows
+    )
+    return list(moved_by_feedback(context))

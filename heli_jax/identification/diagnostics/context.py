@@ -42,8 +42,6 @@ from heli_jax.identification.validation.adequacy import (
     misses,
 )
 from heli_jax.identification.validation.closed_loop_trust import (
-    Loop,
-    Moved,
     held_poles,
     moved_by_feedback,
 )
@@ -184,11 +182,22 @@ class Context:
         return any(one.present for one in self.feedback)
 
     @cached_property
-    def moved(self) -> dict[str, Moved]:
-        """By unknown of interest what feedback may have done to it; empty where nothing is told."""
+    def _held_poles(self) -> list[float]:
+        return held_poles(self.at)
+
+    @property
+    def held(self) -> bool:
+        """True in frequency if the model is unstable and a record does not grow."""
+        return bool(self.moved) and any(pole > 0.0 for pole in self._held_poles)
+
+    @cached_property
+    def moved(self) -> dict[str, float]:
+        """In frequency: by unknown of interest the part of its information that may come from
+        feedback."""
         if not self.arrived or self.unrelated:
             return {}
-        return moved_by_feedback(self.at, np.asarray(self.e.J))
+        poles = self._held_poles
+        return moved_by_feedback(self.at, [0.0] * len(poles) if self.instruments else poles)
 
     @cached_property
     def instruments(self) -> tuple[str, ...]:
@@ -197,12 +206,6 @@ class Context:
             return self.responses.instruments
         by_instrument = self.at.data.flights[0].by_instrument is not None
         return instruments_of(self.problem) if by_instrument else ()
-
-    @cached_property
-    def loop(self) -> Loop:
-        """Feedback, instruments, and whether somebody holds an unstable vehicle."""
-        held = bool(self.moved) and any(pole > 0.0 for pole in held_poles(self.at))
-        return Loop(self.feedback, self.instruments, held)
 
     # Whether the model explains the record.
 
@@ -396,7 +399,7 @@ class Context:
         in_one_piece, in_frequency = checked.free_run, None
         free_run = signals_of(flights, in_one_piece) if in_one_piece is not None else ()
         if self.arrived:
-            feedback = (self.loop.held or self.follows) and not self.instruments
+            feedback = (self.held or self.follows) and not self.instruments
             in_frequency = validate_in_frequency(problem, at, self.e, flights, feedback=feedback)
         return HeldOut(signals, free_run, in_frequency)
 

@@ -9,8 +9,8 @@ from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.adequacy import is_unstable
 from heli_jax.identification.validation.closed_loop_trust import (
+    BESIDE,
     MAY_BE,
-    untrusted,
     weak_by_instrument,
 )
 from heli_jax.identification.validation.follows_response import LEVEL
@@ -73,27 +73,33 @@ def _frees_a_delay(problem: Problem, late: Sequence[str]) -> str:
 
 def moved_by_feedback(c: Context) -> Iterator[Finding]:
     """Parameters that feedback may have moved in frequency, where no excitation was logged."""
-    if not (c.moved and c.loop.closed):
+    by = c.instruments
+    closed = any(one.present for one in c.feedback) or (c.held and not by)
+    direct = [one for one in c.feedback if one.input not in by]
+    # Whoever closes the loop of an input with an instrument may move the others as well.
+    inputs = list(dict.fromkeys(one.input for one in [f for f in direct if f.present] or direct))
+    if not (c.moved and closed) or (by and not inputs):
         return
-    doubted = untrusted(c.moved, c.loop)
-    shares = {n: c.moved[n].part for n in doubted or c.moved}
+    limit = BESIDE if by else MAY_BE
+    doubted = tuple(n for n, part in c.moved.items() if part > limit)
+    parts = {n: c.moved[n] for n in doubted or c.moved}
     yield found(
         "loop.no-instrument" if doubted else "loop.no-instrument-harmless",
         "doubt" if doubted else "note",
-        *c.loop.inputs,
-        value=max(shares.values()),
+        *inputs,
+        value=max(parts.values()),
         distrusts=doubted,
-        of=" and ".join(c.loop.inputs) if c.instruments else "",
-        inputs=c.loop.inputs if c.instruments else ["the inputs"],
+        of=" and ".join(inputs) if by else "",
+        inputs=inputs if by else ["the inputs"],
         held="" if c.follows else "the vehicle is held",
-        names=list(shares),
-        shares=list(shares.values()),
-        limit=MAY_BE,
+        names=list(parts),
+        shares=list(parts.values()),
+        limit=limit,
     )
 
 
 def weak_instruments(c: Context) -> Iterator[Finding]:
-    """Parameters of which the logged excitation tells too little."""
+    """Parameters on which the logged excitation has too little information."""
     names = weak_by_instrument(c.problem, c.at) if c.arrived else ()
     if names:
         yield found("loop.weak-instrument", "doubt", *names, distrusts=names, limit=STRONG)

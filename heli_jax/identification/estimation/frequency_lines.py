@@ -215,7 +215,7 @@ def discretised(
             states=_with(u.states, first, state), offsets=_with(u.offsets, first, offset)
         )
         condition = layout.flight_facts[first].condition if layout.flight_facts else None
-        model, drive, _ = linear_drive(layout, driven(layout, numbers, here, first), condition)
+        model, drive = linear_drive(layout, driven(layout, numbers, here, first), condition)
         model, inputs, linear = between_samples(
             model, drive.inputs, drive.inputs, layout.hold(first)
         )

@@ -53,7 +53,6 @@ from heli_jax.identification.estimation.response_weights import (
     ResponseWeights,
     back,
     first_weights,
-    gusts_through,
     noise_density,
     on_device,
     response_of,
@@ -341,8 +340,7 @@ class FrequencyResponse(Objective):
         z = in_time(layout, data, noise, z)
         weights = back(noise.whitening)
         errors = np.asarray(errors_in_windows(layout, data, noise.whitening, z))
-        shape = gusts_through(layout, data, z, weights.windows)
-        density = noise_density(weights.windows, weights.averages, errors, shape)
+        density = noise_density(weights.windows, weights.averages, errors)
         weights = weighed(weights, density)
         level = -2.0 * weights.log_determinant / max(weights.numbers, 1.0)
         sd = _sd(layout, data, weights, z)

@@ -13,13 +13,12 @@ Sources: Bendat and Piersol, Random Data (2010), chapter 9; Pintelon and Schouke
 2, for the estimate by instrument.
 """
 
-import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Bool, Complex, Float
 
 from heli_jax import naming
 from heli_jax.analysis.responses import inverse
@@ -36,12 +35,7 @@ from heli_jax.analysis.spectra import (
 from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
-from heli_jax.identification.estimation.frequency_noise import (
-    first_model,
-    gust_spectrum,
-)
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.layout import Data, Layout
 
 _WIDEST = 2.0
 """sd of the Gaussian that smooths the noise's spectrum over frequency, in lines of the window: half
@@ -62,11 +56,6 @@ _SMALLEST = 1e-9
 none of their own"""
 
 
-type Described = Callable[[np.ndarray, list[int]], np.ndarray | None]
-"""of raw spectral matrices (k, q, q) of some outputs, by their place in the windows, what the
-vehicle makes of gusts, and white noise: (k, q, q), or None where that says nothing"""
-
-
 class Averages(NamedTuple):
     """The errors of responses as the inputs alone determine them; p outputs, m inputs, k lines."""
 
@@ -78,9 +67,8 @@ class Averages(NamedTuple):
     share: np.ndarray
     """(p, k, m) of each error how much of an independent one it is: errors at neighbouring lines
     are correlated, and responses are smooth"""
-    power: np.ndarray
-    """(k,) of white noise in a window over its density: less than 1 at the first line, of which the
-    mean takes a part"""
+    freedom: np.ndarray
+    """(k, p) squares of white noise of density 1 that no response explains, summed over windows"""
 
 
 def averages(w: Windowed) -> Averages:
@@ -93,14 +81,22 @@ def averages(w: Windowed) -> Averages:
     cases, case = np.unique(w.seen, axis=1, return_inverse=True)
     masks, case = cases.T, case.reshape(-1)
     V = np.array([[_spread(w, a, b, near[0]) for b in masks] for a in masks])
-    P, share = [], []
-    for seen in masks:
+    P, share, freedom = [], [], []
+    # White noise at the first line has a density below 1: the mean takes a part of it.
+    power = np.real(near[0][0])
+    for i, seen in enumerate(masks):
         S = _cross(seen, w.Z, w.U)
         z, u = (np.real(np.einsum("kaa->ka", _cross(seen, v, v))) for v in (w.Z, w.U))
         P.append(inverse(S, z, u))
         share.append(_share(w, seen, np.nan_to_num(P[-1]), near))
-    power = np.real(near[0][0])
-    return Averages(np.stack(P)[case], V[case][:, case], np.stack(share)[case], power)
+        taken = np.real(np.einsum("kab,kba->k", _inverse_power(w, seen), V[i, i]))
+        freedom.append(np.maximum(np.sum(seen) * (power - taken), 0.5))
+    return Averages(
+        np.stack(P)[case],
+        V[case][:, case],
+        np.stack(share)[case],
+        np.stack(freedom, axis=1)[:, case],
+    )
 
 
 def _cross(seen: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -176,73 +172,56 @@ def response_of(
 
 
 def noise_density(
-    w: Windowed,
-    at: Averages,
-    E: Complex[np.ndarray, "W k p"],
-    described: Described | None = None,
+    w: Windowed, at: Averages, E: Complex[np.ndarray, "W k p"]
 ) -> Complex[np.ndarray, "k p p"]:
-    """The spectral matrix of what no response explains of the errors, smoothed over frequency.
+    """Return the spectral matrix of the part of errors that no response explains, smoothed over
+    frequency.
 
     Args:
         E: errors (W, k, p); zero in windows that an output does not have.
-        described: the mean over lines is taken of what is left by it.
     """
-    own = np.real(np.einsum("kii->ki", _left(w, E, w.seen)))
-    p, power = own.shape[1], np.mean(np.abs(w.Y) ** 2, axis=(0, 1))
+    p, power = E.shape[2], np.mean(np.abs(w.Y) ** 2, axis=(0, 1))
     floor = np.maximum(_ROUNDING * power, 1e-300)
     averages = np.maximum(w.averages - len(w.inputs), 0.5)
     least = _ENOUGH * len(w.outputs) / (_LINES * float(np.min(averages)))
     width = np.clip(least, 0.5 * _WIDEST, _WIDEST) * np.maximum(1.0, _PART * w.lines)
     kernel = np.exp(-0.5 * ((w.lines[:, None] - w.lines[None, :]) / width[:, None]) ** 2)
     kernel = kernel / np.sum(kernel, axis=1, keepdims=True)
-    if not w.together:
-        each = [_smoothed(kernel, own[:, i, None, None], [i], described) for i in range(p)]
-        S = np.concatenate(each, axis=1) * np.eye(p)
-        return _definite(S, floor) / at.power[:, None, None]
-    # Coherences from windows that all outputs have: those of pairs would contradict one another,
-    # and the noise that seems to be left of several outputs with a common one would be anything.
-    S = _left(w, E, np.repeat(w.common[:, None], p, axis=1))
-    common = np.real(np.einsum("kii->ki", S))
-    S = _smoothed(kernel, S, list(range(p)), described)
-    shape = np.real(np.einsum("kii->ki", S))
-    own, common = (kernel @ (v / np.maximum(shape, floor)) for v in (own, common))
-    size = np.sqrt(np.maximum(own, _ROUNDING) / np.maximum(common, _ROUNDING))
-    return _definite(S * size[:, :, None] * size[:, None, :], floor) / at.power[:, None, None]
+    own = np.sum(np.abs(_unexplained(w, E, w.seen)) ** 2, axis=0) / at.freedom
+    own = np.maximum(own, floor)
+    # The mean over lines of a steep spectrum is too large: it is taken of the spectrum over its
+    # geometric mean (Blackman and Tukey, 1958, prewhitening).
+    shape = np.exp(kernel @ np.log(own))
+    size = np.sqrt(shape * (kernel @ (own / shape)))
+    R = np.broadcast_to(np.eye(p), (len(own), p, p))
+    if w.together:
+        # Coherences are taken from windows that all outputs have: those of pairs would contradict
+        # one another, and the matrix would not be positive definite.
+        D = _unexplained(w, E, np.repeat(w.common[:, None], p, axis=1)) / np.sqrt(shape)
+        S = np.einsum("kl,wli,wlj->kij", kernel, D, np.conj(D), optimize=True)
+        root = np.sqrt(np.maximum(np.real(np.einsum("kii->ki", S)), _ROUNDING))
+        R = S / (root[:, :, None] * root[:, None, :])
+    return _definite(R * size[:, :, None] * size[:, None, :], floor)
 
 
-def _smoothed(
-    kernel: Float[np.ndarray, "k k"],
-    S: Complex[np.ndarray, "k q q"],
-    outputs: list[int],
-    described: Described | None,
-) -> Complex[np.ndarray, "k q q"]:
-    """The mean over lines of spectral matrices, divided by what is known of their shape."""
-    known = None if described is None else described(S, outputs)
-    if known is None:
-        return np.einsum("kl,lij->kij", kernel, S)
-    L = np.linalg.cholesky(known)
-    white = np.linalg.inv(L)
-    flat = np.einsum("kl,lij->kij", kernel, white @ S @ np.conj(np.swapaxes(white, 1, 2)))
-    return L @ flat @ np.conj(np.swapaxes(L, 1, 2))
-
-
-def _left(w: Windowed, E: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """(k, p, p) spectral matrix of what inputs (their instruments) leave of errors in the windows
-    seen (W, p); of outputs with different windows only the diagonal is sound."""
-    P = []
-    for mask in seen.T:
-        # By what follows the instruments in the errors themselves, not by a response by instrument:
-        # that one is anything where the excitation has no power, and what it left would be as well.
-        S_zz = _cross(mask, w.Z, w.Z)
-        power = np.real(np.einsum("kaa->ka", S_zz))
-        P.append(np.nan_to_num(inverse(S_zz, power, power)))
+def _unexplained(
+    w: Windowed, E: Complex[np.ndarray, "W k p"], seen: Float[np.ndarray, "W p"]
+) -> Complex[np.ndarray, "W k p"]:
+    """Return the part of errors that no response to the instruments explains, in the windows
+    seen."""
+    # By regression on the instruments and not by the response: that one is unbounded where the
+    # excitation has no power.
+    P = np.stack([_inverse_power(w, mask) for mask in seen.T])
     S_ze = np.einsum("wp,wkz,wkp->kpz", seen, np.conj(w.Z), E, optimize=True)
-    part = np.einsum("pkmz,kpz->kpm", np.stack(P), S_ze / np.sum(seen, axis=0)[None, :, None])
-    D = (E - np.einsum("wkm,kpm->wkp", w.Z, part, optimize=True)) * seen[:, None, :]
-    # Each input takes one of the independent averages for its own response.
-    freedom = np.maximum(np.sum(seen, axis=0) - PER_AVERAGE * len(w.inputs), 0.5)
-    S = np.einsum("wki,wkj->kij", D, np.conj(D), optimize=True)
-    return S / np.sqrt(freedom[:, None] * freedom[None, :])
+    part = np.einsum("pkmz,kpz->kpm", P, S_ze / np.sum(seen, axis=0)[None, :, None])
+    return (E - np.einsum("wkm,kpm->wkp", w.Z, part, optimize=True)) * seen[:, None, :]
+
+
+def _inverse_power(w: Windowed, seen: Float[np.ndarray, " W"]) -> Complex[np.ndarray, "k m m"]:
+    """Return the inverse of the instruments' spectral matrix; zero where they move as one."""
+    S_zz = _cross(seen, w.Z, w.Z)
+    power = np.real(np.einsum("kaa->ka", S_zz))
+    return np.nan_to_num(inverse(S_zz, power, power))
 
 
 def _definite(S: np.ndarray, floor: np.ndarray) -> np.ndarray:
@@ -449,89 +428,3 @@ def on_device(weights: ResponseWeights) -> ResponseWeights:
 def back(weights: ResponseWeights) -> ResponseWeights:
     """The same in NumPy."""
     return jax.tree.map(lambda v: np.asarray(v) if isinstance(v, jax.Array) else v, weights)
-
-
-# What the vehicle makes of gusts, as windows show it: a shape for the noise of responses.
-#
-# The noise's spectrum in windows is a mean over few of their lines. Gusts come through the
-# vehicle's own modes, which are no wider than that: the mean makes a wide and low hill of a mode,
-# and what the record tells of the mode is weighed by too much noise beside it and too little at it.
-# So
-#
-# $$S_0 = \sum_i q_i \int |W|^2 h_i h_i^H + R, \qquad [h_1 \ldots h_n] = C (zI - A_d)^{-1}$$
-#
-# is found first, as in `frequency_gusts` but through the windows' own transform W, and the mean is
-# taken of what is left where it is divided by that.
-#
-# Sources: Blackman and Tukey (1958) for prewhitening.
-
-
-_APART = 0.04
-"""part of the frequency within which lines are taken together"""
-_OFFSETS = np.arange(-1.875, 2.0, 0.25)
-"""from a line to the frequencies that a window brings to it, in lines: its main lobe. None of them
-is zero, where integrations have no finite response"""
-
-
-def gusts_through(layout: Layout, data: Data, z: Float[Array, " q"], w: Windowed) -> Described:
-    """The shape that the first flight's vehicle gives to the noise."""
-    seen = dataclasses.replace(layout, outputs=(w.outputs,) * len(data.flights))
-    model = first_model(seen, data, z)
-    return described(np.asarray(model.Ad, float), np.asarray(model.C, float), w)
-
-
-def described(Ad: Float[np.ndarray, "n n"], C: Float[np.ndarray, "p n"], w: Windowed) -> Described:
-    """The shape that a vehicle gives to the noise."""
-    # Each line by itself at first, then those within a part of the frequency.
-    first = [0]
-    while (
-        end := np.searchsorted(w.lines, w.lines[first[-1]] * (1.0 + _APART), "right")
-    ) < w.lines.size:
-        first.append(int(end))
-    count = np.diff(np.append(first, w.lines.size)).astype(float)
-    at = np.add.reduceat(w.lines.astype(float), first) / count
-    with np.errstate(all="ignore"):
-        ways = ways_of(Ad, C, at, w.length)
-
-    def of(raw: Complex[np.ndarray, "k q q"], outputs: list[int]) -> np.ndarray | None:
-        power = np.add.reduceat(raw, first, axis=0) / count[:, None, None]
-        with np.errstate(all="ignore"):
-            S = gust_spectrum(ways[:, :, outputs][:, :, :, outputs], at / w.length, power, count)
-        return None if S is None else _between(S, at, w.lines)
-
-    return of
-
-
-def ways_of(
-    Ad: Float[np.ndarray, "n n"],
-    C: Float[np.ndarray, "p n"],
-    lines: Float[np.ndarray, " c"],
-    length: int,
-) -> Complex[np.ndarray, "c n p p"]:
-    """By line and state what windows show of the outputs in white gusts of power 1."""
-    f = lines[:, None] + _OFFSETS
-    z = np.exp(2j * np.pi * f / length)[:, :, None, None]
-    H = np.swapaxes(C @ np.linalg.inv(z * np.eye(len(Ad)) - Ad), 2, 3)
-    weights = _weights(lines, length)
-    return np.einsum("co,conp,conq->cnpq", weights, H, np.conj(H), optimize=True)
-
-
-def _weights(lines: Float[np.ndarray, " c"], length: int) -> Float[np.ndarray, "c o"]:
-    """The share of the power at each offset that windows bring to a line."""
-    t, window = np.arange(length), hann(length)
-    lobe = np.exp(2j * np.pi * np.outer(_OFFSETS, t) / length) @ window
-    # What the mean of a window takes off is a part of the first line.
-    constant = np.exp(2j * np.pi * np.outer(1.0 + _OFFSETS, t) / length).sum(axis=1)
-    mean = np.mean(window * np.exp(-2j * np.pi * t / length))
-    seen = np.where(lines[:, None] < 1.5, lobe - mean * constant, lobe)
-    return np.abs(seen) ** 2 / np.sum(np.abs(lobe) ** 2)
-
-
-def _between(
-    S: Complex[np.ndarray, "c p p"], at: Float[np.ndarray, " c"], lines: np.ndarray
-) -> Complex[np.ndarray, "k p p"]:
-    """Straight lines from cell to cell."""
-    low = np.clip(np.searchsorted(at, lines, side="right") - 1, 0, max(len(at) - 2, 0))
-    high = np.minimum(low + 1, len(at) - 1)
-    part = np.clip((lines - at[low]) / np.maximum(at[high] - at[low], 1e-300), 0.0, 1.0)
-    return S[low] + part[:, None, None] * (S[high] - S[low])

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from heli_jax import stages
 from heli_jax.identification.estimation.frequency_lines import (
@@ -125,7 +125,7 @@ def _records(
 
 
 def _fit_by_lines(
-    at: Solution, means: Float[Array, "runs p"], rng: np.random.Generator
+    at: Solution, means: Float[np.ndarray, "runs p"], rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "runs q"], Bool[np.ndarray, " runs"]]:
     """Fit drawn records one by one, each with its own means of priors and spectrum; return the
     unknowns and convergence."""

@@ -1,29 +1,27 @@
-r"""Estimates that feedback may have moved, where nobody logged an excitation.
+r"""Estimates that feedback may have moved, where no excitation was logged.
 
-Feedback brings what disturbs the vehicle into its inputs. Directly the response is off by the part
-$\gamma^2$ of the input that comes of it, and the record does not tell that part: a model follows
-its inputs where it can, and its residual then shows nothing of it. Two things it does tell.
+Feedback brings the disturbances of the vehicle into its inputs. The direct response is then off by
+the part $\gamma^2$ of the input that comes from feedback. The record does not show that part, but
+it bounds it in two ways:
 
-What feedback may have brought in: from one output, at a constant gain, $|k|^2 S_{ee}$ of $S_{uu}$,
-which is nowhere more than all of the input; with the largest such gain, as a mean over the outputs,
-since nobody knows which is fed back. A loop holds the vehicle at low frequencies, where gusts are
-large in it and sweeps move sticks no more than elsewhere.
+- Feedback of one output at a constant gain brings in $|k|^2 S_{ee}$ of $S_{uu}$, which is nowhere
+  more than the input. The largest such gain is taken, in the mean over the outputs, since nobody
+  knows which is fed back. A loop acts at low frequencies, where gusts are large in the residual.
+- The loop that holds an unstable vehicle has a bandwidth of at least twice its unstable pole: below
+  that frequency the whole input may be feedback.
 
-An unstable vehicle that was held all the same had a loop with a bandwidth of twice its unstable
-pole at least: up to there all of the input may have come of it, whatever the residual is.
-
-Each is a mean over the frequencies that tell of a parameter, by what they tell. Neither says that
-there is a loop. Parameters are named where inputs were found to follow the response, or where
-somebody must have held the vehicle: the model is unstable, and the record does not grow. Inputs
-that are taken by instrument bring in nothing.
+A parameter's part is the mean over the frequencies, weighted by their information on it. It does
+not show that there is a loop: parameters are named where inputs follow the response, or where the
+model is unstable and the record does not grow. Inputs that are taken by instrument bring in
+nothing.
 
 Sources: L. Ljung, System Identification (1999), 13.4, for the direct estimate's bias; Astrom and
-Murray, Feedback Systems (2008), 11.4, for the bandwidth that an unstable pole asks for.
+Murray, Feedback Systems (2008), 11.4, for the bandwidth that an unstable pole requires.
 """
 
 import functools
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -47,66 +45,46 @@ from heli_jax.identification.estimation.frequency_noise import (
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Noise, Solution
-from heli_jax.identification.validation.follows_response import Feedback
 
 MAY_BE = 0.25
-"""part of the input that feedback may have brought in, where a parameter that is trusted shows"""
-HELD = 0.1
-"""part of what tells of a parameter that is trusted from frequencies at which the loop that holds
-an unstable vehicle has to act: there all of the input may be that loop's"""
+"""part of a parameter's information that may come from feedback, from which on it is not trusted"""
 BESIDE = 0.05
-"""the same where other inputs are taken by instrument: an input's effect is off by that part of it
-at least, in a fit that is taken for one that feedback does no harm to"""
+"""the same where other inputs are taken by instrument: the effect of an input is off by that part
+at least, in a fit that should not be affected by feedback"""
 _GROWS = 3.0
-"""e-foldings over a record of the model's fastest growing mode, from which on somebody holds it"""
+"""e-foldings of the model's fastest growing mode over a record, from which on a loop holds it"""
 _REACHES = 2.0
 """times an unstable pole, up to which the loop that holds it has to act: with less bandwidth no
 feedback has margins (Astrom and Murray, 2008, section 11.4)"""
 _SEEN = 2.0
-"""times the residual's power, above which an output shows the response: only there is it asked how
-large a gain the input leaves room for"""
+"""times the residual's power, above which an output shows the response: only such frequencies bound
+the gain"""
 _PART = 0.05
 """sd of the Gaussian that smooths the spectra, as a part of the frequency"""
 
 
-class Moved(NamedTuple):
-    """Parts of the information on one estimate that feedback may have made."""
+def moved_by_feedback(at: Solution, poles: Sequence[float]) -> dict[str, float]:
+    """Return by unknown of interest the part of its information that may come from feedback, 0 to
+    1; empty in the time domain, and where every input that moves is taken by instrument.
 
-    may_be: float
-    """part of the input that feedback may have brought in, 0 to 1"""
-    held: float = 0.0
-    """part of what tells of it that lies where the loop which holds an unstable vehicle acts"""
-
-    @property
-    def part(self) -> float:
-        """The larger one."""
-        return max(self)
-
-
-def moved_by_feedback(at: Solution, J: Float[np.ndarray, "n q"]) -> dict[str, Moved]:
-    """By unknown of interest; empty where the method knows no frequencies, or every input that
-    moves is taken by instrument.
+    Args:
+        poles: of `held_poles`; zero for an estimate by instrument.
     """
-    layout, q = at.layout, len(at.layout.of_interest)
+    layout = at.layout
     if layout.noise_model != "spectrum":
         return {}
     responses = layout.objective.fits_responses
-    room = _room_of_responses(at) if responses else _room_of_records(at)
-    if not room:
+    parts = _room_of_responses(at) if responses else _room_of_records(at)
+    if not parts:
         return {}
-    # Up to where the loop that holds an unstable mode has to reach nothing tells test from
-    # correction.
-    poles, inside = held_poles(at), [np.zeros_like(v) for v in room]
-    for record, v in zip(() if responses else records_of(layout), inside, strict=False):
-        dt = float(at.data.flights[record.flight].dt)
-        omega = 2.0 * np.pi * np.arange(1, record.lines + 1) / (record.samples * dt)
-        v[omega <= _REACHES * poles[record.flight]] = 1.0
-    whole = (
-        information(at, [np.ones_like(v) for v in room]) if responses else J[:q, :q].T @ J[:q, :q]
-    )
-    may_be, held = (shares(information(at, w), whole) for w in (room, inside))
-    each = zip(layout.of_interest, may_be, held, strict=True)
-    return {n: Moved(float(m), float(h)) for n, m, h in each}
+    if not responses:
+        for i, record in enumerate(records_of(layout)):
+            dt = float(at.data.flights[record.flight].dt)
+            omega = 2.0 * np.pi * np.arange(1, record.lines + 1) / (record.samples * dt)
+            parts[i] = np.where(omega <= _REACHES * poles[record.flight], 1.0, parts[i])
+    whole = information(at, [np.ones_like(v) for v in parts])
+    of_each = shares(information(at, parts), whole)
+    return {n: float(v) for n, v in zip(layout.of_interest, of_each, strict=True)}
 
 
 def _room_of_records(at: Solution) -> list[Float[np.ndarray, " K"]]:
@@ -158,8 +136,8 @@ def shares(
 
 
 def held_poles(at: Solution) -> list[float]:
-    """By flight |p| [rad/s] of the model's fastest unstable mode that the record would show, and
-    does not: somebody holds it. 0 where there is none."""
+    """Return by flight |p| [rad/s] of the fastest unstable mode of the model that the record would
+    show and does not: a loop holds it. 0 where there is none."""
     layout, data, *_, z = at
     if layout.noise_model != "spectrum" or layout.objective.fits_responses:
         return [0.0]
@@ -176,43 +154,6 @@ def held_poles(at: Solution) -> list[float]:
         stays = alone > 0.0 and np.log(grown) < 0.5 * half * alone
         held.append(float(np.max(np.abs(growing))) / float(flight.dt) if stays else 0.0)
     return held
-
-
-class Loop(NamedTuple):
-    """Who closes a loop, as far as it is known."""
-
-    found: Sequence[Feedback]
-    """by flight and input, whether it follows the response"""
-    instruments: Sequence[str] = ()
-    """the inputs that are taken by instrument"""
-    held: bool = False
-    """whether somebody must hold the vehicle"""
-
-    @property
-    def closed(self) -> bool:
-        """True if an input that is taken for given follows the response, or may: where only one
-        with an instrument was found to, whoever closes its loop may move the others as well."""
-        if self.instruments:
-            return bool(self.inputs) and any(one.present for one in self.found)
-        return self.held or any(one.present for one in self.found)
-
-    @property
-    def inputs(self) -> list[str]:
-        """Inputs without an instrument that follow the response; all that move freely if none
-        does."""
-        direct = [one for one in self.found if one.input not in self.instruments]
-        those = [one for one in direct if one.present] or direct
-        return list(dict.fromkeys(one.input for one in those))
-
-
-def untrusted(moved: Mapping[str, Moved], loop: Loop) -> tuple[str, ...]:
-    """The parameters that a fit cannot be trusted on: nothing where no loop is closed."""
-    if not loop.closed:
-        return ()
-    most = BESIDE if loop.instruments else MAY_BE
-    # Beside inputs by instrument somebody logged what excites the slow mode.
-    beyond = 1.0 if loop.instruments else HELD
-    return tuple(n for n, m in moved.items() if m.may_be > most or m.held > beyond)
 
 
 def _room(
