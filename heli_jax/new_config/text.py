@@ -114,7 +114,6 @@ def configuration(
     others: Sequence[str] = (),
     preset_outputs: Sequence[str] = (),
     filtered: Mapping[str, Filtered] = {},
-    late: tuple[str, bool] = ("", False),
 ) -> str:
     """The configuration as text.
 
@@ -123,9 +122,6 @@ def configuration(
         rate: [Hz] onto which topics with clocks of their own are brought, or a table whose rows are
             those of several topics.
         preset_outputs: those to take from the preset; all unless given.
-        late: which input is logged late, in words, empty where none is; and whether nothing else
-            looks like that.
-
     """
     lines = [
         f"# Made from {_comment(log)}. What is marked GUESS was guessed: look it over.",
@@ -168,10 +164,8 @@ def configuration(
     lines += [f"    # {n}: {{start: {_number(v)}}}".ljust(33) + stays for n, v in held.items()]
     if not chosen.linear and "a" in naming.names(chosen.model.Params) and "a" not in free:
         lines.append(_PRIOR_OF_A)
-    guess, sure = late
-    why = f"GUESS: {_comment(guess)}" if guess else "where the stick was logged late or early"
     lines += [
-        f"  {'' if sure else '# '}nuisance: {{time_shift: true}} # {why}",
+        "  # nuisance: {time_shift: true} # where the stick was logged late or early",
         *([f"disturbance: {{on: [{', '.join(axes)}]}}"] if axes else []),
         "rls: null",
     ]

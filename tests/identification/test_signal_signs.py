@@ -7,9 +7,7 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight, linear_model
-from heli_jax.identification.diagnostics.timing import inputs_late
 from heli_jax.identification.diagnostics.units import outputs_against_start, rate_against_angle
-from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.signal_signs import against_start, sticks_of
 from tests.identification.test_enough import DT, SWING, problem, response, steps
 
@@ -119,34 +117,6 @@ def test_the_stick_of_an_output_is_that_of_its_axis():
         "lon",
         "lon",
     )
-
-
-def a_stick_and_its_answer(late):
-    rng = np.random.default_rng(3)
-    u = scipy.signal.lfilter([0.1], [1.0, -0.9], rng.standard_normal(N))
-    answer = scipy.signal.lfilter([0.1], [1.0, -0.9], u)
-    return u, answer, np.roll(u, late), np.roll(answer, late), 1e-3 * rng.standard_normal(N)
-
-
-def test_an_output_before_its_stick_is_said_before_any_fit():
-    u, answer, u_late, _, noise = a_stick_and_its_answer(8)
-    cut = slice(50, None)
-    outputs = {"p": (answer + noise)[cut]}
-    # A second stick that the pilot moves a little later is no late one.
-    second = 0.8 * np.roll(u, 5) + 0.2 * np.random.default_rng(4).standard_normal(N)
-    good = Flight(dt=DT, inputs={"u": u[cut], "v": second[cut]}, outputs=outputs)
-    bad = Flight(dt=DT, inputs={"u": u_late[cut], "v": np.zeros(N - 50)}, outputs=outputs)
-
-    def said_of(flight, *feedback):
-        c = SimpleNamespace(
-            problem=problem(flight), flights=[("flight 1", flight)], feedback=feedback,
-            fitted=False, at=SimpleNamespace(layout=None),
-        )  # fmt: skip
-        return [(f.code, f.severity) for f in inputs_late(c)]
-
-    assert said_of(good) == []
-    assert said_of(bad) == [("timing.output-leads", "doubt")]
-    assert said_of(bad, Feedback("flight 1", "u", "p", 0.9, (0.1, 0.2), 1e-9)) == []
 
 
 def swept_and_held(seed=0, held_by=0.3, swept=0.0, sign=1.0):

@@ -15,9 +15,7 @@ from heli_jax.identification.validation.logging_rate import (
     rates_against_modes,
 )
 from heli_jax.identification.validation.shifts import (
-    LEAD,
     SHIFT,
-    leads,
     shift_in_time,
 )
 
@@ -31,29 +29,6 @@ _NAMED = 3
 """parameters that a sentence names at most"""
 _SEEN = 1e-3
 """of a parameter, below which a move is not named: of one held by a prior alone it is rounding"""
-
-
-def inputs_late(c: Context) -> Iterator[Finding]:
-    """Inputs that an output precedes; after a fit, only where no likelihood tells how late."""
-    layout, model = c.at.layout, c.problem.model
-    if c.fitted:
-        freed = layout.shift or set(model.delay_parameters) & set(c.free)
-        judged = c.arrived and c.explains and layout.noise_model != "spectrum"
-        if freed or judged:
-            return
-    follow = {(one.flight, one.input) for one in c.feedback if one.present}
-    for lead in leads(c.flights):
-        # The finding on feedback says that such an input may be late.
-        if (lead.flight, lead.input) not in follow:
-            yield found(
-                "timing.output-leads",
-                value=lead.share,
-                flight=lead.flight,
-                input=lead.input,
-                output=lead.output,
-                seconds=lead.seconds,
-                limit=LEAD.share,
-            )
 
 
 def signals_shifted(c: Context) -> Iterator[Finding]:
@@ -187,7 +162,6 @@ def delays_negative(c: Context) -> Iterator[Finding]:
 
 
 DIAGNOSTICS = (
-    inputs_late,
     signals_shifted,
     loop_between_samples,
     modes_past_nyquist,
