@@ -1,7 +1,7 @@
 """Signals that are cut off, stuck, astray, logged in coarse steps or smoothed.
 
-Judged as they were logged, where the flight knows it: what was resampled has no flat tops and no
-steps, and suffers from them all the same.
+They are tested as logged, where the flight knows it: resampling hides flat tops and steps, and
+does not mend them.
 """
 
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ def saturation(c: Context) -> Iterator[Finding]:
         share = sum(facts.shares)
         ends = zip((facts.low.value, facts.high.value), facts.shares, strict=True)
         yield found(
-            "quality.saturation" if kind == "output" else "quality.input-saturation",
+            "quality.saturation",
             "doubt",
             name,
             value=share,
@@ -122,12 +122,13 @@ def smoothed(c: Context) -> Iterator[Finding]:
             outputs = [flight.outputs[n] for n in names]
             highest = [highest_frequency(y, flight.dt) or 0.0 for y in outputs]
             yield found(
-                "quality.smoothed-for-filter" if filtered else "quality.smoothed",
+                "quality.smoothed",
                 "doubt" if filtered else "note",
                 *names,
                 value=max(noise_guess(y) / float(np.nanstd(y)) for y in outputs),
                 flight=label,
                 below=f"{max(highest):.2g} Hz" if max(highest) else "",
+                filtered=filtered,
             )
 
 

@@ -134,7 +134,7 @@ def of_rates(
             elif one.samples < one.least:
                 severity = "refuse"
             finding = found(
-                "timing.rate-enough" if severity == "ok" else "timing.logging-rate",
+                "timing.logging-rate",
                 severity,
                 value=one.samples,
                 flight=label,
@@ -143,7 +143,7 @@ def of_rates(
                 hz=one.mode.hz,
                 output=one.mode.output,
                 where=where,
-                needed=RATE.enough * one.mode.hz,
+                low="" if severity == "ok" else f"{RATE.enough * one.mode.hz:.3g} Hz",
                 enough=RATE.enough,
                 least=one.least,
             )
@@ -152,20 +152,10 @@ def of_rates(
     yield from bad or (f for _, f in sorted(enough, key=lambda pair: pair[0])[:1])
 
 
-def delays_negative(c: Context) -> Iterator[Finding]:
-    """Delays, and the shift of the inputs, below zero: the other estimates are right with them."""
-    for name in (*c.problem.model.delay_parameters, "time_shift"):
-        estimate = c.estimates.get(name)
-        if estimate is not None and estimate.upper95 is not None and estimate.upper95 < 0:
-            value = estimate.value
-            yield found("timing.delay-negative", "note", name, value=value, ms=1e3 * value)
-
-
 DIAGNOSTICS = (
     signals_shifted,
     loop_between_samples,
     modes_past_nyquist,
     rates_enough,
-    delays_negative,
 )
 """causes first"""

@@ -48,7 +48,6 @@ class Limits:
 
 
 LIMITS = Limits()
-UNIT_IN_DOUBT = "units.in-doubt"
 _DEGREE = 180.0 / np.pi
 _ROLL = frozenset({"phi", "roll"})
 
@@ -117,29 +116,29 @@ def against_file(c: Context) -> Iterator[Finding]:
 def size_of_angles(c: Context) -> Iterator[Finding]:
     """Angles and rates that are too large for the unit that they are read in."""
     for label, flight in c.flights:
-        for finding in in_degrees(c.problem.model, label, flight):
-            doubted = finding.code == UNIT_IN_DOUBT and not finding.denies
-            yield finding._replace(distrusts=_estimates(c) if doubted else ())
+        yield from in_degrees(c.problem.model, label, flight, _estimates(c))
 
 
-def in_degrees(model: Model, label: str, flight: Flight) -> Iterator[Finding]:
+def in_degrees(
+    model: Model, label: str, flight: Flight, estimates: tuple[str, ...] = ()
+) -> Iterator[Finding]:
     """Angles and rates of a flight that look like degrees read as radians."""
     for name, size, limit, flown, certain in oversized(model, flight):
         assert flight.source is not None
         signal = flight.source.outputs[name]
         yield found(
-            # What was flown upside down is in its own unit as likely as not.
-            "units.flown-or-degrees" if flown else UNIT_IN_DOUBT,
+            "units.in-doubt",
             "doubt",
             name,
             value=size,
             denies=certain,
+            distrusts=() if certain or flown else estimates,
             flight=label,
             unit=signal.unit,
             degrees=signal.unit.replace("rad", "deg"),
-            in_degrees=float(np.degrees(size)),
             limit=limit,
             channel=shown(signal.name),
+            flown=flown,
         )
 
 
@@ -168,7 +167,7 @@ def size_of_inputs(c: Context) -> Iterator[Finding]:
 
 
 def _estimates(c: Context) -> tuple[str, ...]:
-    """The estimates, of which nobody knows which another unit changes; none before an optimum."""
+    """All estimates, since any may depend on the unit; none before an optimum."""
     return () if c.status == "not-converged" else tuple(c.estimates)
 
 
@@ -212,13 +211,11 @@ def outputs_against_start(c: Context) -> Iterator[Finding]:
 
 
 def turned_from_start(c: Context) -> Iterator[Finding]:
-    """Parameters that surely have the other sign than they began with: a turned signal fits as
-    well, and the start alone tells. One whose sign is declared (`Model.positive`, `sign: keep`,
-    bounds) cannot turn."""
+    """Parameters whose sign is surely not that of their start values: an inverted signal fits as
+    well, and only the start value shows it."""
     turned = {}
     for name, free in c.problem.free.items() if c.arrived else ():
         e = c.estimates[name]
-        # A delay says by itself what it means to be negative.
         if name in c.problem.model.delay_parameters or e.lower95 is None or e.upper95 is None:
             continue
         surely = e.lower95 * e.upper95 > 0 and e.value * free.start < 0
