@@ -57,7 +57,7 @@ def load(tmp_path):
 
 
 RECORD_ALONE = (
-    units.rate_against_angle, units.against_file, units.size_of_angles, units.no_sticks,
+    units.rate_against_angle, units.against_file, units.size_of_angles,
     quality.saturation, quality.stuck_outputs,
 )  # fmt: skip
 

@@ -55,7 +55,6 @@ DIAGNOSTICS: tuple[Diagnostic, ...] = (
 
 MOOT: dict[str, tuple[str, ...]] = {
     "units.in-doubt": ("signs.rate-against-angle",),
-    "units.input-in-doubt": ("signs.rate-against-angle",),
     "signs.against-start": ("signs.rate-against-angle",),
     "timing.mode-past-nyquist": ("timing.logging-rate",),
 }
