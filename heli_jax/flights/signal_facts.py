@@ -108,17 +108,6 @@ class SignalFacts:
         n = max(self.size, 1)
         return self.low.times.size / n, self.high.times.size / n
 
-    def rounding(self, dt: float) -> float:
-        """The error of rounding, rms, that is left at a step of `dt` [s].
-
-        Rounding to steps of q adds an error of q / sqrt(12), rms, where the signal moves by more
-        than a step from sample to sample or has noise of that size. It is white then, and the
-        low-pass filter before a lower rate takes its part of it; where a value stays for several
-        samples, their error is one and the same, and nothing is averaged.
-        """
-        run = self.usual / self.moves if self.moves > 0 else dt
-        return self.step / 12**0.5 * min(1.0, (run / dt) ** 0.5)
-
     def within(self, begin: float, end: float) -> "SignalFacts":
         """Return the facts of the part from `begin` to `end` [s], with times from `begin`;
         levels and steps stay those of the whole."""

@@ -17,10 +17,6 @@ _REPEATED = 0.3
 """share of samples equal to the one before from which on they are those of a slower sensor"""
 _NO_NOISE = 1e-4
 """of a signal's sd, below which its noise is that of no sensor"""
-_BELOW = 0.999
-"""part of the power of a signal that lies below the frequency that is its highest"""
-_SEEN = 0.9
-"""part of the samples that a spectrum is made of, at least"""
 
 
 def noise_guess(signal: np.ndarray) -> float:
@@ -145,25 +141,3 @@ def without_noise(signal: np.ndarray) -> bool:
     """
     known = signal[np.isfinite(signal)]
     return known.size >= _FEWEST and bool(noise_guess(known) < _NO_NOISE * np.std(known))
-
-
-def highest_frequency(signal: np.ndarray, dt: float) -> float | None:
-    """Below which frequency [Hz] all but a thousandth of a signal's power lies; None where too many
-    samples are missing to say.
-
-    Args:
-        signal: (N,), NaN where nothing is measured; without noise (`without_noise`).
-        dt: from sample to sample [s].
-    """
-    seen = np.isfinite(signal)
-    if np.mean(seen) < _SEEN:
-        return None
-    # A short gap is bridged by a line: of a smooth signal that changes nothing below its band.
-    at = np.arange(signal.size)
-    y = np.interp(at, at[seen], signal[seen])
-    y = y - np.polyval(np.polyfit(at, y, 1), at)
-    # Without a window the ends of the record would put power at every frequency.
-    power = np.abs(np.fft.rfft(np.blackman(y.size) * y)) ** 2
-    total = np.cumsum(power)
-    at_highest = np.searchsorted(total, _BELOW * total[-1])
-    return float(np.fft.rfftfreq(y.size, dt)[at_highest])

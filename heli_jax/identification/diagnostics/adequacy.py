@@ -56,7 +56,7 @@ def simulation_as_expected(c: Context) -> Iterator[Finding]:
 
 
 def outputs_unmoved(c: Context) -> Iterator[Finding]:
-    """Outputs of which nothing is explained, and outputs that never move."""
+    """Records of which nothing stands out of the noise, and outputs that never move."""
     if not c.fitted:
         return
     if c.adequacy.by_chance and c.adequacy.judged:
@@ -70,9 +70,6 @@ def outputs_unmoved(c: Context) -> Iterator[Finding]:
             vafs=[o.vaf for o in c.adequacy.judged],
         )
         return
-    for output in c.adequacy.judged:
-        if output.output in c.adequacy.unmoved:
-            yield found("adequacy.output-unmoved", "doubt", output.output, value=output.vaf)
     for name in c.adequacy.still:
         yield found("quality.never-moves", "doubt", name)
 

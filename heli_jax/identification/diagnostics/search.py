@@ -2,9 +2,8 @@
 
 from collections.abc import Iterator
 
-from heli_jax import naming
 from heli_jax.finding import Finding, found
-from heli_jax.flights.flight import labels, own_instruments, own_said
+from heli_jax.flights.flight import labels
 from heli_jax.identification.diagnostics.context import Context
 
 STOPPED = "search.stopped"
@@ -65,13 +64,3 @@ def log_cautions(c: Context) -> Iterator[Finding]:
         for caution in flight.source.cautions if flight.source else ():
             said.setdefault(caution.sentence, caution.of(label))
     yield from said.values()
-    own = own_instruments(c.problem.training, naming.names(c.problem.model.Inputs))
-    if own and c.problem.instrument is None:
-        yield found("loop.instrument-unused", "note", *own, said=own_said(own))
-
-
-def band_unused(c: Context) -> Iterator[Finding]:
-    """A stated band that the fit does not use."""
-    objective, band = c.at.layout.objective, c.problem.frequency.band
-    if band is not None and objective.noise_model == "spectrum" and not objective.fits_responses:
-        yield found("frequency.band-unused", "note", low=band[0], high=band[1])

@@ -91,7 +91,7 @@ def modes_past_nyquist(c: Context) -> Iterator[Finding]:
     for mode in c.fast_modes:
         yield found(
             "timing.mode-past-nyquist",
-            "doubt" if mode.undetermined else "note",
+            "doubt",
             mode.flight,
             value=mode.frequency,
             distrusts=mode.undetermined,
@@ -99,8 +99,6 @@ def modes_past_nyquist(c: Context) -> Iterator[Finding]:
             hz=mode.frequency / (2.0 * math.pi),
             nyquist=mode.nyquist,
             nyquist_hz=mode.nyquist / (2.0 * math.pi),
-            about=mode.about,
-            past=1 if mode.frequency >= mode.nyquist else 2,
         )
 
 

@@ -119,8 +119,6 @@ class Adequacy(NamedTuple):
     """whether nothing measured stands out of the noise, so that any optimum is one of chance"""
     ahead: float | None = None
     """[s] that is predicted at most where that, and no simulation, was judged"""
-    unmoved: tuple[str, ...] = ()
-    """outputs of which nothing is explained, though what is left may be noise"""
     still: tuple[str, ...] = ()
     """outputs that never move, of which nothing is judged"""
 
@@ -197,8 +195,7 @@ def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
     if outputs and not bad and noise == outputs:
         outputs = tuple(output._replace(adequate=False) for output in outputs)
         return Adequacy(outputs, by_chance=True, still=still)
-    unmoved = tuple(o.output for o in noise if o.adequate)
-    return Adequacy(outputs, False, evidence.ahead, unmoved, still)
+    return Adequacy(outputs, False, evidence.ahead, still)
 
 
 _BY_CHANCE = 1e-3
