@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scipy.signal
 
 from heli_jax import cli, load_config, units, yaml_file
 from heli_jax.config import read_flights
@@ -73,28 +72,6 @@ def test_a_stick_in_pulse_widths_beside_a_rate_becomes_a_configuration_that_read
     before = out.read_text()
     assert cli.main(["new", str(log), "--out", str(out)]) == 2
     assert out.read_text() == before
-
-
-@pytest.mark.parametrize(("late", "feedback"), [(0, False), (15, True), (15, False)])
-def test_a_stick_that_is_logged_late_gets_a_time_shift(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, late: int, feedback: bool
-) -> None:
-    """100 Hz; the roll rate answers a stick 20 ms after it. Feedback looks like lateness too."""
-    rng, n = np.random.default_rng(1), 4000
-    stick = scipy.signal.lfilter([0.1], [1.0, -0.9], rng.standard_normal(n))
-    p = scipy.signal.lfilter([0.0, 0.0, 0.08], [1.0, -0.92], stick)
-    p += 0.01 * rng.standard_normal(n)
-    columns = np.c_[0.01 * np.arange(n), np.r_[np.zeros(late), stick[: n - late]], p]
-    log, out = tmp_path / "run.csv", tmp_path / "run.yaml"
-    np.savetxt(log, columns, delimiter=",", header="t,lat,p", comments="", fmt="%.6g")
-    if not feedback:
-        monkeypatch.setattr("heli_jax.new_config.feedback", lambda flight: ())
-    assert cli.main(["new", str(log), "--out", str(out)]) == 0
-    made = Config.model_validate(yaml_file.read_mapping(out))
-    assert made.fit is not None
-    assert made.fit.nuisance.time_shift is (late > 0 and not feedback)
-    (line,) = (line for line in out.read_text().splitlines() if "time_shift" in line)
-    assert ("GUESS" in line) is (late > 0)
 
 
 def test_a_model_of_one_s_own_beside_the_configuration(tmp_path: Path) -> None:

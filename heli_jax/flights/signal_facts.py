@@ -109,17 +109,6 @@ class SignalFacts:
         n = max(self.size, 1)
         return self.low.times.size / n, self.high.times.size / n
 
-    def rounding(self, dt: float) -> float:
-        """Return the rms error of rounding that remains at a step of `dt` [s].
-
-        Rounding to steps of q adds an rms error of q / sqrt(12). The error is white if the signal
-        moves by more than a step between samples, or has noise of that size. The low-pass filter
-        before a lower rate then reduces it. If a value stays for several samples, their errors are
-        equal and do not average out.
-        """
-        run = self.usual / self.moves if self.moves > 0 else dt
-        return self.step / 12**0.5 * min(1.0, (run / dt) ** 0.5)
-
     def within(self, begin: float, end: float) -> "SignalFacts":
         """Return the facts of the part from `begin` to `end` [s], with times from `begin`.
 

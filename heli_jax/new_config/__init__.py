@@ -4,19 +4,13 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from heli_jax import naming
 from heli_jax.errors import InputError
 from heli_jax.finding import LEFT_OUT, Finding, note
-from heli_jax.flights.flight import Flight
 from heli_jax.flights.log import shown
 from heli_jax.flights.preset import fitting_presets
-from heli_jax.identification.validation.follows_response import feedback
-from heli_jax.identification.validation.shifts import led_by
 from heli_jax.linear_models import read as linear_models
 from heli_jax.new_config import guess, tables, text
-from heli_jax.new_config.guess import Series
 from heli_jax.new_config.logs import Log, read_log
 from heli_jax.new_config.model_choice import chosen_model, other_models, other_vehicle
 from heli_jax.new_config.rate import channels_of_preset, common_rate, rate_of_outputs
@@ -97,7 +91,6 @@ def write_config(
         others=[f"{name}: {meaning}" for name, meaning in others],
         preset_outputs=from_preset,
         filtered=filtered,
-        late=_late(read.series, signals),
     )
     for path, words in {out: content, **paths}.items():
         with whole_file(path, str(path)) as temporary:
@@ -154,46 +147,6 @@ def _outputs(
     known = tuple(log.series)
     found = channels_of_preset(preset, known, asked or naming.names(model.Outputs))
     return found or channels_of_preset(preset, known, naming.names(model.Inputs))
-
-
-def _seen(channel: Series) -> Series:
-    """Return the channel without missing samples."""
-    seen = np.isfinite(channel.values)
-    return channel._replace(times=channel.times[seen], values=channel.values[seen])
-
-
-def _late(series: Mapping[str, Series], signals: text.Signals | None) -> tuple[str, bool]:
-    """Return a description of the input that an output precedes, and True if feedback is excluded.
-
-    The description is empty if there is no such input.
-    """
-    none = "", False
-    if signals is None:
-        return none
-    inputs, outputs = (
-        {n: _seen(series[g.channel]) for n, g in of.items() if g is not None}
-        for of in (signals.inputs, signals.outputs)
-    )
-    both = [*inputs.values(), *outputs.values()]
-    if not (inputs and outputs and all(s.times.size > 1 for s in both)):
-        return none
-    first, last = max(s.times[0] for s in both), min(s.times[-1] for s in both)
-    dt = min(float(np.median(np.diff(s.times))) for s in outputs.values())
-    if not (dt > 0 and last - first > 2.0 * dt):
-        return none
-    times = np.arange(first, last, dt)
-    on_grid = [
-        {n: np.interp(times, s.times, s.values) for n, s in of.items()} for of in (inputs, outputs)
-    ]
-    followed = {f.input for f in feedback(Flight(dt, on_grid[0], on_grid[1])) if f.present}
-    for output, y in on_grid[1].items():
-        led = led_by(y, on_grid[0], dt)
-        if led is not None:
-            _, lead, name = led
-            follows = f" or follows {output} (feedback)" if name in followed else ""
-            words = f"{output} moves {lead:.2g} s or more before it"
-            return f"{name} is logged late{follows}: {words}", not follows
-    return none
 
 
 def _rate(log: Log, outputs: Sequence[str]) -> float | None:

@@ -117,7 +117,6 @@ def configuration(
     others: Sequence[str] = (),
     preset_outputs: Sequence[str] = (),
     filtered: Mapping[str, Filtered] = {},
-    late: tuple[str, bool] = ("", False),
 ) -> str:
     """Return the configuration as text.
 
@@ -135,8 +134,6 @@ def configuration(
         others: other models of the axis.
         preset_outputs: outputs to take from the preset; all if empty.
         filtered: filtered outputs of the preset.
-        late: description of the input that is logged late (empty if none), and True if feedback is
-            excluded.
     """
     lines = [
         f"# Made from {_comment(log)}. Check the lines marked GUESS.",
@@ -179,10 +176,8 @@ def configuration(
     lines += [f"    # {n}: {{start: {_number(v)}}}".ljust(33) + stays for n, v in held.items()]
     if not chosen.linear and "a" in naming.names(chosen.model.Params) and "a" not in free:
         lines.append(_PRIOR_OF_A)
-    guess, sure = late
-    why = f"GUESS: {_comment(guess)}" if guess else "if the stick was logged late or early"
     lines += [
-        f"  {'' if sure else '# '}nuisance: {{time_shift: true}} # {why}",
+        "  # nuisance: {time_shift: true} # if the stick was logged late or early",
         *([f"disturbance: {{on: [{', '.join(axes)}]}}"] if axes else []),
         "rls: null",
     ]

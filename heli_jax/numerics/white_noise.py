@@ -20,10 +20,6 @@ _REPEATED = 0.3
 """Share of repeated samples from which the sensor is slower than the grid."""
 _NO_NOISE = 1e-4
 """Noise level below which there is no sensor noise [fraction of the signal's sd]."""
-_BELOW = 0.999
-"""Share of a signal's power below its highest frequency."""
-_SEEN = 0.9
-"""Least share of known samples for a spectrum."""
 
 
 def noise_guess(signal: np.ndarray) -> float:
@@ -156,23 +152,4 @@ def without_noise(signal: np.ndarray) -> bool:
     return known.size >= _FEWEST and bool(noise_guess(known) < _NO_NOISE * np.std(known))
 
 
-def highest_frequency(signal: np.ndarray, dt: float) -> float | None:
-    """Return the frequency [Hz] below which 99.9 % of a signal's power lies; None if too many
-    samples are missing.
-
-    Args:
-        signal: (N,), NaN where nothing is measured; without noise (`without_noise`).
-        dt: sample time [s].
-    """
-    seen = np.isfinite(signal)
-    if np.mean(seen) < _SEEN:
-        return None
-    # A line across a short gap does not change a smooth signal's spectrum below its band.
-    at = np.arange(signal.size)
-    y = np.interp(at, at[seen], signal[seen])
-    y = y - np.polyval(np.polyfit(at, y, 1), at)
-    # Without a window the ends of the record would add power at every frequency.
-    power = np.abs(np.fft.rfft(np.blackman(y.size) * y)) ** 2
-    total = np.cumsum(power)
-    at_highest = np.searchsorted(total, _BELOW * total[-1])
-    return float(np.fft.rfftfreq(y.size, dt)[at_highest])
+"""Noise level below which there is no sensor noise [fraction of the signal's sd]."""

@@ -1,7 +1,6 @@
 """A free delay: none, whose bound is the record's, and one far from where the search begins."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -10,8 +9,6 @@ import scipy.linalg
 
 from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model
 from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.identification.diagnostics.timing import delays_negative
-from heli_jax.identification.result import Estimate
 from heli_jax.naming import Scalar
 from heli_jax.simulation.inputs import random_steps
 from tests.identification.lag import LAG, response
@@ -64,22 +61,6 @@ def test_a_positive_delay_that_is_none_has_an_upper_limit(seed):
     assert tau.upper95 == pytest.approx(tau.value + 1.96 * sd, rel=0.2)
     assert tau.upper95 < DT
     assert abs(found.estimates["Lp"].value + 4.0) < 4 * found.estimates["Lp"].sd
-
-
-def test_a_delay_below_zero_is_told():
-    flight = Flight(dt=DT, inputs={"d": STICK}, outputs={"p": STICK})
-    problem = Problem(MODEL, START, [flight], {"tau": Free(0.03)})
-    for low, high, codes in (
-        (-0.05, -0.03, ["timing.delay-negative"]),
-        (-0.01, 0.002, []),
-        (0.08, 0.12, []),
-    ):
-        estimate = Estimate(0.5 * (low + high), 0.005, low, high, "s", 0.03, 0.0, False)
-        found = delays_negative(SimpleNamespace(problem=problem, estimates={"tau": estimate}))
-        # Two logs whose clocks differ look like it, and then the other estimates are right.
-        assert [(f.code, f.severity, f.value) for f in found] == [
-            (code, "note", estimate.value) for code in codes
-        ]
 
 
 def test_filter_error_finds_a_stick_that_is_late_by_ten_samples():

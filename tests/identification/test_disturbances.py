@@ -134,7 +134,7 @@ def test_one_that_is_not_there_freezes_no_other():
     found = fit(problem(flight))
     assert found.status == "converged"
     assert found.nuisance["sigma_w_q"].value == 0.0
-    absent = [f.subjects for f in found.findings if f.code == "noise.disturbances-absent"]
+    absent = [f.subjects for f in found.findings if f.code == "noise.no-disturbance"]
     assert absent == [("q",)]
     for name, true in {"sigma_w_p": 2.0, "tau_w_p": 0.4}.items():
         assert abs(found.nuisance[name].value - true) < 3.5 * found.nuisance[name].sd

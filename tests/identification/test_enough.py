@@ -14,7 +14,7 @@ from heli_jax.dynamics.onboard.filters import Filter
 from heli_jax.flights import Signal, read_flight
 from heli_jax.flights.signal_facts import quantum, signal_facts
 from heli_jax.identification.design.next_flight import plan_next_flight
-from heli_jax.identification.diagnostics import excitation, quality
+from heli_jax.identification.diagnostics import excitation
 from heli_jax.identification.diagnostics.timing import of_rates
 from heli_jax.identification.fit import check
 from heli_jax.identification.validation.excitation import excitation_of
@@ -137,13 +137,6 @@ def test_steps_of_the_log_are_held_against_the_noise():
     assert quantum(y) == 0.0
     coarse = np.round(y / 0.04) * 0.04 * np.pi / 180
     assert quantum(coarse) == pytest.approx(0.04 * np.pi / 180)
-    # Rounding's error, as it is: uniform within a step.
-    assert np.std(np.round(y / 0.04) * 0.04 - y) == pytest.approx(0.04 / 12**0.5, rel=0.05)
-    f = replace(flight(n=2000), outputs={"phi": np.round(y / 0.04) * 0.04}, sd={"phi": 0.002})
-    (found,) = found_of(quality.quantisation, f, sd=0.002)
-    assert found.severity == "doubt"
-    assert found.value == pytest.approx(0.04 / 12**0.5 / 0.002)
-    assert not found_of(quality.quantisation, replace(f, outputs={"phi": y}), sd=0.002)
 
 
 def test_sticks_that_move_together_are_named_with_their_coherence():

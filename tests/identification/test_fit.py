@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from heli_jax import Flight, Free, Nuisance, Prior, Problem, check, fit, models
+from heli_jax import Flight, Free, Nuisance, Prior, Problem, fit, models
 from tests.identification.bench import (
     BENCH,
     record,
@@ -94,11 +94,6 @@ def test_prior_on_a_makes_it_well_posed(resting):
     assert found.verdict.rank_without_priors == 2
 
 
-def codes(flight, free):
-    found = check(Problem(models.roll_on_stand, vehicle(BENCH), [flight], free))
-    return {f.code for f in found.findings}
-
-
 def test_ratios_that_the_data_alone_determine_have_their_own_intervals(resting, alone):
     found = resting
     assert set(found.verdict.resting) == {"Ixx", "If", "a"}
@@ -127,12 +122,6 @@ def test_they_widen_with_autocorrelated_residuals(bench_run, resting):
         truth = BENCH["a"] / BENCH[name]
         assert c.lower95 < truth < c.upper95
         assert c.sd > 2.0 * resting.verdict.combinations[0].sd or name != "Ixx"
-
-
-def test_check_warns_of_feeble_excitation():
-    weak = record(BENCH, seed=3, n=N, amplitude=1e-9)
-    found = codes(weak, started(BENCH, 1.0, 1.0))
-    assert "excitation.feeble" in found
 
 
 def test_added_inertia_determines_all_three():

@@ -6,8 +6,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import pytest
 
-from heli_jax import Flight, Free, Nuisance, Prior, Problem, Signal, fit
-from heli_jax.flights.flight import Source
+from heli_jax import Flight, Free, Nuisance, Prior, Problem, fit
 from heli_jax.identification.identifiability.analysis import Around, analyse
 from heli_jax.identification.identifiability.verdict import Unknown
 from heli_jax.naming import Scalar
@@ -153,16 +152,3 @@ def test_of_a_time_shift_at_its_end_is_not_said_that_it_has_no_effect():
     shift = Unknown("time_shift", 0.5, False, 1.0, 0.0, is_parameter=False, at_bound=True)
     verdict = analyse(np.array([[100.0, 0.0]]), (parameter, shift))
     assert verdict.without_effect == ("time_shift",)
-
-
-def test_an_input_whose_unit_is_in_doubt_takes_the_intervals():
-    flight = record(1, 0.0, 0.02)
-    percent = {"d": 100.0 * flight.inputs["d"] / np.max(np.abs(flight.inputs["d"]))}
-    source = Source("log.csv", "", inputs={"d": Signal("stick", "1", "1")})
-    read = Flight(dt=DT, inputs=percent, outputs=dict(flight.outputs), source=source)
-    found = fit(problem(read, Lp=Free(-1.0), Ld=Free(2.0)))
-    [one] = of(found, "units.input-in-doubt")
-    assert one.subjects == ("d",)
-    # Per cent or not, Ld is a hundredth or not.
-    assert set(found.untrusted) == set(one.distrusts) == {"Lp", "Ld"}
-    assert found.exit_code == 3

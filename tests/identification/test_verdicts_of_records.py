@@ -1,4 +1,4 @@
-"""Late sticks, stuck sensors and dropouts, as they are told of a record at any rate."""
+"""Stuck sensors and dropouts, as they are told of a record at any rate."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -11,7 +11,6 @@ from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.signal_facts import facts_of_all
 from heli_jax.identification.diagnostics.quality import stuck_outputs
 from heli_jax.identification.validation.adequacy import Evidence, OutputAdequacy, Record, _of_noise
-from heli_jax.identification.validation.shifts import led_by
 
 RNG = np.random.default_rng(0)
 T = 0.005 * np.arange(6000)
@@ -19,18 +18,6 @@ STICK = np.repeat(RNG.uniform(-0.3, 0.3, 80), 75)
 # A damped swing at 2 Hz, by SciPy.
 ANSWER = scipy.signal.lsim(([20.0, 0.0], [1.0, 8.0, 160.0]), STICK, T)[1]
 ANSWER = ANSWER / ANSWER.std()
-
-
-@pytest.mark.parametrize("every", [1, 2, 4, 8])
-def test_a_late_stick_is_told_at_any_rate_of_the_log(every):
-    y = (ANSWER + 0.05 * np.random.default_rng(1).standard_normal(T.size))[::every]
-    dt = 0.005 * every
-    for late, least, most in ((0, None, None), (16, 0.039, 0.09), (40, 0.1, 0.21)):
-        led = led_by(y, {"u": np.roll(STICK, late)[::every]}, dt)
-        assert (led is None) == (late == 0)
-        assert led is None or least < led[1] < most
-    noise = np.random.default_rng(2).standard_normal(y.size)
-    assert led_by(noise, {"u": STICK[::every]}, dt) is None
 
 
 def test_a_stuck_sensor_is_seen_in_steps_as_large_as_its_noise_and_dropouts_are_named():

@@ -1,4 +1,4 @@
-"""All that is asked of a record and of a fit: one tuple of diagnostics, for `check` and for `fit`.
+"""Diagnostics of a record and of a fit: one tuple, for `check` and for `fit`.
 
 A diagnostic is a function of a `Context` that yields findings. To add one: a function, its entry
 here, and its words in `messages.yaml`.
@@ -45,17 +45,14 @@ DIAGNOSTICS: tuple[Diagnostic, ...] = (
     noise.residuals_white,
     noise.residuals_correlated,
     noise.disturbance_shows,
-    noise.noise_as_stated,
     search.search_told,
     search.prior_contradicted,
     search.profile_intervals,
-    search.band_unused,
 )
 """causes first: of two findings as severe the first one is shown first"""
 
 MOOT: dict[str, tuple[str, ...]] = {
     "units.in-doubt": ("signs.rate-against-angle",),
-    "units.input-in-doubt": ("signs.rate-against-angle",),
     "signs.against-start": ("signs.rate-against-angle",),
     "timing.mode-past-nyquist": ("timing.logging-rate",),
 }

@@ -8,11 +8,9 @@ from heli_jax.finding import Finding, found, note
 from heli_jax.identification.agreement import pooled_metrics
 from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.validation.adequacy import (
-    EXPECTED,
     EXPLAINED,
     GATE,
     WORSE,
-    OutputAdequacy,
 )
 from heli_jax.identification.validation.excitation import LEVEL
 
@@ -24,7 +22,7 @@ def outputs_explained(c: Context) -> Iterator[Finding]:
     doubted = [o for o in c.adequacy.judged if not o.adequate or o.doubtful]
     for output in doubted:
         yield found(
-            _why(output, c.adequacy.ahead),
+            "adequacy.below-gate" if output.adequate else "adequacy.output-not-explained",
             "note" if output.adequate else "doubt",
             output.output,
             value=output.vaf,
@@ -34,25 +32,9 @@ def outputs_explained(c: Context) -> Iterator[Finding]:
             expected=EXPLAINED,
             explained=max(output.explained, 0.0),
             lag1=output.lag1,
-            times=np.sqrt(output.against_disturbance or np.nan),
-            seconds=c.adequacy.ahead or 0.0,
+            times=f"{np.sqrt(ratio):.2g}" if (ratio := output.against_disturbance) else "",
+            ahead=f"up to {c.adequacy.ahead:g} s ahead" if c.adequacy.ahead else "",
         )
-
-
-def _why(output: OutputAdequacy, ahead: float | None) -> str:
-    """The code of what is wrong with an output."""
-    ratio = output.against_disturbance
-    if output.adequate:
-        return "adequacy.below-gate"
-    if ahead is not None:
-        return "adequacy.prediction-misses"
-    if not np.isfinite(output.vaf):
-        return "adequacy.simulation-not-finite"
-    if output.vaf < 0:
-        return "adequacy.worse-than-mean"
-    if ratio is None:
-        return "adequacy.output-not-explained"
-    return "adequacy.more-than-disturbance" if ratio > EXPECTED else "adequacy.innovations-coloured"
 
 
 def simulation_as_expected(c: Context) -> Iterator[Finding]:
@@ -74,7 +56,7 @@ def simulation_as_expected(c: Context) -> Iterator[Finding]:
 
 
 def outputs_unmoved(c: Context) -> Iterator[Finding]:
-    """Outputs of which nothing is explained, and outputs that never move."""
+    """Records of which nothing stands out of the noise, and outputs that never move."""
     if not c.fitted:
         return
     if c.adequacy.by_chance and c.adequacy.judged:
@@ -88,9 +70,6 @@ def outputs_unmoved(c: Context) -> Iterator[Finding]:
             vafs=[o.vaf for o in c.adequacy.judged],
         )
         return
-    for output in c.adequacy.judged:
-        if output.output in c.adequacy.unmoved:
-            yield found("adequacy.output-unmoved", "doubt", output.output, value=output.vaf)
     for name in c.adequacy.still:
         yield found("quality.never-moves", "doubt", name)
 
@@ -115,8 +94,6 @@ def responses_explained(c: Context) -> Iterator[Finding]:
 
 _SURE = 1e-4
 """p value below which a residual that follows the excitation takes all intervals away"""
-_DIVERGED = -10.0
-"""VAF of a simulation below which it has left the record"""
 
 
 def residual_follows_excitation(c: Context) -> Iterator[Finding]:
@@ -138,9 +115,6 @@ def residual_follows_excitation(c: Context) -> Iterator[Finding]:
             explained=[max(f.explained, 0.0) for f in failed.values()],
             level=level,
         )
-    left = [n for n, m in c.metrics.items() if c.followed and not m.vaf >= _DIVERGED]
-    if left:
-        yield found("adequacy.simulation-leaves-record", "note", *left)
 
 
 def outputs_follow_excitation(c: Context) -> Iterator[Finding]:

@@ -68,11 +68,6 @@ from heli_jax.identification.validation.unmodelled import Unmodelled, unmodelled
 from heli_jax.messages import sentence
 
 
-def no_disturbance(optimum: RelaxedOptimum) -> bool:
-    """True if a disturbance was searched for and is not significant."""
-    return optimum.ratio is not None and optimum.ratio < NO_DISTURBANCE
-
-
 class HeldOut(NamedTuple):
     """The flights held out, predicted."""
 
@@ -303,20 +298,21 @@ class Context:
 
     @property
     def absent(self) -> tuple[str, ...]:
-        """The parameters of disturbances that do not show."""
+        """The parameters of disturbances that are not significant."""
         if self.optimum is None:
             return ()
-        if no_disturbance(self.optimum):
-            return self.at.layout.disturbance
-        return self.optimum.absent
+        ratio = self.optimum.ratio
+        none = ratio is not None and ratio < NO_DISTURBANCE
+        return self.at.layout.disturbance if none else self.optimum.absent
 
     @cached_property
     def fast_modes(self) -> list[FastMode]:
-        """By flight the mode that its samples cannot show."""
+        """By flight the mode that its samples cannot show, after a fit."""
         if not self.fitted:
-            return fast_modes(self.problem, {n: f.start for n, f in self.problem.free.items()})
+            return []
         noise = measurement_noise(self.problem, self.at.noise.sd)
-        return fast_modes(self.problem, self.named, noise)
+        modes = fast_modes(self.problem, self.named, noise)
+        return [mode for mode in modes if mode.undetermined]
 
     @cached_property
     def errors(self) -> StandardErrors:

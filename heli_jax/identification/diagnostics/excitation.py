@@ -32,8 +32,6 @@ class Limits:
     of what each does is 1 / (1 - 0.8) = 5 times as large as if the other were still"""
     noise: float = 0.5
     """mean squared step of an output over that of white noise, above which it shows no motion"""
-    feeble: float = 3.0
-    """rms of a response over the noise, below which an input hardly excites the model"""
     better: float = 0.98
     """of the sd that the same record again would leave: less is no reason to fly something else"""
 
@@ -100,28 +98,6 @@ def inputs_together(c: Context) -> Iterator[Finding]:
             )
 
 
-def feeble_inputs(c: Context) -> Iterator[Finding]:
-    """Outputs that the inputs hardly move at the start values: worth most while a record can still
-    be flown again."""
-    if c.fitted:
-        return
-    for (label, _), outputs in zip(c.flights, c.start.simulated, strict=True):
-        for name, y in outputs.items():
-            # About its mean: a trim value that the model holds excites nothing.
-            moved, noise = float(np.std(y)), c.noise[f"{label}/{name}"]
-            if moved < LIMITS.feeble * noise:
-                yield found(
-                    "excitation.feeble",
-                    "note",
-                    name,
-                    value=moved / noise,
-                    flight=label,
-                    moved=moved,
-                    noise=noise,
-                    limit=LIMITS.feeble,
-                )
-
-
 def gusts_guessed(c: Context) -> Iterator[Finding]:
     """Sizes of disturbances that are what the record says at the start values."""
     guessed = [] if c.fitted else unstated_gusts(c.problem)
@@ -141,12 +117,12 @@ def next_flight(c: Context) -> Iterator[Finding]:
     unit = naming.unit(c.problem.model.Inputs, plan.best.input) or ""
     determined = bool(np.isfinite(plan.before))
     yield found(
-        "excitation.next-flight" if determined else "excitation.flight-determines",
+        "excitation.next-flight",
         "note",
         plan.parameter,
         value=plan.after / plan.again if determined else 0.0,
-        before=100.0 * plan.before,
-        again=100.0 * plan.again,
+        before=f"{100.0 * plan.before:.2g} %" if determined else "",
+        again=f"{100.0 * plan.again:.2g} %",
         after=100.0 * plan.after,
         manoeuvre=plan.best.words,
         input=plan.best.input,
@@ -162,7 +138,6 @@ DIAGNOSTICS = (
     nothing_follows,
     excited_bands,
     inputs_together,
-    feeble_inputs,
     gusts_guessed,
     next_flight,
 )

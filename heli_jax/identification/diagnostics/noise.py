@@ -1,10 +1,10 @@
-"""Are residuals, or innovations, white, and are noise and disturbance what the model says?"""
+"""Whiteness of residuals or innovations, and disturbances that are not significant."""
 
 from collections.abc import Iterator
 
 from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.finding import Finding, found
-from heli_jax.identification.diagnostics.context import Context, no_disturbance
+from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.estimation.disturbance_search import NO_DISTURBANCE
 
 COLOURED, TOO_NARROW = "noise.residuals-coloured", "noise.intervals-too-narrow"
@@ -37,29 +37,17 @@ def residuals_white(c: Context) -> Iterator[Finding]:
 
 
 def residuals_correlated(c: Context) -> Iterator[Finding]:
-    """Residuals of several outputs that go together, for which the intervals allow."""
+    """Residuals of several outputs that are correlated, for which the intervals allow."""
     if c.fitted and c.errors.coloured and c.correlated:
         pairs, rho = list(c.correlated), list(c.correlated.values())
         yield found("noise.outputs-correlated", "note", *pairs, correlations=rho)
 
 
 def disturbance_shows(c: Context) -> Iterator[Finding]:
-    """Disturbances that were looked for and do not show."""
+    """Disturbances that were searched for and are not significant."""
     if c.optimum is None:
         return
-    if no_disturbance(c.optimum):
-        yield found("noise.no-disturbance", "note", value=c.optimum.ratio)
-    names = [d.name for d in disturbances_of(c.at.layout.model) if d.sigma in c.optimum.absent]
+    absent = c.absent
+    names = [d.name for d in disturbances_of(c.at.layout.model) if d.sigma in absent]
     if names:
-        yield found("noise.disturbances-absent", "note", *names, limit=NO_DISTURBANCE)
-
-
-def noise_as_stated(c: Context) -> Iterator[Finding]:
-    """Residuals that are larger or smaller than the stated noise."""
-    for label, flight in c.flights if c.fitted else ():
-        for name, stated in flight.sd.items():
-            ratio = c.noise[f"{label}/{name}"] / stated
-            if not 0.5 < ratio < 2.0:
-                yield found(
-                    "noise.not-as-stated", "note", label, name, flight=label, value=ratio, name=name
-                )
+        yield found("noise.no-disturbance", "note", *names, limit=NO_DISTURBANCE)

@@ -1,7 +1,7 @@
-"""Signals that are cut off, stuck, astray, logged in coarse steps or smoothed.
+"""Signals that are cut off, stuck or astray.
 
-Judged as they were logged, where the flight knows it: what was resampled has no flat tops and no
-steps, and suffers from them all the same.
+They are tested as logged, where the flight knows it: resampling hides flat tops, and does not
+mend them.
 """
 
 from collections.abc import Iterator
@@ -11,8 +11,6 @@ import numpy as np
 from heli_jax.finding import Finding, found
 from heli_jax.flights.signal_facts import DROP_SHARE, RAIL_SHARE, STUCK_SECONDS
 from heli_jax.identification.diagnostics.context import Context
-from heli_jax.identification.estimation.filter_error import noiseless
-from heli_jax.numerics.white_noise import highest_frequency, noise_guess
 
 _CUT_OFF = 0.02
 """part of an output's samples at its rails from which on no model of them is adequate"""
@@ -30,7 +28,7 @@ def saturation(c: Context) -> Iterator[Finding]:
         share = sum(facts.shares)
         ends = zip((facts.low.value, facts.high.value), facts.shares, strict=True)
         yield found(
-            "quality.saturation" if kind == "output" else "quality.input-saturation",
+            "quality.saturation",
             "doubt",
             name,
             value=share,
@@ -94,41 +92,4 @@ def strays(c: Context) -> Iterator[Finding]:
                 )
 
 
-def quantisation(c: Context) -> Iterator[Finding]:
-    """Outputs whose steps are coarse beside the noise that is assumed."""
-    for label, flight in c.flights:
-        for name in flight.outputs:
-            facts = flight.facts[name, "output"]
-            rounding = facts.rounding(flight.dt) if facts.levels > 1 else 0.0
-            ratio = rounding / c.noise[f"{label}/{name}"]
-            if ratio > 1.0:
-                yield found(
-                    "quality.quantisation",
-                    "doubt",
-                    name,
-                    value=ratio,
-                    flight=label,
-                    step=facts.step,
-                    rounding=rounding,
-                )
-
-
-def smoothed(c: Context) -> Iterator[Finding]:
-    """Outputs that have no noise of a sensor."""
-    filtered = c.at.layout.noise_model == "disturbance"
-    for label, flight in c.flights:
-        names = noiseless(flight.outputs)
-        if names:
-            outputs = [flight.outputs[n] for n in names]
-            highest = [highest_frequency(y, flight.dt) or 0.0 for y in outputs]
-            yield found(
-                "quality.smoothed-for-filter" if filtered else "quality.smoothed",
-                "doubt" if filtered else "note",
-                *names,
-                value=max(noise_guess(y) / float(np.nanstd(y)) for y in outputs),
-                flight=label,
-                below=f"{max(highest):.2g} Hz" if max(highest) else "",
-            )
-
-
-DIAGNOSTICS = (saturation, stuck_outputs, strays, quantisation, smoothed)
+DIAGNOSTICS = (saturation, stuck_outputs, strays)

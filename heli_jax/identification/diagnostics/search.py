@@ -1,12 +1,9 @@
-"""Did the search end at an optimum, and within what was stated?"""
+"""The end of the search, and what was stated beforehand: bounds, priors, a band."""
 
 from collections.abc import Iterator
 
-import numpy as np
-
-from heli_jax import naming
 from heli_jax.finding import Finding, found
-from heli_jax.flights.flight import labels, own_instruments, own_said
+from heli_jax.flights.flight import labels
 from heli_jax.identification.diagnostics.context import Context
 
 STOPPED = "search.stopped"
@@ -15,28 +12,18 @@ FAR = 3.0
 
 
 def at_bound(c: Context) -> Iterator[Finding]:
-    """Estimates at their bounds: all estimates are those of a bound that the data do not bear
-    out."""
+    """Estimates at their bounds, which the data contradict."""
     for name, estimate in c.estimates.items():
         if estimate.at_bound:
-            # No key widens that of the shift.
-            code = "fit.shift-at-bound" if name == "time_shift" else "fit.at-bound"
-            yield found(code, "doubt", name, value=estimate.value, distrusts=c.estimates)
+            value = estimate.value
+            yield found("fit.at-bound", "doubt", name, value=value, distrusts=c.estimates)
 
 
 def search_stopped(c: Context) -> Iterator[Finding]:
-    """A search that did not arrive, and what the data leave open where it may go on without end."""
+    """A search that did not converge."""
     # Rounding has a remedy of its own.
-    if c.optimum is None or c.arrived or c.rounding:
-        return
-    layout = c.at.layout
-    windows = sum(count for count, _ in layout.windows) > len(layout.windows)
-    code = "search.stopped-in-windows" if windows and layout.continuity is None else STOPPED
-    yield found(code, "doubt", value=float(sum(s for s, _ in c.optimum.trace)))
-    open_ = c.before.not_identifiable & c.verdict.not_identifiable
-    names = [n for n in c.verdict.names if n in open_]
-    if names and np.all(np.isfinite(c.e.J)):
-        yield found("search.open-directions", "doubt", *names)
+    if c.optimum is not None and not (c.arrived or c.rounding):
+        yield found(STOPPED, "doubt", value=float(sum(s for s, _ in c.optimum.trace)))
 
 
 def search_told(c: Context) -> Iterator[Finding]:
@@ -48,7 +35,7 @@ def search_told(c: Context) -> Iterator[Finding]:
 
 
 def prior_contradicted(c: Context) -> Iterator[Finding]:
-    """Estimates that have left their priors."""
+    """Estimates far from their priors."""
     for name, free in c.problem.free.items() if c.fitted else ():
         if free.prior is not None:
             away = abs(c.estimates[name].value - free.prior.mean) / free.prior.sd
@@ -77,13 +64,3 @@ def log_cautions(c: Context) -> Iterator[Finding]:
         for caution in flight.source.cautions if flight.source else ():
             said.setdefault(caution.sentence, caution.of(label))
     yield from said.values()
-    own = own_instruments(c.problem.training, naming.names(c.problem.model.Inputs))
-    if own and c.problem.instrument is None:
-        yield found("loop.instrument-unused", "note", *own, said=own_said(own))
-
-
-def band_unused(c: Context) -> Iterator[Finding]:
-    """A stated band that is none of the fit's."""
-    objective, band = c.at.layout.objective, c.problem.frequency.band
-    if band is not None and objective.noise_model == "spectrum" and not objective.fits_responses:
-        yield found("frequency.band-unused", "note", low=band[0], high=band[1])

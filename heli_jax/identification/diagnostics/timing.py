@@ -15,9 +15,7 @@ from heli_jax.identification.validation.logging_rate import (
     rates_against_modes,
 )
 from heli_jax.identification.validation.shifts import (
-    LEAD,
     SHIFT,
-    leads,
     shift_in_time,
 )
 
@@ -31,29 +29,6 @@ _NAMED = 3
 """parameters that a sentence names at most"""
 _SEEN = 1e-3
 """of a parameter, below which a move is not named: of one held by a prior alone it is rounding"""
-
-
-def inputs_late(c: Context) -> Iterator[Finding]:
-    """Inputs that an output precedes; after a fit, only where no likelihood tells how late."""
-    layout, model = c.at.layout, c.problem.model
-    if c.fitted:
-        freed = layout.shift or set(model.delay_parameters) & set(c.free)
-        judged = c.arrived and c.explains and layout.noise_model != "spectrum"
-        if freed or judged:
-            return
-    follow = {(one.flight, one.input) for one in c.feedback if one.present}
-    for lead in leads(c.flights):
-        # The finding on feedback says that such an input may be late.
-        if (lead.flight, lead.input) not in follow:
-            yield found(
-                "timing.output-leads",
-                value=lead.share,
-                flight=lead.flight,
-                input=lead.input,
-                output=lead.output,
-                seconds=lead.seconds,
-                limit=LEAD.share,
-            )
 
 
 def signals_shifted(c: Context) -> Iterator[Finding]:
@@ -116,7 +91,7 @@ def modes_past_nyquist(c: Context) -> Iterator[Finding]:
     for mode in c.fast_modes:
         yield found(
             "timing.mode-past-nyquist",
-            "doubt" if mode.undetermined else "note",
+            "doubt",
             mode.flight,
             value=mode.frequency,
             distrusts=mode.undetermined,
@@ -124,8 +99,6 @@ def modes_past_nyquist(c: Context) -> Iterator[Finding]:
             hz=mode.frequency / (2.0 * math.pi),
             nyquist=mode.nyquist,
             nyquist_hz=mode.nyquist / (2.0 * math.pi),
-            about=mode.about,
-            past=1 if mode.frequency >= mode.nyquist else 2,
         )
 
 
@@ -159,7 +132,7 @@ def of_rates(
             elif one.samples < one.least:
                 severity = "refuse"
             finding = found(
-                "timing.rate-enough" if severity == "ok" else "timing.logging-rate",
+                "timing.logging-rate",
                 severity,
                 value=one.samples,
                 flight=label,
@@ -168,7 +141,7 @@ def of_rates(
                 hz=one.mode.hz,
                 output=one.mode.output,
                 where=where,
-                needed=RATE.enough * one.mode.hz,
+                low="" if severity == "ok" else f"{RATE.enough * one.mode.hz:.3g} Hz",
                 enough=RATE.enough,
                 least=one.least,
             )
@@ -177,21 +150,10 @@ def of_rates(
     yield from bad or (f for _, f in sorted(enough, key=lambda pair: pair[0])[:1])
 
 
-def delays_negative(c: Context) -> Iterator[Finding]:
-    """Delays, and the shift of the inputs, below zero: the other estimates are right with them."""
-    for name in (*c.problem.model.delay_parameters, "time_shift"):
-        estimate = c.estimates.get(name)
-        if estimate is not None and estimate.upper95 is not None and estimate.upper95 < 0:
-            value = estimate.value
-            yield found("timing.delay-negative", "note", name, value=value, ms=1e3 * value)
-
-
 DIAGNOSTICS = (
-    inputs_late,
     signals_shifted,
     loop_between_samples,
     modes_past_nyquist,
     rates_enough,
-    delays_negative,
 )
 """causes first"""

@@ -12,19 +12,15 @@ import numpy as np
 
 from heli_jax.dynamics.model import Model
 from heli_jax.finding import Finding, found
-from heli_jax.flights.channel_names import no_stick, unit_in_name
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.log import shown
 from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.validation.signal_signs import (
     AGAINST,
-    NEAR,
     against_start,
     angle_over_rate,
-    inputs_in_other_units,
     oversized,
     rates_and_angles,
-    sticks_of,
 )
 
 
@@ -48,7 +44,6 @@ class Limits:
 
 
 LIMITS = Limits()
-UNIT_IN_DOUBT = "units.in-doubt"
 _DEGREE = 180.0 / np.pi
 _ROLL = frozenset({"phi", "roll"})
 
@@ -117,76 +112,35 @@ def against_file(c: Context) -> Iterator[Finding]:
 def size_of_angles(c: Context) -> Iterator[Finding]:
     """Angles and rates that are too large for the unit that they are read in."""
     for label, flight in c.flights:
-        for finding in in_degrees(c.problem.model, label, flight):
-            doubted = finding.code == UNIT_IN_DOUBT and not finding.denies
-            yield finding._replace(distrusts=_estimates(c) if doubted else ())
+        yield from in_degrees(c.problem.model, label, flight, _estimates(c))
 
 
-def in_degrees(model: Model, label: str, flight: Flight) -> Iterator[Finding]:
+def in_degrees(
+    model: Model, label: str, flight: Flight, estimates: tuple[str, ...] = ()
+) -> Iterator[Finding]:
     """Angles and rates of a flight that look like degrees read as radians."""
     for name, size, limit, flown, certain in oversized(model, flight):
         assert flight.source is not None
         signal = flight.source.outputs[name]
         yield found(
-            # What was flown upside down is in its own unit as likely as not.
-            "units.flown-or-degrees" if flown else UNIT_IN_DOUBT,
+            "units.in-doubt",
             "doubt",
             name,
             value=size,
             denies=certain,
+            distrusts=() if certain or flown else estimates,
             flight=label,
             unit=signal.unit,
             degrees=signal.unit.replace("rad", "deg"),
-            in_degrees=float(np.degrees(size)),
             limit=limit,
             channel=shown(signal.name),
-        )
-
-
-def size_of_inputs(c: Context) -> Iterator[Finding]:
-    """Inputs whose size and effect at the start values suit another unit."""
-    sticks = sticks_of(c.problem.model)
-    for one in inputs_in_other_units(c.flights, c.start.simulated, sticks):
-        signal = next(
-            f.source.inputs[one.name] for n, f in c.flights if n == one.flight and f.source
-        )
-        yield found(
-            "units.input-in-doubt",
-            "doubt",
-            one.name,
-            value=max(one.moved.values()),
-            distrusts=_estimates(c),
-            flight=one.flight,
-            channel=shown(signal.name),
-            unit=one.unit,
-            stated=one.stated,
-            moved=list(one.moved),
-            times=list(one.moved.values()),
-            factor=one.factor,
-            near=NEAR,
+            flown=flown,
         )
 
 
 def _estimates(c: Context) -> tuple[str, ...]:
-    """The estimates, of which nobody knows which another unit changes; none before an optimum."""
+    """All estimates, since any may depend on the unit; none before an optimum."""
     return () if c.status == "not-converged" else tuple(c.estimates)
-
-
-def no_sticks(c: Context) -> Iterator[Finding]:
-    """Inputs that are taken from a channel which by its name is a motion."""
-    for label, flight in c.flights:
-        for name, signal in (flight.source.inputs if flight.source else {}).items():
-            what = no_stick(signal.name, unit_in_name(signal.name), signal.si, sure=True)
-            if what and signal.constant is None:
-                yield found(
-                    "signs.no-stick",
-                    "doubt",
-                    name,
-                    denies=True,
-                    flight=label,
-                    channel=shown(signal.name),
-                    what=what,
-                )
 
 
 def outputs_against_start(c: Context) -> Iterator[Finding]:
@@ -194,31 +148,25 @@ def outputs_against_start(c: Context) -> Iterator[Finding]:
     not explain the record, since else it found the right sign."""
     if c.fitted and not c.adequacy.denied:
         return
-    for one in against_start(c.flights, c.start.simulated, sticks_of(c.problem.model)):
-        names = tuple(one.correlations)
+    flights = [flight for _, flight in c.flights]
+    against = against_start(flights, c.start.simulated)
+    if against:
         yield found(
             "signs.against-start",
             "doubt",
-            *names,
-            *one.sticks,
-            value=min(one.correlations.values()),
-            flight=one.flight,
-            outputs=names,
-            correlations=list(one.correlations.values()),
-            # Of one stick the one cause is likelier than that all outputs are turned.
-            suspects=one.sticks if len(names) > 1 else (*names, *one.sticks),
+            *against,
+            value=min(against.values()),
+            correlations=list(against.values()),
             limit=AGAINST,
         )
 
 
 def turned_from_start(c: Context) -> Iterator[Finding]:
-    """Parameters that surely have the other sign than they began with: a turned signal fits as
-    well, and the start alone tells. One whose sign is declared (`Model.positive`, `sign: keep`,
-    bounds) cannot turn."""
+    """Parameters whose sign is surely not that of their start values: an inverted signal fits as
+    well, and only the start value shows it."""
     turned = {}
     for name, free in c.problem.free.items() if c.arrived else ():
         e = c.estimates[name]
-        # A delay says by itself what it means to be negative.
         if name in c.problem.model.delay_parameters or e.lower95 is None or e.upper95 is None:
             continue
         surely = e.lower95 * e.upper95 > 0 and e.value * free.start < 0
@@ -235,8 +183,6 @@ DIAGNOSTICS = (
     rate_against_angle,
     against_file,
     size_of_angles,
-    size_of_inputs,
-    no_sticks,
     outputs_against_start,
     turned_from_start,
 )

@@ -5,7 +5,7 @@ intensity and correlation time are estimated beside the parameters, the scale of
 noise is concentrated out of the likelihood unless it is given.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -56,14 +56,10 @@ from heli_jax.identification.unknowns.layout import (
     scales_of,
     unpack,
 )
-from heli_jax.numerics.white_noise import without_noise
 from heli_jax.simulation.options import SimulationOptions
 from heli_jax.simulation.simulate import simulate
 
-
-def noiseless(outputs: Mapping[str, np.ndarray]) -> list[str]:
-    """Return the outputs (N,) without sensor noise; NaN is missing."""
-    return [n for n, y in outputs.items() if without_noise(y)]
+# Records of a fitted model with the disturbance drawn anew.
 
 
 _BATCH = 8

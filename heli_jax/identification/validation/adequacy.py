@@ -1,16 +1,12 @@
-"""Adequacy: does the model explain what was measured, beside noise and disturbance?
+"""Adequacy of a model: it explains the record, beside noise and disturbance.
 
-That an optimiser converged and that the data determine the parameters says nothing of it: the best
-parameters of a wrong model are found and determined as well as those of the right one.
-
-What is judged is the simulated response of every fitted output. The acceptance card asks for a
-variance accounted for (VAF) of 0.9 (Tischler and Remple, 2012, and Jategaonkar, 2006, gate fits of
-flights in that region). A model is called inadequate only where it misses that by far: where it
-leaves more than a fifth of what is not white noise unexplained, twice what the gate allows.
-Between the two there is doubt, and the same advice. White
-residuals are adequate whatever the VAF: then all that is left is measurement noise.
-With filter error the simulation does not know the disturbance, so it is judged against what the
-estimated disturbance lets expect.
+A wrong model can converge, and the data can determine its parameters. So the simulated response of
+every fitted output is tested. The acceptance card asks for a variance accounted for (VAF) of 0.9
+(Tischler and Remple, 2012, and Jategaonkar, 2006, use limits in that region). A model is inadequate
+if it leaves more than a fifth of what is not white noise unexplained, twice what the card allows;
+between the two it is doubtful. If the residuals are white, the model is adequate at any VAF: only
+measurement noise is left. With filter error the simulation does not know the disturbance, so its
+error is compared with what the estimated disturbance lets expect.
 """
 
 from collections.abc import Mapping, Sequence
@@ -56,7 +52,7 @@ class OutputAdequacy(NamedTuple):
     explained: float
     """share explained of what is not white noise"""
     white: bool
-    """whether residuals (innovations) of all flights are white"""
+    """True if residuals (innovations) of all flights are white"""
     lag1: float
     """their largest autocorrelation at one sample"""
     against_disturbance: float | None = None
@@ -101,10 +97,10 @@ def is_unstable(problem: Problem, params: Any, growth: float = _GROWTH) -> bool:
 EXPLAINED = 0.8
 """share of what is not white noise that has to be explained"""
 NEARLY_WHITE = 0.1
-"""share of the residual's variance that may be other than white noise where nothing else is left"""
+"""largest share of the residual's variance that is not white noise, of a residual that counts as
+noise"""
 WORSE = -0.1
-"""VAF below which not even a white residual is taken for noise alone: in a short record of noise
-chance makes it a few hundredths negative"""
+"""VAF below which a white residual is not noise alone; chance makes it a few hundredths negative"""
 EXPECTED = 9.0
 """power of the simulation's error over that which the disturbance lets expect: its square root is
 three standard deviations where the disturbance is so slow that the record holds one swing of it"""
@@ -116,13 +112,11 @@ class Adequacy(NamedTuple):
     # The names of the first three fields are keys of fit.json.
     judged: tuple[OutputAdequacy, ...] = ()
     by_chance: bool = False
-    """whether nothing measured stands out of the noise, so that any optimum is one of chance"""
+    """True if no response stands out of the noise, so that any optimum is one of chance"""
     ahead: float | None = None
-    """[s] that is predicted at most where that, and no simulation, was judged"""
-    unmoved: tuple[str, ...] = ()
-    """outputs of which nothing is explained, though what is left may be noise"""
+    """[s] longest prediction, where predictions were tested in place of a simulation"""
     still: tuple[str, ...] = ()
-    """outputs that never move, of which nothing is judged"""
+    """outputs that never move"""
 
     @property
     def denied(self) -> bool:
@@ -152,11 +146,9 @@ class Evidence(NamedTuple):
     """with a disturbance, by output the power of the simulation's error over that which disturbance
     and noise make; without, the simulation has to explain by itself"""
     unknowns: int = 0
-    """how many were estimated; a response that explains no more than as many unknowns explain of
-    noise by chance shows nothing"""
+    """number of estimated unknowns"""
     ahead: float | None = None
-    """[s] that is predicted at most, from a filter's states, where that stands in place of the
-    simulation: of an unstable model"""
+    """[s] longest prediction from a filter's states, of an unstable model; None of a simulation"""
 
 
 def misses(expected: Mapping[str, float]) -> bool:
@@ -180,7 +172,7 @@ def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
         evidence: measured and simulated outputs, and what is left between them.
     """
     disturbed = evidence.error_ratio is not None
-    # Linearising takes a compiled program of its own, so it is asked only where the answer counts.
+    # Linearising compiles a program: only where it counts.
     unstable = disturbed and evidence.ahead is None and is_unstable(problem, params)
     # An output that never moves has an error and no VAF.
     still = tuple(
@@ -197,8 +189,7 @@ def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
     if outputs and not bad and noise == outputs:
         outputs = tuple(output._replace(adequate=False) for output in outputs)
         return Adequacy(outputs, by_chance=True, still=still)
-    unmoved = tuple(o.output for o in noise if o.adequate)
-    return Adequacy(outputs, False, evidence.ahead, unmoved, still)
+    return Adequacy(outputs, False, evidence.ahead, still)
 
 
 _BY_CHANCE = 1e-3
@@ -263,19 +254,17 @@ def _explained(error: list[np.ndarray], measured: np.ndarray) -> tuple[float, fl
     return 1.0 - other / rest, other / residual if residual > 0 else 0.0
 
 
-# Do the inputs explain anything? A filter follows any record, if need be by its disturbance alone.
-#
-# What is then estimated is the colour of the noise, and not how the vehicle responds: from other
-# starts, or with another disturbance, it is something else, with an interval as narrow.
+# A filter follows any record, if need be by its disturbance alone. The estimates are then those of
+# the noise, and not of the response to the inputs.
 
 
 def inputs_explain_nothing(at: Solution, e: Evaluation, verdict: Verdict) -> Verdict:
-    """Return the verdict; that nothing is determined if the inputs explain nothing."""
-    # Without a disturbance that is asked of the response: it has to stand out of the noise.
+    """Return the verdict; nothing is identifiable if the inputs explain nothing."""
+    # Without a disturbance the response has to stand out of the noise (`Adequacy.by_chance`).
     if not verdict.identifiable or not e.innovations:
         return verdict
     gain, free = gain_of_inputs(at, e), len(at.layout.free)
-    # Written so that a gain that is no number changes nothing.
+    # A gain that is NaN changes nothing.
     if not scipy.special.chdtrc(free, max(gain, 0.0)) >= _BY_CHANCE:
         return verdict
     words = sentence(

@@ -298,8 +298,6 @@ class FastMode(NamedTuple):
     """[rad/s]"""
     nyquist: float
     """[rad/s]"""
-    about: str
-    """where the model was linearised; empty for a linear one"""
     undetermined: tuple[str, ...]
     """the free parameters that can take it to an alias, where it shows in an output"""
 
@@ -357,7 +355,7 @@ def fast_modes(
             if np.any(np.abs(np.imag(s[lost])) > _TURNED)
         )
         name, fastest = flight.name or "the flight", float(np.max(swing[past]))
-        fast.append(FastMode(name, fastest, nyquist, modes.at.words, undetermined))
+        fast.append(FastMode(name, fastest, nyquist, undetermined))
     return fast
 
 

@@ -35,31 +35,28 @@ the normal distribution"""
 
 _HUGE = 1e100
 _MOSTLY_MISSING = 0.4
-"""part of the samples that are seen, below which a signal is one of fewer samples"""
+"""part of the samples that are measured, below which a signal counts as a slower one"""
 
 NO_METRICS = Metrics(*[float("nan")] * 7)
 
 
 FAR = 1e4
-"""times the variance of a signal that gusts leave of no simulation that does not diverge"""
+"""error over variance of the signal, above which a simulation in gusts diverges"""
 
 
 def diverges(m: Metrics, times: float = 10.0) -> bool:
-    """True if a simulation left what was measured: it is not finite, or its error has several
-    times the variance of the signal.
-    """
+    """True if a simulation is not finite, or its error has several times the signal's variance."""
     return not np.isfinite(m.rmse) or m.vaf < 1.0 - times
 
 
 @np.errstate(over="ignore", invalid="ignore")
 def metrics(measured: np.ndarray, simulated: np.ndarray) -> Metrics:
     """Agreement of two signals (N,) where something is measured (not NaN)."""
-    # Only what was measured counts, for the means too: a gap must not shift one of them.
     seen = ~np.isnan(measured)
     measured, simulated = measured[seen], simulated[seen]
     residual = measured - simulated
     motion = np.linalg.norm(measured - measured.mean())
-    # What rounding leaves of a constant is no motion that a simulation could explain.
+    # The rounding of a constant is no motion.
     motion = motion if motion > 1e-9 * np.linalg.norm(measured) else 0.0
     rms = np.sqrt(np.mean(measured**2)) + np.sqrt(np.mean(simulated**2))
     mse = float(np.mean(residual**2))
@@ -86,7 +83,7 @@ class Whiteness(NamedTuple):
 
     white: bool
     p_value: float
-    """of the Ljung-Box test over `lags` lags, for all signals that were judged together"""
+    """of the Ljung-Box test over `lags` lags, for all signals that are tested together"""
     lags: int
     outside: float
     """share of the lags outside the 99 % band"""
@@ -95,9 +92,7 @@ class Whiteness(NamedTuple):
 
 
 def _padded(n: int, lags: int) -> int:
-    """Samples of a transform of n, by which products up to so many lags are told from those of the
-    record's end with its beginning."""
-    # Beyond the lags asked for the end may wrap round.
+    """Return the size of a transform of n samples without wrap-around up to so many lags."""
     return cast(int, scipy.fft.next_fast_len(n + lags, real=True))
 
 
@@ -140,11 +135,9 @@ def _centred(signal: np.ndarray) -> np.ndarray:
 
 
 def sequence(signal: np.ndarray) -> np.ndarray:
-    """A signal (N,), or where most of it is missing the samples that there are, one behind the
-    other.
+    """Return a signal (N,), or its measured samples in a row where most are missing.
 
-    White noise is white at whatever instants it is sampled. A slow sensor's samples, put on the
-    nearest instants of a fast grid, have no lag at which many pairs are seen: lags are then counted
+    The samples of a slow sensor on a fast grid have no lag with many pairs: lags are then counted
     in its own samples.
     """
     return signal[kept(signal)]
@@ -169,9 +162,8 @@ def whiteness(
 
     Args:
         residual: (N,), any unit.
-        together: how many signals are judged side by side: p is that of the least of as many, so
-            that one in a hundred white records fails, not one in a hundred signals.
-        fitted: (N, k) what of the signal the unknowns could follow, see `seen_autocorrelation`.
+        together: number of signals that are tested side by side, for the p value.
+        fitted: (N, k) of `seen_autocorrelation`.
     """
     fitted = None if fitted is None else fitted[kept(residual)]
     residual = sequence(residual)
@@ -180,7 +172,7 @@ def whiteness(
     lags = r.size
     # Of the squared autocorrelation at a lag white noise expects one over the pairs seen there.
     q = (n + 2) / max(n, 1) * np.cumsum(r**2 * pairs)
-    # Few lags see a short memory that many lags would drown; both must agree with white noise.
+    # A short autocorrelation is significant at few lags, and not at many: both are tested.
     short = min(lags, 20)
     p_all, p_short = (_chance(q[k - 1], k, n) for k in (lags, short))
     # Two tests of each signal (Sidak, 1967).

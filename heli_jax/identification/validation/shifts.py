@@ -1,23 +1,19 @@
 """Signals that act at another time than their log has them.
 
-- `shifts`: the likelihood of a fitted model with a signal at another time, where its unknowns
-  follow to first order (a score test, Rao, 1948). An input or an output is moved by whole samples,
-  an input also within a sample by the slope of the residual; the other hold of an input moves it
-  by half a sample. Every candidate has the same statistic and the same limit. An input that
-  follows the response knows the errors of later samples, but takes them back: used too early it
-  predicts them with the wrong sign, so that the test holds in a closed loop too.
-- `leads`: no vehicle responds before its input. If the past of an output and of all inputs leaves
-  something of the output that an input's future explains, that input is logged late, or it follows
-  the output (C. A. Sims, Money, income, and causality, Am. Econ. Rev. 62, 1972). It needs no model.
+The likelihood of a fitted model with a signal at another time is computed where the unknowns follow
+to first order (a score test, Rao, 1948). An input or an output is moved by whole samples, an input
+also within a sample by the slope of the residual; the other hold of an input moves it by half a
+sample. Every candidate has the same statistic and the same limit. An input that follows the
+response knows the errors of later samples, but takes them back: used too early it predicts them
+with the wrong sign, so that the test holds in a closed loop too.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
 import numpy as np
-import scipy.special
 from jaxtyping import Float
 
 from heli_jax import naming
@@ -32,8 +28,6 @@ from heli_jax.identification.estimation.evaluation import (
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Solution
-
-# Signals with which a model explains the record better at another time.
 
 
 @dataclass(frozen=True)
@@ -212,122 +206,3 @@ def _moved(data: Data, kind: str, name: str, seconds: float) -> Data:
             of[name] = jax.device_put(line.astype(v.dtype))
         flights.append(flight._replace(inputs=type(flight.inputs)(**inputs), outputs=outputs))
     return data._replace(flights=tuple(flights))
-
-
-# Inputs whose future an output shows.
-
-
-@dataclass(frozen=True)
-class _LeadLimits:
-    rate: float = 50.0
-    """[Hz] to which logs are averaged, so that the verdict is the same at any rate of the log"""
-    seconds: float = 0.4
-    """past and future of an input that are looked at"""
-    own: int = 6
-    """past samples of the output that predict it"""
-    fewest: int = 10
-    """samples for each regressor"""
-    share: float = 0.1
-    """part of what the past leaves of an output that an input's future explains, for a lead"""
-    chance: float = 1e-6
-    """probability of as much by chance, at most"""
-
-
-LEAD = _LeadLimits()
-
-
-class Lead(NamedTuple):
-    """An output that moves before an input does."""
-
-    flight: str
-    input: str
-    output: str
-    share: float
-    """part of what the past leaves of the output that the later input explains"""
-    seconds: float
-
-
-def leads(flights: Sequence[tuple[str, Flight]]) -> list[Lead]:
-    """Return by flight and input the surest lead of an output."""
-    surest: dict[tuple[str, str], Lead] = {}
-    for label, flight in flights:
-        for output, y in flight.outputs.items():
-            led = led_by(y, flight.inputs, flight.dt)
-            if led is not None:
-                share, seconds, name = led
-                lead = Lead(label, name, output, share, seconds)
-                if (label, name) not in surest or surest[label, name].share < share:
-                    surest[label, name] = lead
-    return list(surest.values())
-
-
-def led_by(
-    y: Float[np.ndarray, " N"], inputs: Mapping[str, Float[np.ndarray, " N"]], dt: float
-) -> tuple[float, float, str] | None:
-    """Return the input whose future explains most of an output: the part (0 to 1) that it explains
-    of what the past leaves, by how much the output precedes it [s], and its name; None without one.
-
-    Args:
-        y: the output, NaN where nothing is measured.
-        dt: [s].
-    """
-    moving = {n: u for n, u in inputs.items() if np.isfinite(u).all() and np.ptp(u) > 0}
-    if not moving or not np.isfinite(y).all() or not np.ptp(y) > 0:
-        return None
-    count = max(1, round(1.0 / (LEAD.rate * dt)))
-    step = count * dt
-    slow, drives = _averaged(y, count), {n: _averaged(u, count) for n, u in moving.items()}
-    shares = {n: _of_future(slow, drives, n, step) for n in drives}
-    name, share = max(shares.items(), key=lambda item: item[1])
-    if share < LEAD.share:
-        return None
-    # Move that input ahead until its future explains no more.
-    most = max(1, round(LEAD.seconds / step))
-    for k in range(1, most + 1):
-        ahead = {n: u[k:] if n == name else u[: u.size - k] for n, u in drives.items()}
-        if _of_future(slow[: slow.size - k], ahead, name, step) < LEAD.share:
-            return share, k * step, name
-    return share, most * step, name
-
-
-def _averaged(x: np.ndarray, count: int) -> np.ndarray:
-    """Means (N // count,) of so many samples."""
-    size = x.size // count
-    return x[: size * count].reshape(size, count).mean(axis=1)
-
-
-def _of_future(y: np.ndarray, drives: Mapping[str, np.ndarray], name: str, step: float) -> float:
-    """Return the part of what the past of all leaves of an output that an input's future explains,
-    less what as many regressors explain of noise; 0 if chance may make as much."""
-    lags = max(2, round(LEAD.seconds / step))
-    first, last = max(lags, LEAD.own), y.size - lags
-    regressors = LEAD.own + len(drives) * (lags + 1) + lags
-    if last - first < LEAD.fewest * regressors:
-        return 0.0
-
-    def column(x: np.ndarray, k: int) -> np.ndarray:
-        return x[first - k : last - k]
-
-    past = [column(y, k) for k in range(1, LEAD.own + 1)] + [np.ones(last - first)]
-    past += [column(u, k) for u in drives.values() for k in range(lags + 1)]
-    # A step within a mean shows in full in the next one: that is no lead yet.
-    past += [column(u, -1) for u in drives.values()]
-    known = directions(np.stack(past, axis=1))
-    future = np.stack([column(drives[name], -k) for k in range(2, lags + 1)], axis=1)
-    size = float(np.linalg.norm(future - future.mean(axis=0), axis=0).max())
-    beside = future - known @ (known.T @ future)
-    # What the past determines of the future is left as rounding.
-    beside = beside[:, np.linalg.norm(beside, axis=0) > 1e-6 * size]
-    if not beside.size:
-        return 0.0
-    new = directions(beside)
-    rest = column(y, 0) - known @ (known.T @ column(y, 0))
-    freedom = rest.size - known.shape[1] - new.shape[1]
-    power = float(rest @ rest)
-    if not power > 0:
-        return 0.0
-    share = min(float(np.sum((new.T @ rest) ** 2)) / power, 1.0)
-    F = share / new.shape[1] / max((1.0 - share) / freedom, 1e-300)
-    if scipy.special.fdtrc(new.shape[1], freedom, F) > LEAD.chance:
-        return 0.0
-    return max(0.0, 1.0 - (1.0 - share) * (freedom + new.shape[1]) / freedom)

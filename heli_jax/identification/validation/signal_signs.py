@@ -1,9 +1,8 @@
-"""Signs and units of signals, as far as signals tell them.
+"""Signs and units of signals: three tests that need no fit.
 
-Three tests that need no fit. An angle is the integral of its rate, so the two move alike, and as
-far. With start values of the right signs and units the simulated outputs move with the measured
-ones, and about as far. And the size of a signal suits one unit better than another: degrees fit as
-well as radians where all outputs are in them, with every estimate off by 57.
+An angle is the integral of its rate. Simulated outputs move with the measured ones if the start
+values have the right signs. The size of an angle or a rate suits radians or degrees: where all
+outputs are in degrees, they fit as well, with every estimate off by 57.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,9 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from heli_jax import units
 from heli_jax.dynamics.model import Model, axes_of
-from heli_jax.flights.flight import Flight, Signal
+from heli_jax.flights.flight import Flight
 from heli_jax.identification.validation.metrics import autocorrelation, cross_correlation
 from heli_jax.vehicle import of_helicopter
 
@@ -120,76 +118,39 @@ AGAINST = -0.3
 _SURE = 3.0
 """times what chance makes of it"""
 _LAG = 0.25
-"""[s] to either side: later, a swing of the right sign looks like one of the wrong sign"""
+"""[s] to either side: at longer lags an oscillation of the right sign looks inverted"""
 _LARGER = 1.3
 """by how much the correlation of the wrong sign exceeds any of the right one"""
-_MORE = 1.3
-"""times as far an output is simulated to move in a flight that says more of it"""
-
-
-class Turned(NamedTuple):
-    """Outputs of a flight that move against those simulated at the start values."""
-
-    flight: str
-    correlations: dict[str, float]
-    """by output"""
-    sticks: tuple[str, ...]
-    """inputs one of which may have the wrong sign instead; none where another output of the same
-    input has the right one"""
 
 
 def against_start(
-    flights: Sequence[tuple[str, Flight]],
-    simulated: Sequence[Mapping[str, np.ndarray]],
-    sticks: Mapping[str, str],
-) -> Iterator[Turned]:
-    """Outputs that move against those simulated at the start values: all that a stick moves, or one
-    of them that others do not go with.
-
-    A stick that only holds an output against gusts moves against it by feedback alone. So what
-    another flight shows, in which it moves the output further and the right way, goes before it.
+    flights: Sequence[Flight], simulated: Sequence[Mapping[str, np.ndarray]]
+) -> dict[str, float]:
+    """Return by output the correlation over all flights with the simulation at the start values,
+    where it surely is negative.
 
     Args:
         simulated: by flight and output (N,), SI.
-        sticks: by output the input that moves it, of `sticks_of`; of others any input may.
     """
-    # By output its correlation with the simulated one, where that is sure, and the latter's sd.
-    by_flight = [
-        {
-            name: (c, float(np.std(run[name])))
-            for name, measured in f.outputs.items()
-            if (c := _surely(measured, run[name], f.dt)) is not None
-        }
-        for (_, f), run in zip(flights, simulated, strict=True)
-    ]
-    for (label, flight), signs in zip(flights, by_flight, strict=True):
-        groups: dict[tuple[str, ...], dict[str, float]] = {}
-        for name, (correlation, size) in signs.items():
-            others = [of_flight[name] for of_flight in by_flight if name in of_flight]
-            if correlation > 0 or not any(c > 0 and sd > _MORE * size for c, sd in others):
-                of = (sticks[name],) if name in sticks else tuple(flight.inputs)
-                groups.setdefault(of, {})[name] = correlation
-        for of, group in groups.items():
-            turned = {n: c for n, c in group.items() if c < 0}
-            if turned and len(turned) == len(group):
-                yield Turned(label, turned, of)
-            else:
-                yield from (Turned(label, {n: c}, ()) for n, c in turned.items())
-
-
-def sticks_of(model: Model) -> dict[str, str]:
-    """By output, named as its axis names it or as outputs are here, the input that turns the model
-    about that axis."""
-    sticks = {}
-    for axis in axes_of(model):
-        if axis.stick is not None:
-            names = {axis.rate, axis.angle, *(a for r, a in _PAIRS if r == axis.rate)}
-            sticks |= {name: axis.stick for name in names if name is not None}
-    return sticks
+    against = {}
+    for name in dict.fromkeys(n for f in flights for n in f.outputs):
+        both = [
+            (f.outputs[name], run[name])
+            for f, run in zip(flights, simulated, strict=True)
+            if name in f.outputs
+        ]
+        # Each flight about its mean: flights have biases of their own.
+        measured, model = (
+            np.concatenate([v - np.nanmean(v) for v in of]) for of in zip(*both, strict=True)
+        )
+        correlation = _surely(measured, model, flights[0].dt)
+        if correlation is not None and correlation < 0:
+            against[name] = correlation
+    return against
 
 
 def _surely(measured: np.ndarray, simulated: np.ndarray, dt: float) -> float | None:
-    """The correlation of the wrong sign, or else of the right one, where it is sure."""
+    """Return the most negative correlation, or else the largest, where it is sure."""
     seen = np.isfinite(measured)
     if not np.max(np.abs(simulated)) < 1e100 or np.std(simulated) == 0 or seen.mean() < 0.5:
         return None
@@ -269,73 +230,3 @@ def _flown(model: Model, flight: Flight, name: str, size: float) -> bool:
     ratio = angle_over_rate(flight.outputs[name], p, flight.dt)
     turns = size <= _FLOWN_TURNS * 2 * np.pi
     return turns and ratio is not None and abs(ratio.factor - 1.0) < _FLOWN
-
-
-# A stick in per cent that is read as plain numbers fits as well as one read right, with its effect
-# a hundredth of what it is. Two things together tell: numbers that are large (or small) for the
-# unit, and a model that at the start values moves its outputs too far (or not far enough) by about
-# as much.
-
-
-NEAR = 3.0
-"""factor by which start values may be off beside the unit"""
-_FULL = 1.2
-"""of a stick's or a surface's full travel: 1, or a radian"""
-
-
-class OtherUnit(NamedTuple):
-    """An input whose numbers suit another unit than the one that was stated."""
-
-    flight: str
-    name: str
-    stated: str
-    unit: str
-    """that they suit"""
-    factor: float
-    """of the stated unit over this one"""
-    moved: dict[str, float]
-    """by output how many times as far it moves as is simulated"""
-
-
-def inputs_in_other_units(
-    flights: Sequence[tuple[str, Flight]],
-    simulated: Sequence[Mapping[str, np.ndarray]],
-    sticks: Mapping[str, str],
-) -> Iterator[OtherUnit]:
-    """Inputs that look like degrees for radians, per cent for plain numbers, or the reverse;
-    arguments as of `against_start`."""
-    for (label, flight), run in zip(flights, simulated, strict=True):
-        for name, signal in (flight.source.inputs if flight.source else {}).items():
-            if signal.constant is not None:
-                continue
-            outputs = [n for n in flight.outputs if sticks.get(n, name) == name]
-            sizes = {n: _size(flight.outputs[n], run[n]) for n in outputs}
-            stated, other = _units_by_size(signal, flight.inputs[name])
-            if other and sizes:
-                factor = units.factor(other, stated)
-                if all(factor / NEAR < size < factor * NEAR for size in sizes.values()):
-                    yield OtherUnit(label, name, stated, other, factor, sizes)
-
-
-def _units_by_size(signal: Signal, values: np.ndarray) -> tuple[str, str]:
-    """The stated unit of an input, and the one that its size suits better; empty for none."""
-    named = signal.unit in ("rad", "deg", "%")
-    stated = "1" if not named and units.is_plain(signal.unit) else signal.unit
-    if not named and stated != "1":
-        return stated, ""
-    size = float(np.max(np.abs(values), initial=0.0)) / units.factor(signal.unit, signal.si)
-    for small, large in (("rad", "deg"), ("1", "%")):
-        # Of the larger unit no more than its full travel, so that a motor's speed is none.
-        if stated == small and _FULL < size <= _FULL * units.factor(small, large):
-            return stated, large
-        if stated == large and size <= _FULL:
-            return stated, small
-    return stated, ""
-
-
-def _size(measured: np.ndarray, simulated: np.ndarray) -> float:
-    """Measured over simulated motion of an output; 0 if there is none."""
-    seen = np.isfinite(measured)
-    with np.errstate(over="ignore", invalid="ignore"):
-        far = float(np.std(simulated[seen])) if seen.any() else 0.0
-    return float(np.std(measured[seen])) / far if far > 0 and np.isfinite(far) else 0.0
