@@ -75,7 +75,7 @@ def _diverges(at: SearchState) -> bool:
     possible = (
         problem.noise_model == "white" and problem.window is None and problem.nuisance.initial_state
     )
-    if bool(at.best.best.converged) or not possible:
+    if at.best.best.converged or not possible:
         return False
     # Squares of a run that diverged may overflow: infinity is past the limit too.
     with np.errstate(all="ignore"):
@@ -130,7 +130,7 @@ def _needs_further_starts(at: SearchState) -> bool:
         outputs = [{n: np.asarray(y) for n, y in f.outputs.items()} for f in data.flights]
         moved = [{n: y - np.nanmean(y) for n, y in of.items()} for of in outputs]
         explained = 1.0 - left / sum_of_squares(moved, noise)
-        return not (bool(best.best.converged) and explained > _LITTLE)
+        return not (best.best.converged and explained > _LITTLE)
     return layout.noise_model == "spectrum" and left_stability(at.search, best)
 
 
@@ -182,7 +182,7 @@ _OTHERS = 2
 def _has_one_disturbance(at: SearchState) -> bool:
     layout, best = at.search.layout, at.best
     return (
-        bool(best.best.converged)
+        best.best.converged
         and len(layout.sigmas) == 1
         # Without a disturbance nothing distinguishes such values.
         and (best.ratio is None or best.ratio > NO_DISTURBANCE)

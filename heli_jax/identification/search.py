@@ -138,7 +138,7 @@ def is_better(over: Search, optimum: RelaxedOptimum, other: RelaxedOptimum) -> b
 
     def passes(o: RelaxedOptimum) -> tuple[bool, bool]:
         unstable = over.layout.model.linear and left_stability(over, o)
-        return bool(o.best.converged), not unstable
+        return o.best.converged, not unstable
 
     if passes(optimum) != passes(other):
         return passes(optimum) > passes(other)

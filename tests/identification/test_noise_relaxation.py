@@ -33,7 +33,7 @@ class Slowly:
     def run(self, noise: Noise, points: Any) -> list[Optimum]:
         z = points[0] + next(self.moves)
         moved = np.sum((z - points[0]) ** 2)
-        return [Optimum(z, jnp.ones(()), np.asarray(1), np.asarray(True), moved)]
+        return [Optimum(z, 1.0, 1, True, float(moved))]
 
 
 def optimum_of(falls: float) -> RelaxedOptimum:
@@ -41,7 +41,7 @@ def optimum_of(falls: float) -> RelaxedOptimum:
     layout = SimpleNamespace(objective=objective, noise_model="white")
     search: Any = SimpleNamespace(layout=layout, data=None, problem=None, run=objective.run)
     noise = Noise(({"p": np.ones(())},), np.zeros(()))
-    begun = Optimum(jnp.zeros(1), jnp.ones(()), np.asarray(1), np.asarray(True))
+    begun = Optimum(jnp.zeros(1), 1.0, 1, True)
     return relax_noise_covariance(search, noise, begun)
 
 

@@ -65,10 +65,10 @@ def significant_disturbances(search: Search, optimum: RelaxedOptimum) -> Relaxed
         if len(candidates) == 1:
             optimum = optimum._replace(ratio=ratio)
         # Negated: a ratio that is NaN is no evidence of a disturbance.
-        if bool(without.best.converged) and not ratio > NO_DISTURBANCE:
+        if without.best.converged and not ratio > NO_DISTURBANCE:
             optimum = without.after(optimum)
             absent.append(d)
-    if not bool(optimum.best.converged):
+    if not optimum.best.converged:
         # The search was cut short before it was known that there is something to find.
         optimum = relaxed_from(search, optimum.noise, optimum.best.z).after(optimum)
     if len(candidates) == 1:
@@ -92,7 +92,7 @@ def _is_known(search: Search, optimum: RelaxedOptimum, d: Disturbance) -> bool:
     show."""
     layout, z = search.layout, optimum.best.z
     e = evaluate(layout, search.data, optimum.noise, z)
-    if not (bool(optimum.best.converged) and np.all(np.isfinite(e.J))):
+    if not (optimum.best.converged and np.all(np.isfinite(e.J))):
         return False
     sds = deviations(e.J)
     its = [layout.disturbance_at(n) for n in (d.sigma, d.tau) if n in layout.disturbance]

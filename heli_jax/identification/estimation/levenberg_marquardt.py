@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 from jaxtyping import Array, Float
 
 from heli_jax import stages
@@ -33,7 +34,7 @@ _ROUNDING = 1e-12
 """part of the sum of squares below which a change is rounding, and part of the largest column below
 which the column of a logarithm is"""
 _RANK = 1e-10
-"""singular value of columns of one size below which a direction has no effect"""
+"""part of a column of size 1 that the other columns leave, below which it depends on them"""
 
 _DAMPING, _LEAST_DAMPING = 1.1e-5, 1.1e-12
 """mu of the first step, and the least: along a direction without effect rounding over less would be
@@ -110,7 +111,7 @@ def optimise(
     start, logarithms = np.asarray(z0, np.float64), ~without_size(layout)
     moving = np.ones(layout.size, bool) if held is None else ~held
     free = np.arange(layout.size) < len(layout.free)
-    ties = np.where(free & logarithms, 1.0 / _TIE_SD, 0.0)
+    ties = np.eye(layout.size)[free & logarithms & moving] / _TIE_SD
     low, high = _bounds(layout, data)
 
     def linearise(z: np.ndarray, rows: Any = None) -> Point:
@@ -118,8 +119,7 @@ def optimise(
         # A derivative that overflowed shows no direction.
         J = np.where(moving & np.isfinite(J).all(axis=0), J, 0.0)
         R = np.linalg.qr(np.column_stack([r, J]), mode="r")
-        r = np.append(R[:, 0], ties * (z - start))
-        return Point(z, r, np.vstack([R[:, 1:], np.diag(ties * moving)]))
+        return Point(z, np.append(R[:, 0], ties @ (z - start)), np.vstack([R[:, 1:], ties]))
 
     with np.errstate(all="ignore"):  # simulations overflow on the way
         at, region = linearise(start, known), Region(_DAMPING, np.inf)
@@ -191,8 +191,9 @@ def gain_ahead(
         return np.inf
     if not moves.any():
         return 0.0
-    U, s, _ = np.linalg.svd(J, full_matrices=False)
-    return float(np.sum(np.square(U[:, s > _RANK].T @ r)))
+    Q, R, _ = scipy.linalg.qr(J, mode="economic", pivoting=True)
+    sizes = np.abs(np.diag(R))
+    return float(np.sum(np.square(Q[:, : sizes.size][:, sizes > _RANK].T @ r)))
 
 
 def _step(at: Point, sizes: np.ndarray, region: Region) -> np.ndarray:
@@ -200,7 +201,8 @@ def _step(at: Point, sizes: np.ndarray, region: Region) -> np.ndarray:
     units = np.where(sizes > 0, 1.0 / np.where(sizes > 0, sizes, 1.0), 0.0)
     damped = np.vstack([at.J * units, np.sqrt(region.damping) * np.eye(units.size)])
     # Not by J'J, which would square the condition number.
-    step = units * np.linalg.lstsq(damped, -np.append(at.r, np.zeros(units.size)))[0]
+    Q, R = np.linalg.qr(damped)
+    step = -units * scipy.linalg.solve_triangular(R, Q[: at.r.size].T @ at.r)
     change = float(np.linalg.norm(at.J @ step))
     return step * (region.radius / change) if change > region.radius else step
 

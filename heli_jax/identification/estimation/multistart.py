@@ -134,7 +134,7 @@ def table(layout: Layout, data: Data, runs: list[Run], chosen: Run) -> tuple[Sta
     reasons = list(dict.fromkeys(run.reason for run in runs))
     rows, optimum, last = [], 0, None
     for run in sorted(runs, key=lambda run: (reasons.index(run.reason), rank(run.optimum))):
-        cost, converged = _cost(run.optimum), bool(run.optimum.converged)
+        cost, converged = _cost(run.optimum), run.optimum.converged
         if rows and rows[-1].reason != run.reason:
             optimum, last = 0, None
         # By their costs: along a direction that the data leave open, equal optima differ in place.
@@ -145,7 +145,7 @@ def table(layout: Layout, data: Data, runs: list[Run], chosen: Run) -> tuple[Sta
                 named_values(layout, data, run.start),
                 named_values(layout, data, run.optimum.z),
                 cost,
-                int(run.optimum.steps),
+                run.optimum.steps,
                 converged,
                 optimum if converged else 0,
                 run.reason,
@@ -158,12 +158,12 @@ def table(layout: Layout, data: Data, runs: list[Run], chosen: Run) -> tuple[Sta
 def rank(run: Optimum) -> tuple[bool, float]:
     """Return the sort key of a run: those that converged first, then the lowest cost."""
     # False sorts before True.
-    return not bool(run.converged), _cost(run)
+    return not run.converged, _cost(run)
 
 
 def _cost(run: Optimum) -> float:
     # NaN would compare as neither better nor worse, and sort at random.
-    cost = float(run.cost)
+    cost = run.cost
     return cost if np.isfinite(cost) else float("inf")
 
 

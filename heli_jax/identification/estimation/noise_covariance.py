@@ -79,7 +79,7 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
     Source: relaxation of the noise covariance, Jategaonkar (2006), section 4.4.
     """
     layout, objective = search.layout, search.layout.objective
-    trace = [(int(best.steps), float(best.cost))]
+    trace = [(best.steps, best.cost)]
     moved, notes = np.inf, ()
     for _ in range(_ROUNDS):
         z, new = objective.relax(layout, search.data, noise, best.z)
@@ -93,7 +93,7 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
         # the noise of the round before, and where one stays so does the other.
         best, noise = best._replace(z=z), new
         # A search that failed with one noise is not repeated with another.
-        if change < _UNCHANGED or moved < _SETTLED or not (moves and bool(best.converged)):
+        if change < _UNCHANGED or moved < _SETTLED or not (moves and best.converged):
             break
         begin = np.array(best.z)
         # Nuisances have no part in the rows of a spectrum: their weak priors alone would be a
@@ -101,8 +101,8 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
         if layout.noise_model == "spectrum" and layout.model.linear:
             begin[layout.first_nuisance :] = 0.0
         [best] = search.run(noise, begin[None])
-        trace.append((int(best.steps), float(best.cost)))
-        moved = float(best.moved) ** 0.5
+        trace.append((best.steps, best.cost))
+        moved = best.moved**0.5
     else:
         notes = (found("search.noise-not-settled", value=moved, rounds=_ROUNDS, limit=_SETTLED),)
     best = best._replace(z=objective.finish(layout, search.data, noise, best.z))

@@ -221,7 +221,10 @@ def log_posterior(
     The scale of the noise is integrated out under Jeffreys' prior unless it is fixed: that of each
     flight and output with output error, the common one with filter error.
     """
-    rows = rows_of(layout, data, noise._replace(own=()), z)
+    # Draws integrate over the parameters of the mean, which the restricted likelihood allows for.
+    scales = layout.model.input_scales
+    corrections = {n: c for n, c in dict(noise.corrections).items() if n in scales}
+    rows = rows_of(layout, data, noise._replace(corrections=corrections), z)
     rest = jnp.concatenate([prior_rows(layout, data, z), weak_rows(layout, z)])
     # The rows of the priors come last; their scale is known.
     measured = layout.objective.log_density(layout, data, rows[: rows.shape[0] - rest.shape[0]])
