@@ -123,22 +123,17 @@ class FrequencyError(Objective):
         return first_spectrum(noise, flights)
 
     def data_at_start(self, data: Data) -> Data:
-        """By instrument what follows the instruments, of inputs and outputs."""
-        # The equations by instrument have other solutions, far from the least squares of these, and
-        # what feedback makes of the signals as they were measured may lead to one.
+        """By instrument: the parts of inputs and outputs that follow the instruments."""
+        # The equations by instrument have several solutions. Least squares of these parts end near
+        # the right one; those of the measured signals, which hold feedback, need not.
         by = data.flights[0].by_instrument is not None
         return as_instruments_have_it(data) if by else data
 
     def noise_of_check(self, layout: Layout, data: Data, noise: Noise) -> Noise:
-        """By instrument, where there is one; the noise is what the inputs leave of the outputs.
-
-        That of the errors at the start values would hold all that is wrong with these.
-        """
-        if (whitening := whitening_without_model(layout, data)) is not None:
-            noise = noise._replace(whitening=whitening)
-        if data.flights[0].by_instrument is None:
-            return noise
-        return noise._replace(by_instrument=np.ones(()))
+        """The part of the outputs that the inputs do not explain: the errors at the start values
+        would hold the effect of these."""
+        whitening = whitening_without_model(layout, data)
+        return noise if whitening is None else noise._replace(whitening=whitening)
 
     def relax(
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
@@ -167,8 +162,7 @@ class FrequencyError(Objective):
             own = np.concatenate([v for v, f in zip(errors, of_flight, strict=True) if f == i])
             rms = np.sqrt(np.mean(np.abs(own) ** 2, axis=0))
             sd.append({n: np.asarray(v) for n, v in zip(names, rms, strict=True)})
-        by = np.asarray(float(data.flights[0].by_instrument is not None))
-        return z, Noise(tuple(sd), np.asarray(np.mean(logs)), whitening, by)
+        return z, Noise(tuple(sd), np.asarray(np.mean(logs)), whitening)
 
     def finish(
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
@@ -183,7 +177,7 @@ class FrequencyError(Objective):
         Args:
             noise: that `e` was evaluated with.
         """
-        if data.flights[0].by_instrument is not None and float(noise.by_instrument) > 0:
+        if data.flights[0].by_instrument is not None:
             return float("nan")
         # A row for each unknown of interest, and one for all that is left of the errors.
         rows = np.asarray(e.r)[: len(layout.of_interest) + 1]
@@ -218,9 +212,7 @@ def first_spectrum(noise: Noise, flights: Sequence[Flight]) -> Noise:
         whole = np.stack([flight.outputs[n] for n in sorted(sd)], axis=1)
         for first, last in parts_of(flight):
             measured.append(lines_of(whole[first:last]))
-    whitening = whitening_alone(measured)
-    # Least squares at first: near that estimate the equations by instrument have one solution.
-    return noise._replace(whitening=whitening, by_instrument=np.zeros(()))
+    return noise._replace(whitening=whitening_alone(measured))
 
 
 OBJECTIVE = FrequencyError()
@@ -274,14 +266,15 @@ def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Floa
     """The rows, with the derivative that a step of Gauss and Newton needs.
 
     Args:
-        noise: with the whitening of each record, and whether instruments are used.
+        noise: with the whitening of each record.
     """
     v = shared_of(layout, u)
     at, rest = jax.lax.stop_gradient((v, u))
     made = products_of_lines(layout, data, noise, at, lambda v: with_shared(layout, rest, v))
     r, M = _weighed(made)
     left = jnp.sqrt(jnp.maximum(made.ee - jnp.sum(r**2), 0.0))
-    left = jnp.where(noise.by_instrument > 0.5, 0.0, left)
+    if data.flights[0].by_instrument is not None:
+        left = jnp.zeros_like(left)
     r, M, left = jax.lax.stop_gradient((r, M, left))
     # The derivative is exactly M, whatever else moves with the unknowns.
     return jnp.append(r + M @ (v - at), left)
@@ -310,7 +303,7 @@ def products_of_lines(
     the inputs by instrument.
 
     Args:
-        noise: with the whitening of each record, and whether instruments are used.
+        noise: with the whitening of each record.
         v: unknowns that all flights share.
     """
     total, with_instruments = [], data.flights[0].by_instrument is not None
@@ -327,7 +320,7 @@ def products_of_lines(
         for record, W in parts_of_group(layout, noise, members):
             at = resolved(m, record, W)
             e = errors_of_record(at, m, driving, y)
-            total.append(_of_record(at, e, ((m, driving), slopes), by, noise.by_instrument))
+            total.append(_of_record(at, e, ((m, driving), slopes), by))
     return jax.tree.map(lambda *p: sum(p), *total)
 
 
@@ -341,7 +334,6 @@ def _of_record(
     e: Errors,
     direct: _Differentiated,
     by: _Differentiated | None,
-    by_instrument: Array,
 ) -> Products:
     """Products over one record of all flights of a group."""
 
@@ -357,22 +349,12 @@ def _of_record(
 
         def of_flight(one: Any) -> Products:
             e, X, direct_lines, by_lines = one
-
-            def directly() -> Products:
-                J = _slopes(H, W, X, direct, direct_lines)
-                return products(J, J, e, Q)
-
-            def with_instruments(by: _Differentiated) -> Products:
-                J = _slopes(H, W, X, direct, direct_lines)
-                # The states are those of the inputs alone: such a record has no ends.
-                of_inputs = times(R, by_lines[0].U @ by[0][0].B.T)
-                return products(_slopes(H, W, of_inputs, by, by_lines), J, e, Q)
-
+            J = _slopes(H, W, X, direct, direct_lines)
             if by is None:
-                return directly()
-            # One program for both: the direct estimate is where the search begins.
-            instruments = lambda: with_instruments(by)  # noqa: E731  # pyright: ignore
-            return jax.lax.cond(by_instrument > 0.5, instruments, directly)
+                return products(J, J, e, Q)
+            # The states of the inputs by instrument alone: such a record has no ends.
+            of_inputs = times(R, by_lines[0].U @ by[0][0].B.T)
+            return products(_slopes(H, W, of_inputs, by, by_lines), J, e, Q)
 
         return jax.lax.map(of_flight, own)
 

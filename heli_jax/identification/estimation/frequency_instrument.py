@@ -90,21 +90,24 @@ def following(
 
 
 def as_instruments_have_it(data: Data) -> Data:
-    """The same flights as if nothing but the instruments moved them: inputs by instrument, and what
-    of the outputs follows those. Of gusts and noise chance's part alone is in them, and nothing of
-    what feedback makes of both: to begin a search with."""
+    """Return the flights as if nothing but the instruments moved them: inputs by instrument, and
+    the part of the outputs that follows those, for a direct estimate.
+
+    Gusts and noise are in them by chance alone, and their effect through feedback is not.
+    """
     inputs = [naming.asdict(f.by_instrument) for f in data.flights]
     moving = [n for n in inputs[0] if any(np.ptp(np.asarray(u[n])) > 0 for u in inputs)]
     names = list(data.flights[0].outputs)
+    direct = tuple(f._replace(by_instrument=None) for f in data.flights)
     if not moving or any(list(f.outputs) != names for f in data.flights):
-        return data
+        return data._replace(flights=direct)
     outputs = [np.stack([_filled(f.outputs[n]) for n in names], axis=1) for f in data.flights]
     made = _parts(outputs, [np.stack([np.asarray(u[n]) for n in moving], axis=1) for u in inputs])
     flights = []
     for f, columns in zip(data.flights, made, strict=True):
         columns = columns.astype(f.outputs[names[0]].dtype)
         by_name = dict(zip(names, columns.T, strict=True))
-        flights.append(f._replace(inputs=f.by_instrument, outputs=by_name))
+        flights.append(f._replace(inputs=f.by_instrument, outputs=by_name, by_instrument=None))
     return data._replace(flights=tuple(flights))
 
 

@@ -8,7 +8,6 @@ Sources: Pintelon and Schoukens (2012), chapters 6 and 10; Golub and Pereyra (19
 (1975) for the projection.
 """
 
-import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -363,43 +362,15 @@ def resolved(m: Matrices, record: Record, whitening: Complex[Array, "K p p"]) ->
         effects = effects[:, :1]
     effects = by_block(stacked(jnp.asarray(effects)), count)
 
-    triangle = _triangle(m.Ad)
-
     def of_block(of: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         z, W, effects = of
-        R = _inverse(z, *triangle)
+        R = jnp.linalg.inv(z[:, None, None] * jnp.eye(n, dtype=z.dtype)[None] - m.Ad[None])
         H = W @ real(m.C[None].astype(z.dtype) @ R)
         basis = basis_of(H, effects)
         return real(R), H, basis.T @ basis
 
     R, H, grams = jax.lax.map(of_block, (jnp.asarray(z).reshape(count, size), W, effects))
     return Resolved(record, W, R, H, effects, orthonormal(jnp.sum(grams, axis=0)))
-
-
-def _triangle(Ad: Float[Array, "n n"]) -> tuple[Complex[Array, "n n"], Complex[Array, "n n"]]:
-    """T and V with Ad = V T V^H, V unitary; T is triangular on the CPU, where JAX has Schur's."""
-    dtype = np.result_type(Ad.dtype, np.complex64)
-
-    def triangle(Ad: Array) -> tuple[Array, Array]:
-        T, V = jax.scipy.linalg.schur(Ad, output="complex")
-        return T, V
-
-    def whole(Ad: Array) -> tuple[Array, Array]:
-        return Ad.astype(dtype), jnp.eye(len(Ad), dtype=dtype)
-
-    return jax.lax.platform_dependent(Ad, cpu=triangle, default=whole)
-
-
-def _inverse(z: Complex[Array, " k"], T: Array, V: Array) -> Complex[Array, "k n n"]:
-    """(zI - Ad)^-1, by substitution where T is triangular: half the time of an inverse."""
-    M = z[:, None, None] * jnp.eye(len(T), dtype=z.dtype)[None] - T[None]
-    back = jnp.broadcast_to(jnp.conj(V.T), M.shape)
-    return V[None] @ jax.lax.platform_dependent(
-        M,
-        back,
-        cpu=functools.partial(jax.lax.linalg.triangular_solve, left_side=True, lower=False),
-        default=jnp.linalg.solve,
-    )
 
 
 def basis_of(H: Float[Array, "k 2p 2n"], effects: Float[Array, "k 2 e"]) -> Float[Array, "s m"]:

@@ -259,9 +259,6 @@ class Noise(NamedTuple):
     mean over all lines of log det(spectrum)"""
     whitening: Any = ()
     """frequency error: by record (K, p, p) what makes white noise of that at its lines; () else"""
-    by_instrument: Any = ()
-    """frequency error: 1 where instruments weigh the errors, 0 where the model's own response does,
-    as it does until the search by instrument has somewhere to begin"""
     scale_slopes: Any = ()
     """filter error: derivatives of the sum of log(innovation variance) by the scale errors that are
     unknown (k,), see `noisy_scales`; () where the model has none"""

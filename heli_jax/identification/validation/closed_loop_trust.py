@@ -242,7 +242,8 @@ def weak_by_instrument(problem: Problem, at: Solution) -> tuple[str, ...]:
             for flight in (data.flights[r.flight] for r in records)
         ]
         followed, F = _followed(signals, [(r.first, r.last) for r in records])
-        direct = at._replace(noise=noise._replace(by_instrument=np.zeros(())))
+        flights = tuple(f._replace(by_instrument=None) for f in data.flights)
+        direct = at._replace(data=data._replace(flights=flights))
     weak = [g * (f < STRONG) for g, f in zip(followed, F, strict=True)]
     part, whole = information(direct, weak), information(direct, followed)
     each = zip(layout.of_interest, shares(part, whole), strict=True)
