@@ -1,7 +1,7 @@
-"""A first guess of a problem's parameters by frequency error, for a fit in time.
+"""Start values by frequency error, for a fit in time.
 
-The misfit in time has valleys and plateaus far from its optimum, and an unstable vehicle's
-simulation overflows there; the one in frequency simulates nothing.
+Far from its optimum the cost in time has local minima and plateaus, and the simulation of an
+unstable vehicle overflows; in frequency nothing is simulated.
 """
 
 import dataclasses
@@ -16,13 +16,13 @@ from heli_jax.identification.result import Status
 
 
 class FrequencyErrorStart(NamedTuple):
-    """First guesses, and how they were found."""
+    """Start values, and the fit that they come from."""
 
     values: dict[str, StartValue]
     status: Status
     """of the fit in frequency"""
     seconds: float
-    """that it took"""
+    """of processing"""
     notes: tuple[str, ...]
     """of the fit in frequency"""
     selection: None = None
@@ -30,7 +30,7 @@ class FrequencyErrorStart(NamedTuple):
 
     @property
     def findings(self) -> list[Finding]:
-        """The source of one start value."""
+        """Notes on the start values."""
         taken = [n for n, v in self.values.items() if v.origin == "frequency error"]
         run = {"status": self.status, "seconds": self.seconds}
         if not taken:

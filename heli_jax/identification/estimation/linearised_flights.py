@@ -55,9 +55,7 @@ def cannot_linearise(problem: Problem) -> str | None:
     return None
 
 
-def linear_drive(
-    layout: Layout, drive: Drive, condition: Condition | None
-) -> tuple[Model, Drive]:
+def linear_drive(layout: Layout, drive: Drive, condition: Condition | None) -> tuple[Model, Drive]:
     """Return a linear model of a flight, and its inputs and parameters.
 
     Args:
