@@ -21,6 +21,7 @@ import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -326,7 +327,8 @@ def products_of_lines(
 
 
 type _Differentiated = tuple[tuple[Matrices, Driving], tuple[Matrices, Driving]]
-"""a model with its inputs, and the derivatives of both by the unknowns, a last axis"""
+"""a model with its inputs, and the derivatives of both by the unknowns, a last axis; None in place
+of those that are zero"""
 
 
 def _of_record(
@@ -383,7 +385,10 @@ def _slopes(
         signals: inputs of the model at the lines, and their derivatives.
     """
 
-    def response(m: Matrices, signals: Driving) -> Float[Array, " s"]:
+    value, slopes = (of[0][0], signals[0]), (of[1][0], signals[1])
+
+    def response(moving: tuple[Matrices, Driving]) -> Float[Array, " s"]:
+        m, signals = eqx.combine(moving, value)
         # Not X @ Ad.T, whose derivatives XLA lays out so that the next product turns them over.
         driving, passing = (
             jnp.einsum("kcj,ij->kci", X, A) + jnp.einsum("kcj,ij->kci", v, B)
@@ -391,16 +396,44 @@ def _slopes(
         )
         return (times(H, driving) + times(W, passing)).reshape(-1)
 
-    def along(*direction: Any) -> Float[Array, " s"]:
-        return jax.jvp(response, (of[0][0], signals[0]), direction)[1]
+    # Only arrays that depend on the unknowns: long signals usually do not.
+    moving = jax.tree.map(
+        lambda d, v: None if d is None else v, slopes, value, is_leaf=lambda d: d is None
+    )
 
-    return jax.vmap(along, in_axes=-1, out_axes=-1)(of[1][0], signals[1])
+    def along(direction: tuple[Matrices, Driving]) -> Float[Array, " s"]:
+        return jax.jvp(response, (moving,), (direction,))[1]
+
+    return jax.vmap(along, in_axes=-1, out_axes=-1)(slopes)
 
 
 def differentiated[T](make: Callable[[Array], T], v: Float[Array, " q"]) -> tuple[T, T]:
-    """Return arrays in tuples and their derivatives by v, a last axis."""
+    """Return arrays in tuples and their derivatives by v, a last axis; None in place of those that
+    are zero."""
+    moving: list[bool] = []
+
+    # Called beside `make`, it records which derivatives are zero: to trace a model once more for
+    # that takes as long as to differentiate it.
+    @jax.custom_jvp
+    def look(*leaves: Array) -> Array:
+        return jnp.zeros((), v.dtype)
+
+    def rule(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Array, Array]:
+        zero = jax.custom_derivatives.SymbolicZero
+        moving[:] = [not isinstance(t, zero) for t in tangents]
+        return jnp.zeros((), v.dtype), jnp.zeros((), v.dtype)
+
+    look.defjvp(rule, symbolic_zeros=True)
+
+    def looked_at(v: Array) -> T:
+        made = make(v)
+        look(*jax.tree.leaves(made))
+        return made
 
     def along(direction: Array) -> tuple[T, T]:
-        return jax.jvp(make, (v,), (direction,))
+        return jax.jvp(looked_at, (v,), (direction,))
 
-    return jax.vmap(along, out_axes=(None, -1))(jnp.eye(v.size, dtype=v.dtype))
+    value, slopes = jax.vmap(along, out_axes=(None, -1))(jnp.eye(v.size, dtype=v.dtype))
+    leaves, structure = jax.tree.flatten(slopes)
+    kept = [d if moves else None for d, moves in zip(leaves, moving, strict=True)]
+    return value, jax.tree.unflatten(structure, kept)
