@@ -27,9 +27,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from heli_jax.finding import Finding
+from heli_jax.analysis.operating_point import flown
+from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.evaluation import Evaluation
+from heli_jax.identification.estimation.evaluation import Evaluation, deviations
 from heli_jax.identification.estimation.frequency_instrument import (
     absent_instrument,
     as_instruments_have_it,
@@ -61,6 +62,7 @@ from heli_jax.identification.estimation.frequency_lines import (
     without_parts,
 )
 from heli_jax.identification.estimation.frequency_noise import (
+    first_model,
     log_determinants,
     once_a_length,
     whitening_alone,
@@ -70,12 +72,11 @@ from heli_jax.identification.estimation.frequency_noise import (
 from heli_jax.identification.estimation.linearised_flights import (
     cannot_linearise,
     condition_of,
-    linearisation_notes,
 )
 from heli_jax.identification.estimation.objective import Objective, RowTags, untagged
 from heli_jax.identification.estimation.output_error import OBJECTIVE as OUTPUT_ERROR
 from heli_jax.identification.estimation.output_error import in_time
-from heli_jax.identification.estimation.residual import Residuals
+from heli_jax.identification.estimation.residual import Residuals, rows_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
     Data,
@@ -212,6 +213,56 @@ def first_spectrum(noise: Noise, flights: Sequence[Flight]) -> Noise:
         for first, last in parts_of(flight):
             measured.append(lines_of(whole[first:last]))
     return noise._replace(whitening=whitening_alone(measured))
+
+
+_NOTABLE = 0.3
+"""standard deviations from which on an estimate is named"""
+_GROWS = 3.0
+"""e-foldings of an unstable mode over a flight, beyond which a simulation leaves the record"""
+
+
+def linearisation_notes(at: Solution, e: Evaluation) -> list[Finding]:
+    """Return the point of linearisation, and the shifts of the estimates that it causes: those
+    which the model's own simulation, in place of the record, gives in one step of Gauss and Newton.
+    """
+    layout, data, noise, _ = at
+    if layout.model.linear:
+        return []
+    flights = tuple(
+        flight._replace(outputs={n: jnp.asarray(run[n]) for n in flight.outputs})
+        for flight, run in zip(data.flights, e.simulated, strict=True)
+    )
+    rows = eqx.filter_jit(rows_of)(layout, data._replace(flights=flights), noise, jnp.asarray(e.z))
+    # The rows of priors are no error of the model.
+    J, r, q = np.asarray(e.J), np.zeros(len(e.J)), len(layout.of_interest)
+    r[:q] = np.asarray(rows)[:q]
+    shifts: dict[str, float] = {}
+    growth = np.log(
+        np.max(np.abs(np.linalg.eigvals(first_model(layout, data, jnp.asarray(e.z)).Ad)))
+    )
+    samples = max(len(v) for run in e.simulated for v in run.values())
+    known = samples * growth < _GROWS and np.isfinite(r).all() and np.isfinite(J).all()
+    if known:
+        step = -np.linalg.lstsq(J, r, rcond=1e-10)[0]
+        shifts = dict(zip(layout.of_interest, step[:q] * e.slopes, strict=True))
+    sds = dict(zip(layout.of_interest, deviations(J)[:q] * np.abs(e.slopes), strict=True))
+    in_sds = {n: v / sds[n] for n, v in shifts.items()}
+    facts = layout.flight_facts
+    conditions = [None if f.condition is None else flown(f.condition) for f in facts]
+    where = [f"the trim {c}" if c else "the equilibrium at its mean inputs" for c in conditions]
+    moved = [f"{n} by {v:+.2g}" for n, v in in_sds.items() if abs(v) >= _NOTABLE]
+    if not known:
+        moved = ["estimates by an unknown number of"]
+    return [
+        found(
+            "dynamics.linearised",
+            "note",
+            value=max((abs(v) for v in in_sds.values()), default=None),
+            shifts=shifts,
+            where=list(dict.fromkeys(where)),
+            moved=moved or [f"no estimate by {_NOTABLE:g}"],
+        )
+    ]
 
 
 OBJECTIVE = FrequencyError()
