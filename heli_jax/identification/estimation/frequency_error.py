@@ -237,9 +237,8 @@ def linearisation_notes(at: Solution, e: Evaluation) -> list[Finding]:
     J, r, q = np.asarray(e.J), np.zeros(len(e.J)), len(layout.of_interest)
     r[:q] = np.asarray(rows)[:q]
     shifts: dict[str, float] = {}
-    growth = np.log(
-        np.max(np.abs(np.linalg.eigvals(first_model(layout, data, jnp.asarray(e.z)).Ad)))
-    )
+    modes = np.linalg.eigvals(first_model(layout, data, jnp.asarray(e.z)).Ad)
+    growth = np.log(np.max(np.abs(modes)))
     samples = max(len(v) for run in e.simulated for v in run.values())
     known = samples * growth < _GROWS and np.isfinite(r).all() and np.isfinite(J).all()
     if known:
