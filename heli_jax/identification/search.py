@@ -41,7 +41,7 @@ def first_guess(problem: Problem) -> FirstGuess:
     data = data_of(problem, problem.training, layout)
     noise = first_noise(problem, problem.training)
     begun = layout.objective.data_at_start(data)
-    z = coarse_guess(layout, begun, noise, start_vector(layout, data, problem))
+    z = coarse_guess(layout, data, noise, start_vector(layout, data, problem))
     e = evaluate(layout, data, noise, z)
     level = layout.objective.noise_at_start(layout, data, e, noise)
     if not any(np.ptp(u) > 0 for f in problem.training for u in f.inputs.values()):
