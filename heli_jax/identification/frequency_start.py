@@ -16,19 +16,19 @@ from heli_jax.identification.result import Status
 
 
 class FrequencyErrorStart(NamedTuple):
-    """First guesses, and how they were found."""
+    """Start values, and the fit that they come from."""
 
     values: dict[str, StartValue]
     status: Status
     """of the fit in frequency"""
     seconds: float
-    """that it took"""
+    """processing time [s]"""
     notes: tuple[str, ...]
     """of the fit in frequency"""
 
     @property
     def findings(self) -> list[Finding]:
-        """The source of one start value."""
+        """Notes on the start values."""
         taken = [n for n, v in self.values.items() if v.origin == "frequency error"]
         run = {"status": self.status, "seconds": self.seconds}
         if not taken:

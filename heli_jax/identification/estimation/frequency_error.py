@@ -1,18 +1,18 @@
-r"""Frequency error: output error on Fourier transforms of whole records, with the noise's spectrum.
+r"""Frequency error: output error on the Fourier transforms of records, with the noise's spectrum.
 
 For a linear model with inputs that are held, or linear between samples, and $z = e^{i\omega dt}$ at
 a frequency of the record's own,
 
 $$X = (zI - A_d)^{-1}\,[B_d U + z\,(x_0 - x_N)]$$
 
-is exact, for unstable vehicles too: nothing is simulated, and the ends of the record are n numbers
-that are found by linear least squares and projected out, with n more for the ends of slow gusts.
-The noise's spectrum, a matrix over the outputs, is estimated from the residual and weighs the
-frequencies; maximum likelihood then holds where gusts disturb the vehicle as well, as long as no
-feedback brings them into the inputs. Models that are not linear are linearised where they fly.
+is exact, also for unstable vehicles: nothing is simulated. The ends of the record are n unknowns,
+with n more for the ends of slow gusts; linear least squares projects them out. The noise's
+spectrum, a matrix over the outputs, is estimated from the residual and weights the frequencies. The
+estimate is maximum likelihood in gusts too, as long as no feedback brings them into the inputs.
+Nonlinear models are linearised at the operating point.
 
-Where flights hold an excitation that was added to an input and that no feedback reaches, the errors
-are weighed by the response to what of the input follows it: then feedback does no harm either.
+If flights hold an excitation that was added to an input and that no feedback reaches, the errors
+are weighted by the response to the part of the input that follows it: feedback then has no effect.
 
 Sources: Pintelon and Schoukens (2012), chapters 6, 9 and 10; Klein and Morelli (2006), chapter 7.
 """
@@ -27,9 +27,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from heli_jax.finding import Finding
+from heli_jax.analysis.operating_point import flown
+from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.evaluation import Evaluation
+from heli_jax.identification.estimation.evaluation import Evaluation, deviations
 from heli_jax.identification.estimation.frequency_instrument import (
     absent_instrument,
     as_instruments_have_it,
@@ -61,6 +62,7 @@ from heli_jax.identification.estimation.frequency_lines import (
     without_parts,
 )
 from heli_jax.identification.estimation.frequency_noise import (
+    first_model,
     log_determinants,
     once_a_length,
     whitening_alone,
@@ -70,12 +72,11 @@ from heli_jax.identification.estimation.frequency_noise import (
 from heli_jax.identification.estimation.linearised_flights import (
     cannot_linearise,
     condition_of,
-    linearisation_notes,
 )
 from heli_jax.identification.estimation.objective import Objective, RowTags, untagged
 from heli_jax.identification.estimation.output_error import OBJECTIVE as OUTPUT_ERROR
 from heli_jax.identification.estimation.output_error import in_time
-from heli_jax.identification.estimation.residual import Residuals
+from heli_jax.identification.estimation.residual import Residuals, rows_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
     Data,
@@ -92,22 +93,22 @@ class FrequencyError(Objective):
     noise_model = "spectrum"
 
     def tags(self, layout: Layout, data: Data, count: int) -> RowTags:
-        """Rows are sums over the lines of all flights."""
+        """Return empty tags: rows are sums over the lines of all flights."""
         return untagged(count)
 
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
-        """A row for each unknown of interest, and one for what is left of the errors."""
+        """Return a row for each unknown of interest, and one for the rest of the errors."""
         return Residuals(rows_of_lines(layout, data, noise, u), None)
 
     def refusal(self, problem: Problem) -> str | None:
-        """Flights of other outputs, without a part in which every output is there, or without a
-        trim."""
+        """Return a reason for flights with different outputs, without a part that has all outputs,
+        or without a trim."""
         flights = problem.training
         refused = other_outputs(flights) or without_parts(flights) or absent_instrument(problem)
         return refused or cannot_linearise(problem)
 
     def flight_facts(self, problem: Problem, flights: Sequence[Flight]) -> tuple[FlightFacts, ...]:
-        """Lines where all outputs are there, and the point about which the model is linearised."""
+        """Return the parts that have all outputs, and the point of linearisation."""
         return tuple(
             FlightFacts(parts_of(f), f.dt, condition_of(problem.model, f)) for f in flights
         )
@@ -115,7 +116,7 @@ class FrequencyError(Objective):
     def instrumented(
         self, problem: Problem, flights: Sequence[Flight]
     ) -> tuple[dict[str, np.ndarray], ...] | None:
-        """By flight and input what of it follows the instruments."""
+        """Return by flight and input the part that follows the instruments."""
         return instrumented_inputs(problem, flights)
 
     def first_noise(self, problem: Problem, noise: Noise, flights: Sequence[Flight]) -> Noise:
@@ -123,27 +124,22 @@ class FrequencyError(Objective):
         return first_spectrum(noise, flights)
 
     def data_at_start(self, data: Data) -> Data:
-        """By instrument what follows the instruments, of inputs and outputs."""
-        # The equations by instrument have other solutions, far from the least squares of these, and
-        # what feedback makes of the signals as they were measured may lead to one.
+        """Return by instrument the parts of inputs and outputs that follow the instruments."""
+        # The equations by instrument have several solutions. Least squares of these parts end near
+        # the right one; those of the measured signals, which hold feedback, need not.
         by = data.flights[0].by_instrument is not None
         return as_instruments_have_it(data) if by else data
 
     def noise_of_check(self, layout: Layout, data: Data, noise: Noise) -> Noise:
-        """By instrument, where there is one; the noise is what the inputs leave of the outputs.
-
-        That of the errors at the start values would hold all that is wrong with these.
-        """
-        if (whitening := whitening_without_model(layout, data)) is not None:
-            noise = noise._replace(whitening=whitening)
-        if data.flights[0].by_instrument is None:
-            return noise
-        return noise._replace(by_instrument=np.ones(()))
+        """Return the spectrum of the part of the outputs that the inputs do not explain: the errors
+        at the start values would include the error of these."""
+        whitening = whitening_without_model(layout, data)
+        return noise if whitening is None else noise._replace(whitening=whitening)
 
     def relax(
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
     ) -> tuple[Float[Array, " q"], Noise]:
-        """The spectrum that the errors show, smoothed over frequency and flights."""
+        """Return the spectrum of the errors, smoothed over frequency and flights."""
         errors, model = jax.device_get(errors_of_lines(layout, data, noise, z))
         rows = sum(2 * v.size for v in errors)
         freedom = rows / max(rows - len(layout.free), 1)
@@ -157,7 +153,7 @@ class FrequencyError(Objective):
                 sound = False
         if not sound:
             return z, noise._replace(log_variance_ratio=np.asarray(np.nan))
-        # A model that is not linear is linearised where its nuisances put it.
+        # The nuisances are part of the point of linearisation.
         if not layout.model.linear:
             z = in_time(layout, data, noise, z)
         logs = -2.0 * np.concatenate(once_a_length(log_determinants, whitening))
@@ -167,25 +163,24 @@ class FrequencyError(Objective):
             own = np.concatenate([v for v, f in zip(errors, of_flight, strict=True) if f == i])
             rms = np.sqrt(np.mean(np.abs(own) ** 2, axis=0))
             sd.append({n: np.asarray(v) for n, v in zip(names, rms, strict=True)})
-        by = np.asarray(float(data.flights[0].by_instrument is not None))
-        return z, Noise(tuple(sd), np.asarray(np.mean(logs)), whitening, by)
+        return z, Noise(tuple(sd), np.asarray(np.mean(logs)), whitening)
 
     def finish(
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
     ) -> Float[Array, " q"]:
-        """Biases and initial states are in none of the rows: the simulation in time has them."""
+        """Find biases and initial states, which no row determines, by a simulation in time."""
         return in_time(layout, data, noise, z) if layout.model.linear else z
 
     def log_likelihood(self, layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
-        """Log-likelihood of complex normal errors at the lines used, in SI units of the outputs;
-        NaN for an estimate by instrument, which has none.
+        """Return the log-likelihood of complex normal errors at the lines used, in SI units of the
+        outputs; NaN by instrument.
 
         Args:
             noise: that `e` was evaluated with.
         """
-        if data.flights[0].by_instrument is not None and float(noise.by_instrument) > 0:
+        if data.flights[0].by_instrument is not None:
             return float("nan")
-        # A row for each unknown of interest, and one for all that is left of the errors.
+        # A row for each unknown of interest, and one for the rest of the errors.
         rows = np.asarray(e.r)[: len(layout.of_interest) + 1]
         squares = float(np.sum(np.square(rows)))
         logs = float(np.sum(np.concatenate(once_a_length(log_determinants, noise.whitening))))
@@ -195,8 +190,7 @@ class FrequencyError(Objective):
     def findings(
         self, at: Solution, e: Evaluation, names: Sequence[str], ill: bool
     ) -> list[Finding]:
-        """Notes on flights with missing samples, on points of linearisation, and on what an
-        instrument leaves out."""
+        """Return notes on missing samples, linearisation and instruments."""
         return [
             *cut_notes(at.layout, at.data, names),
             *linearisation_notes(at, e),
@@ -204,29 +198,76 @@ class FrequencyError(Objective):
         ]
 
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
-        """The simulated flights: what disturbs them is in the noise."""
+        """Return the simulated flights: disturbances are in the noise."""
         return OUTPUT_ERROR.records(reached, u, runs, seed)
 
 
 def first_spectrum(noise: Noise, flights: Sequence[Flight]) -> Noise:
     """Return the noise with the spectrum of what is measured, as if all of it were noise.
 
-    White noise would give all the say to where the record is largest, gusts included.
+    White noise would give most weight to the frequencies of the largest power, gusts included.
     """
     measured = []
     for flight, sd in zip(flights, noise.sd, strict=True):
         whole = np.stack([flight.outputs[n] for n in sorted(sd)], axis=1)
         for first, last in parts_of(flight):
             measured.append(lines_of(whole[first:last]))
-    whitening = whitening_alone(measured)
-    # Least squares at first: near that estimate the equations by instrument have one solution.
-    return noise._replace(whitening=whitening, by_instrument=np.zeros(()))
+    return noise._replace(whitening=whitening_alone(measured))
+
+
+_NOTABLE = 0.3
+"""standard deviations from which on an estimate is named"""
+_GROWS = 3.0
+"""e-foldings of an unstable mode over a flight, beyond which a simulation leaves the record"""
+
+
+def linearisation_notes(at: Solution, e: Evaluation) -> list[Finding]:
+    """Return the point of linearisation, and the shifts of the estimates that it causes: those
+    which the model's own simulation, in place of the record, gives in one step of Gauss and Newton.
+    """
+    layout, data, noise, _ = at
+    if layout.model.linear:
+        return []
+    flights = tuple(
+        flight._replace(outputs={n: jnp.asarray(run[n]) for n in flight.outputs})
+        for flight, run in zip(data.flights, e.simulated, strict=True)
+    )
+    rows = eqx.filter_jit(rows_of)(layout, data._replace(flights=flights), noise, jnp.asarray(e.z))
+    # The rows of priors are no error of the model.
+    J, r, q = np.asarray(e.J), np.zeros(len(e.J)), len(layout.of_interest)
+    r[:q] = np.asarray(rows)[:q]
+    shifts: dict[str, float] = {}
+    modes = np.linalg.eigvals(first_model(layout, data, jnp.asarray(e.z)).Ad)
+    growth = np.log(np.max(np.abs(modes)))
+    samples = max(len(v) for run in e.simulated for v in run.values())
+    known = samples * growth < _GROWS and np.isfinite(r).all() and np.isfinite(J).all()
+    if known:
+        step = -np.linalg.lstsq(J, r, rcond=1e-10)[0]
+        shifts = dict(zip(layout.of_interest, step[:q] * e.slopes, strict=True))
+    sds = dict(zip(layout.of_interest, deviations(J)[:q] * np.abs(e.slopes), strict=True))
+    in_sds = {n: v / sds[n] for n, v in shifts.items()}
+    facts = layout.flight_facts
+    conditions = [None if f.condition is None else flown(f.condition) for f in facts]
+    where = [f"the trim {c}" if c else "the equilibrium at its mean inputs" for c in conditions]
+    moved = [f"{n} by {v:+.2g}" for n, v in in_sds.items() if abs(v) >= _NOTABLE]
+    if not known:
+        moved = ["estimates by an unknown number of"]
+    return [
+        found(
+            "dynamics.linearised",
+            "note",
+            value=max((abs(v) for v in in_sds.values()), default=None),
+            shifts=shifts,
+            where=list(dict.fromkeys(where)),
+            moved=moved or [f"no estimate by {_NOTABLE:g}"],
+        )
+    ]
 
 
 OBJECTIVE = FrequencyError()
 
 
-# The rows that frequency error makes small: as many as unknowns, and one for what is left.
+# The rows of frequency error: one for each unknown, and one for the rest of the errors.
 #
 # With whitened errors $e$, their derivatives $J$ by the unknowns and instruments $Z$, the estimate
 # solves $Z^T e = 0$. The rows $r = R^{-T} Z^T e$ with $R^T R = Z^T Z$ have the identity as their
@@ -240,57 +281,61 @@ OBJECTIVE = FrequencyError()
 
 
 _NOTHING = 100.0
-"""times the vehicle's precision: what of the information, of columns of one size, is rounding"""
+"""times the machine precision: eigenvalues of the normalised information that are rounding"""
 
 
 class Products(NamedTuple):
-    """Products of columns: whitened errors e without what the ends of the records may add, the
-    derivatives J of the response by the unknowns, instruments Z, and what the ends may add Q."""
+    """Products of columns: whitened errors e without the effects of the ends of the records, the
+    derivatives J of the response by the unknowns, instruments Z, and the effects of the ends Q."""
 
     ee: Float[Array, ""]
     Ze: Float[Array, " q"]
-    """its negative: the derivatives of e are -J"""
+    """the negative product: the derivatives of e are -J"""
     ZZ: Float[Array, "q q"]
     ZJ: Float[Array, "q q"]
     QZ: Float[Array, "m q"]
-    """zero once what the ends may add is projected out"""
+    """zero after `projected`"""
     QJ: Float[Array, "m q"]
 
 
 def products(Z: Array, J: Array, e: Array, Q: Array) -> Products:
-    """Products of columns, e being one."""
+    """Return the products of columns Z, J, Q and one column e."""
     return Products(e @ e, -Z.T @ e, Z.T @ Z, Z.T @ J, Q.T @ Z, Q.T @ J)
 
 
 def projected(of: Products, S: Float[Array, "m m"]) -> Products:
-    """Products with what the ends may add projected out of Z and J, by S that makes an orthonormal
-    basis of Q."""
+    """Return the products of Z and J with Q projected out.
+
+    Args:
+        S: makes the columns of Q orthonormal.
+    """
     Z, J = S.T @ of.QZ, S.T @ of.QJ
     none = jnp.zeros_like(of.QZ)
     return Products(of.ee, of.Ze, of.ZZ - Z.T @ Z, of.ZJ - Z.T @ J, none, none)
 
 
 def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Float[Array, " r"]:
-    """The rows, with the derivative that a step of Gauss and Newton needs.
+    """Return the rows, with the derivative of a Gauss-Newton step.
 
     Args:
-        noise: with the whitening of each record, and whether instruments are used.
+        noise: with the whitening of each record.
     """
     v = shared_of(layout, u)
     at, rest = jax.lax.stop_gradient((v, u))
     made = products_of_lines(layout, data, noise, at, lambda v: with_shared(layout, rest, v))
     r, M = _weighed(made)
     left = jnp.sqrt(jnp.maximum(made.ee - jnp.sum(r**2), 0.0))
-    left = jnp.where(noise.by_instrument > 0.5, 0.0, left)
+    if data.flights[0].by_instrument is not None:
+        left = jnp.zeros_like(left)
     r, M, left = jax.lax.stop_gradient((r, M, left))
-    # The derivative is exactly M, whatever else moves with the unknowns.
+    # The derivative is M by definition.
     return jnp.append(r + M @ (v - at), left)
 
 
 def _weighed(of: Products) -> tuple[Float[Array, " q"], Float[Array, "q q"]]:
-    """R^-T Z^T e and R^-T Z^T J, with R^T R = Z^T Z; zero along what is no direction of Z."""
+    """Return R^-T Z^T e and R^-T Z^T J, with R^T R = Z^T Z; zero for directions without effect."""
     sizes = jnp.sqrt(jnp.maximum(jnp.diagonal(of.ZZ), 0.0))
-    # Of one size: units do not decide what is rounding.
+    # Columns are normalised, so that units do not matter.
     over = jnp.where(sizes > 0, 1.0 / jnp.where(sizes > 0, sizes, 1.0), 0.0)
     values, vectors = jnp.linalg.eigh(of.ZZ * over[:, None] * over[None, :])
     kept = values > _NOTHING * jnp.finfo(values.dtype).eps * values[-1]
@@ -306,11 +351,11 @@ def products_of_lines(
     v: Float[Array, " q"],
     unknowns: Callable[[Array], Unknowns],
 ) -> Products:
-    """Products over all records. Directly Z = J; by instrument the derivatives of the response to
-    the inputs by instrument.
+    """Return the products over all records. Z is J, or by instrument the derivatives of the
+    response to the inputs by instrument.
 
     Args:
-        noise: with the whitening of each record, and whether instruments are used.
+        noise: with the whitening of each record.
         v: unknowns that all flights share.
     """
     total, with_instruments = [], data.flights[0].by_instrument is not None
@@ -327,13 +372,13 @@ def products_of_lines(
         for record, W in parts_of_group(layout, noise, members):
             at = resolved(m, record, W)
             e = errors_of_record(at, m, driving, y)
-            total.append(_of_record(at, e, ((m, driving), slopes), by, noise.by_instrument))
+            total.append(_of_record(at, e, ((m, driving), slopes), by))
     return jax.tree.map(lambda *p: sum(p), *total)
 
 
 type _Differentiated = tuple[tuple[Matrices, Driving], tuple[Matrices, Driving]]
-"""a model with what drives it, and the derivatives of both by the unknowns, a last axis; None in
-place of those that are zero"""
+"""a model with its inputs, and the derivatives of both by the unknowns, a last axis; None in place
+of those that are zero"""
 
 
 def _of_record(
@@ -341,38 +386,27 @@ def _of_record(
     e: Errors,
     direct: _Differentiated,
     by: _Differentiated | None,
-    by_instrument: Array,
 ) -> Products:
-    """Products over one record of all flights of a group."""
+    """Return the products over one record of all flights of a group."""
 
     def at_lines(of: _Differentiated) -> Any:
         # Flights behind blocks (b, f, k, ...).
         signals = (of[0][1], of[1][1])
         return jax.tree.map(lambda v: jnp.moveaxis(at.lines(v), -1, 1), signals)
 
-    # Block by block: the derivatives at all lines would leave every cache.
+    # Block by block: the derivatives at all lines would not fit the caches.
     def of_block(of: Any) -> Products:
         (W, R, H, effects), own = of
         Q = basis_of(H, effects)
 
         def of_flight(one: Any) -> Products:
             e, X, direct_lines, by_lines = one
-
-            def directly() -> Products:
-                J = _slopes(H, W, X, direct, direct_lines)
-                return products(J, J, e, Q)
-
-            def with_instruments(by: _Differentiated) -> Products:
-                J = _slopes(H, W, X, direct, direct_lines)
-                # The states are those of the inputs alone: such a record has no ends.
-                of_inputs = times(R, by_lines[0].U @ by[0][0].B.T)
-                return products(_slopes(H, W, of_inputs, by, by_lines), J, e, Q)
-
+            J = _slopes(H, W, X, direct, direct_lines)
             if by is None:
-                return directly()
-            # One program for both: the direct estimate is where the search begins.
-            instruments = lambda: with_instruments(by)  # noqa: E731  # pyright: ignore
-            return jax.lax.cond(by_instrument > 0.5, instruments, directly)
+                return products(J, J, e, Q)
+            # Inputs by instrument have no ends.
+            of_inputs = times(R, by_lines[0].U @ by[0][0].B.T)
+            return products(_slopes(H, W, of_inputs, by, by_lines), J, e, Q)
 
         return jax.lax.map(of_flight, own)
 
@@ -394,12 +428,13 @@ def _slopes(
     of: _Differentiated,
     signals: tuple[Driving, Driving],
 ) -> Float[Array, "s q"]:
-    """Derivatives of the whitened response at the lines of a block, where the states are X:
+    """Return the derivatives of the whitened response at the lines of a block, with states X:
     H (dAd X + dB U + B dU) + W (dC X + dD held + D dheld).
 
     Args:
-        signals: what drives the model at the lines, and its derivatives.
+        signals: inputs of the model at the lines, and their derivatives.
     """
+
     value, slopes = (of[0][0], signals[0]), (of[1][0], signals[1])
 
     def response(moving: tuple[Matrices, Driving]) -> Float[Array, " s"]:
@@ -411,7 +446,7 @@ def _slopes(
         )
         return (times(H, driving) + times(W, passing)).reshape(-1)
 
-    # Only numbers that move with the unknowns: all others have no derivative to go through.
+    # Only arrays that depend on the unknowns: long signals usually do not.
     moving = jax.tree.map(
         lambda d, v: None if d is None else v, slopes, value, is_leaf=lambda d: d is None
     )
@@ -423,13 +458,12 @@ def _slopes(
 
 
 def differentiated[T](make: Callable[[Array], T], v: Float[Array, " q"]) -> tuple[T, T]:
-    """Arrays in tuples and their derivatives by v, a last axis; None in place of those that are
-    zero."""
-
+    """Return arrays in tuples and their derivatives by v, a last axis; None in place of those that
+    are zero."""
     moving: list[bool] = []
 
-    # Called beside `make`: which derivatives are zero shows as they are made, and to trace a model
-    # once more for it takes as long as to differentiate it.
+    # Called beside `make`, it records which derivatives are zero: to trace a model once more for
+    # that takes as long as to differentiate it.
     @jax.custom_jvp
     def look(*leaves: Array) -> Array:
         return jnp.zeros((), v.dtype)

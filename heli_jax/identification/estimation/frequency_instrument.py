@@ -1,10 +1,10 @@
-r"""Instruments: excitations that were added to inputs and logged, and that no feedback reaches.
+r"""Instruments: logged excitations that were added to inputs, and that no feedback reaches.
 
-What of an input follows them, $\hat U = S_{ur} S_{rr}^{-1} R$, knows nothing of gusts and noise,
-also where a pilot or an autopilot brings both into the input itself.
+The part of an input that follows them, $\hat U = S_{ur} S_{rr}^{-1} R$, is independent of gusts and
+noise, also if a pilot or an autopilot feeds both back into the input.
 
 Sources: Söderström and Stoica (1983); Pintelon and Schoukens (2012), chapter 9; Stock and Yogo
-(2005) for what is a weak instrument.
+(2005) for weak instruments.
 """
 
 from collections.abc import Sequence
@@ -27,12 +27,12 @@ PART = 0.05
 _ALONE = 1e-9
 """of the instruments' power, below which two of them move as one"""
 STRONG = 16.4
-"""F of the inputs' regression on the instruments from which on an interval of 95 % holds in 90 % of
-all cases at least"""
+"""F of the inputs' regression on the instruments from which on intervals of 95 % cover the truth in
+at least 90 % of all cases"""
 
 
 def instruments_of(problem: Problem) -> tuple[str, ...]:
-    """The inputs that are taken by their instrument: those asked for, or all that have one."""
+    """Return the inputs that are taken by instrument: the configured ones, or all that have one."""
     if problem.instrument is not None:
         return tuple(problem.instrument)
     known = naming.names(problem.model.Inputs)
@@ -41,7 +41,7 @@ def instruments_of(problem: Problem) -> tuple[str, ...]:
 
 
 def _lacks(flights: Sequence[Flight], name: str) -> str | None:
-    """The reason why flights have no instrument of an input, in words; None where they have."""
+    """Return why flights have no instrument of an input; None if they have one."""
     for flight in flights:
         if name not in flight.instruments:
             return f"{flight.name or 'a flight'} holds none (signals.instruments)"
@@ -51,7 +51,7 @@ def _lacks(flights: Sequence[Flight], name: str) -> str | None:
 
 
 def absent_instrument(problem: Problem) -> str | None:
-    """The instrument that was asked for and is not there, or is none; None where all are."""
+    """Return why a configured instrument cannot be used; None if all can."""
     known = naming.names(problem.model.Inputs)
     for name in problem.instrument or ():
         if name not in known:
@@ -69,8 +69,8 @@ def absent_instrument(problem: Problem) -> str | None:
 def instrumented_inputs(
     problem: Problem, flights: Sequence[Flight]
 ) -> tuple[dict[str, np.ndarray], ...] | None:
-    """By flight and input what of it follows the instruments (N,), SI; the input itself where it
-    has none. None where no input has one."""
+    """Return by flight and input its part (N,) that follows the instruments, SI; the input itself
+    if it has none. None if no input has one."""
     names = instruments_of(problem)
     if not names or any(n not in f.instruments for f in flights for n in names):
         return None
@@ -81,7 +81,7 @@ def instrumented_inputs(
 def following(
     flights: Sequence[Flight], names: Sequence[str], signals: Sequence[Float[np.ndarray, "N r"]]
 ) -> tuple[dict[str, np.ndarray], ...]:
-    """By flight and input what of it follows signals (N,), of the named inputs."""
+    """Return by flight the inputs; of the named ones the part (N,) that follows signals."""
     made = _parts([np.stack([f.inputs[n] for n in names], axis=1) for f in flights], signals)
     return tuple(
         {**f.inputs, **dict(zip(names, columns.T, strict=True))}
@@ -90,26 +90,29 @@ def following(
 
 
 def as_instruments_have_it(data: Data) -> Data:
-    """The same flights as if nothing but the instruments moved them: inputs by instrument, and what
-    of the outputs follows those. Of gusts and noise chance's part alone is in them, and nothing of
-    what feedback makes of both: to begin a search with."""
+    """Return the flights as if nothing but the instruments moved them: inputs by instrument, and
+    the part of the outputs that follows those, for a direct estimate.
+
+    Gusts and noise are in them by chance alone, and their effect through feedback is not.
+    """
     inputs = [naming.asdict(f.by_instrument) for f in data.flights]
     moving = [n for n in inputs[0] if any(np.ptp(np.asarray(u[n])) > 0 for u in inputs)]
     names = list(data.flights[0].outputs)
+    direct = tuple(f._replace(by_instrument=None) for f in data.flights)
     if not moving or any(list(f.outputs) != names for f in data.flights):
-        return data
+        return data._replace(flights=direct)
     outputs = [np.stack([_filled(f.outputs[n]) for n in names], axis=1) for f in data.flights]
     made = _parts(outputs, [np.stack([np.asarray(u[n]) for n in moving], axis=1) for u in inputs])
     flights = []
     for f, columns in zip(data.flights, made, strict=True):
         columns = columns.astype(f.outputs[names[0]].dtype)
         by_name = dict(zip(names, columns.T, strict=True))
-        flights.append(f._replace(inputs=f.by_instrument, outputs=by_name))
+        flights.append(f._replace(inputs=f.by_instrument, outputs=by_name, by_instrument=None))
     return data._replace(flights=tuple(flights))
 
 
 def _filled(y: Any) -> Float[np.ndarray, " N"]:
-    """A signal with straight lines over what is missing."""
+    """Return a signal with straight lines over missing samples."""
     y = np.asarray(y)
     at, seen = np.arange(y.size), np.isfinite(y)
     return np.interp(at, at[seen], y[seen])
@@ -118,7 +121,7 @@ def _filled(y: Any) -> Float[np.ndarray, " N"]:
 def _parts(
     of: Sequence[Float[np.ndarray, "N u"]], signals: Sequence[Float[np.ndarray, "N r"]]
 ) -> list[Float[np.ndarray, "N u"]]:
-    """By flight what of some columns follows signals, about the columns' means."""
+    """Return by flight the part of some columns that follows signals, about the columns' means."""
     U, R = ([lines_of(v) for v in one] for one in (of, signals))
     u = U[0].shape[1]
 
@@ -139,14 +142,14 @@ def _parts(
 
 
 def inputs_by_instrument(data: Data) -> tuple[str, ...]:
-    """The inputs that are taken by their instrument."""
+    """Return the inputs that are taken by instrument."""
     first = data.flights[0]
     inputs, by = naming.asdict(first.inputs), naming.asdict(first.by_instrument)
     return tuple(n for n in inputs if np.any(np.asarray(inputs[n]) != np.asarray(by[n])))
 
 
 def instrument_notes(data: Data) -> list[Finding]:
-    """The parts of a fit that an estimate by instrument lacks."""
+    """Return a note on what an estimate by instrument lacks."""
     if data.flights[0].by_instrument is None:
         return []
     words = (

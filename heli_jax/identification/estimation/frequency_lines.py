@@ -1,14 +1,13 @@
-"""Records at their own frequencies, discretised linear models there, and the errors of these.
+"""Fourier transforms of records, the response of linear models at their lines, and its errors.
 
 At $z = e^{i\\omega dt}$ of a record's own frequencies the model x[k+1] = Ad x[k] + B U[k] has the
-states $X = (zI - A_d)^{-1} [B U + z (x_0 - x_N)]$, exactly. What the ends of a record may add to
-the errors is found by linear least squares.
+states $X = (zI - A_d)^{-1} [B U + z (x_0 - x_N)]$, exactly. The effect of the ends of a record
+($x_0 - x_N$) is found by linear least squares.
 
 Sources: Pintelon and Schoukens (2012), chapters 6 and 10; Golub and Pereyra (1973) and Kaufman
 (1975) for the projection.
 """
 
-import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -37,38 +36,37 @@ from heli_jax.numerics.jitted import jitted
 from heli_jax.simulation.hold import between_samples
 from heli_jax.simulation.stepping import held_columns
 
-# Records: flights, cut where an output has a missing sample, for which a Fourier transform has no
-# place. Each has ends of its own.
+# Records: flights, cut where an output has a missing sample. Each has ends of its own.
 
 
 class FlightFacts(NamedTuple):
     """Facts of a flight that are fixed before anything is traced."""
 
     parts: tuple[tuple[int, int], ...]
-    """first sample, and that behind the last, of each part that is a record of its own"""
+    """first sample, and the one after the last, of each part that is a record of its own"""
     dt: float
     """[s]"""
     condition: Condition | None = None
-    """the steady flight about which a whole helicopter is linearised"""
+    """the steady flight about which a full helicopter is linearised"""
 
 
 class Record(NamedTuple):
-    """Samples in a row of one flight."""
+    """A part of a flight without missing samples."""
 
     flight: int
-    """its number"""
+    """index of the flight"""
     first: int
     last: int
-    """the sample behind its last one"""
+    """the sample after its last one"""
 
     @property
     def samples(self) -> int:
-        """N."""
+        """Number of samples N."""
         return self.last - self.first
 
     @property
     def lines(self) -> int:
-        """K, the number of frequencies of the record's own, without zero and Nyquist's."""
+        """Number of Fourier frequencies K, without zero and the Nyquist frequency."""
         return (self.samples - 1) // 2
 
     @property
@@ -78,11 +76,11 @@ class Record(NamedTuple):
 
 
 def lines_of[A: (np.ndarray, Array)](v: A) -> A:
-    """Fourier transform (K, c) of signals (N, c) at a record's own frequencies, over the root of
-    N."""
+    """Return the Fourier transform (K, c) of signals (N, c) over the root of N, without zero and
+    the Nyquist frequency."""
     xp = jnp if isinstance(v, jax.Array) else np
     N = len(v)
-    # Without a mean: the zero line is not used, and rounding would carry it to the others.
+    # The mean is taken off: rounding would carry it to the other lines.
     return (
         xp.fft.rfft(v - v.mean(axis=0, keepdims=True), axis=0)[1 : 1 + (N - 1) // 2]
         / float(N) ** 0.5
@@ -90,25 +88,25 @@ def lines_of[A: (np.ndarray, Array)](v: A) -> A:
 
 
 def in_time_of(lines: Complex[np.ndarray, "K c"], samples: int) -> Float[np.ndarray, "N c"]:
-    """Signals without a mean: the inverse of `lines_of`."""
+    """Return signals of zero mean: the inverse of `lines_of`."""
     whole = np.zeros((samples // 2 + 1, lines.shape[1]), complex)
     whole[1 : 1 + len(lines)] = lines * np.sqrt(samples)
     return np.fft.irfft(whole, samples, axis=0)
 
 
 def parts_of(flight: Flight) -> tuple[tuple[int, int], ...]:
-    """Return first sample, and that behind the last, of each part with all outputs that is long
-    enough for a record."""
+    """Return first sample, and the one after the last, of each part that has all outputs and is
+    long enough for a record."""
     seen = spans(flight.outputs.values())
     if seen == [(0, flight.n_samples)]:
         return tuple(seen)
-    # As with the parts of `gaps: split`: each has ends of its own, which short ones hardly tell.
+    # As with the parts of `gaps: split`: short parts hardly determine their ends.
     least = max(FEWEST, int(np.ceil(SHORTEST / flight.dt)))
     return tuple((a, b) for a, b in seen if b - a >= least)
 
 
 def records_of(layout: Layout) -> list[Record]:
-    """All records, flight after flight."""
+    """Return all records, flight after flight."""
     return [Record(i, a, b) for i, facts in enumerate(layout.flight_facts) for a, b in facts.parts]
 
 
@@ -144,7 +142,7 @@ def other_outputs(flights: Sequence[Flight]) -> str | None:
 
 
 def cut_notes(layout: Layout, data: Data, names: Sequence[str]) -> list[Finding]:
-    """Return by flight that was cut how much of it is used."""
+    """Return a note for each flight that was cut."""
     notes = []
     for i, (flight, facts) in enumerate(zip(data.flights, layout.flight_facts, strict=True)):
         n = next(iter(flight.outputs.values())).shape[0]
@@ -162,7 +160,7 @@ def cut_notes(layout: Layout, data: Data, names: Sequence[str]) -> list[Finding]
     return notes
 
 
-# Discretised models, and the flights that differ from one another in numbers alone.
+# Discretised models of groups of flights whose layouts are equal.
 
 
 class Matrices(NamedTuple):
@@ -178,13 +176,13 @@ class Driving(NamedTuple):
     """Inputs of a discretised model."""
 
     U: Float[Array, "N r"]
-    """what B multiplies"""
+    """inputs of the states, multiplied by B"""
     held: Float[Array, "N m"]
-    """the inputs that act at the samples: what D multiplies"""
+    """inputs at the samples, multiplied by D"""
 
 
 def alike(layout: Layout, data: Data) -> list[list[int]]:
-    """The flights in groups that share one model and differ in their signals alone."""
+    """Return the flights in groups that share one model and differ only in their signals."""
     groups: dict[Any, list[int]] = {}
     for i, flight in enumerate(data.flights):
         n = next(iter(flight.outputs.values())).shape[0]
@@ -198,14 +196,17 @@ def alike(layout: Layout, data: Data) -> list[list[int]]:
 def discretised(
     layout: Layout, data: Data, u: Unknowns, members: Sequence[int], *, by_instrument: bool = False
 ) -> tuple[Matrices, Driving]:
-    """The model of a group of flights, and what drives it, with a leading axis of flights; by
-    instrument what of the inputs follows the instruments drives it."""
+    """Return the model of a group of flights, and its inputs with a leading axis of flights.
+
+    Args:
+        by_instrument: take the part of the inputs that follows the instruments.
+    """
     first = members[0]
 
     def of_one(own: tuple[FlightData, Any, Any]) -> tuple[Matrices, Driving]:
         flight, state, offset = own
-        # With one sample time all that does not depend on the signals is computed once. A point to
-        # linearise about knows means alone, which inputs by instrument have as well.
+        # With one sample time everything that does not depend on the signals is computed once. The
+        # point of linearisation depends on means alone, and inputs by instrument have the same.
         flight = flight._replace(
             dt=data.flights[first].dt,
             inputs=flight.by_instrument if by_instrument else flight.inputs,
@@ -226,7 +227,7 @@ def discretised(
 
     own = [(data.flights[i], u.states[i], u.offsets[i]) for i in members]
     if len(members) == 1:
-        # A model that depends on numbers of its flight alone would leave vmap with an axis.
+        # A model that depends on values of its flight would leave vmap with an axis.
         m, driving = of_one(own[0])
         return m, jax.tree.map(lambda v: v[None], driving)
     axes: Any = (None, 0)
@@ -238,15 +239,15 @@ def _with(values: tuple[Any, ...], i: int, value: Any) -> tuple[Any, ...]:
 
 
 def shared_of(layout: Layout, u: Unknowns) -> Float[Array, " q"]:
-    """The unknowns that all flights share: parameters, gains and the time shift."""
+    """Return the unknowns that all flights share: parameters, gains and the time shift."""
     params, gains = [u.params[n] for n in layout.free], [u.gains[n] for n in layout.gains]
     shift = [] if u.shift is None else [u.shift]
     return jnp.stack([jnp.asarray(v) for v in (*params, *gains, *shift)])
 
 
 def with_shared(layout: Layout, u: Unknowns, v: Float[Array, " q"]) -> Unknowns:
-    """The unknowns with those of a vector in place, in the order of `shared_of`."""
-    # By the layout's order: JAX sorts the names in every dictionary that it has taken apart.
+    """Return the unknowns with the shared ones replaced, in the order of `shared_of`."""
+    # By the layout's order: JAX sorts the keys of the dictionaries that it flattens.
     values = dict(zip((*layout.free, *layout.gains), v, strict=False))
     return u._replace(
         params={n: values[n] for n in layout.free},
@@ -255,67 +256,64 @@ def with_shared(layout: Layout, u: Unknowns, v: Float[Array, " q"]) -> Unknowns:
     )
 
 
-# Complex numbers stand as real ones, [re, im]: their products are then products of real matrices,
-# for which libraries are fastest.
+# Complex vectors are stored as real ones, [re, im]: products of real matrices are faster.
 
 
 def stacked(v: Complex[Array, "K *c"]) -> Float[Array, "K 2 *c"]:
-    """Real parts and imaginary ones."""
+    """Return real and imaginary parts on a second axis."""
     return jnp.stack([jnp.real(v), jnp.imag(v)], axis=1)
 
 
 def real(M: Complex[Array, "K a b"]) -> Float[Array, "K 2a 2b"]:
-    """The real matrix that does to stacked vectors what M does to complex ones."""
+    """Return the real matrix that multiplies stacked vectors as M multiplies complex ones."""
     re, im = jnp.real(M), jnp.imag(M)
     parts = jnp.stack([jnp.stack([re, -im], axis=2), jnp.stack([im, re], axis=2)], axis=1)
     return parts.reshape(len(M), 2 * M.shape[1], 2 * M.shape[2])
 
 
 def times(M: Float[Array, "K 2a 2b"], v: Float[Array, "K 2 b *f"]) -> Float[Array, "K 2 a *f"]:
-    """The products at each line."""
+    """Return the products at each line."""
     made = M @ v.reshape(len(v), M.shape[2], -1)
     return made.reshape(len(v), 2, -1, *v.shape[3:])
 
 
 _NO_END = 1e-10
-"""part of the largest effect of an end's state below which a state has none"""
+"""effect of a state over the largest one, below which it has none"""
 _ROUNDING = 1e-12
-"""part of the largest power of a direction of the ends below which it is rounding: a millionth of
-its size"""
+"""power of a direction over the largest one, below which it is rounding"""
 
 
 def orthonormal(gram: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """S with S^T G S the identity, but for directions without effect, which are zero: for columns
-    with the products G, those times S are orthonormal."""
+    """Return S with S^T G S the identity, but zero for directions without effect.
+
+    Args:
+        gram: products G of columns, which are orthonormal if multiplied by S.
+    """
     sizes = jnp.sqrt(jnp.maximum(jnp.diagonal(gram), 0.0))
-    # A state that no output shows has a column of rounding: that would make some direction of it,
-    # another at each step, and what is taken off by it makes the sum of squares rough.
+    # The column of a state without effect on the outputs is rounding. Its direction changes from
+    # step to step, and to project it out would make the sum of squares rough.
     precision = float(jnp.finfo(gram.dtype).eps)
     seen = sizes > max(_NO_END, 10.0 * precision) * jnp.max(sizes)
     over = jnp.where(seen, 1.0 / jnp.where(seen, sizes, 1.0), 0.0)
     values, vectors = jnp.linalg.eigh(gram * over[:, None] * over[None, :])
-    # Squares of the sizes of directions. What remains along one that is dropped is small where the
-    # others have sizes that a record can tell.
     kept = values > max(_ROUNDING, 100.0 * precision) * values[-1]
     root = jnp.where(kept, 1.0 / jnp.sqrt(jnp.where(kept, values, 1.0)), 0.0)
     return over[:, None] * vectors * root[None, :]
 
 
-# Errors of a record, and what its ends may add to them.
+# Errors of a record, and the effects of its ends.
 
 
 _NUMBERS = 20_000
-"""outputs times states times lines in a block at most: 256 lines of a helicopter, and the whole
-record of a small vehicle, whose blocks would take longer to begin than to go through"""
+"""largest product of outputs, states and lines in a block: 256 lines of a helicopter, or the whole
+record of a small vehicle"""
 _SPARED = 0.1
-"""part of a record's numbers that its ends may take, those of gusts among them"""
+"""largest share of a record's degrees of freedom that its ends, and those of gusts, may take"""
 
 
 class Resolved(NamedTuple):
-    """A model at the lines of a record, in b blocks of k lines; without a derivative.
-
-    The numbers of one block stay in the processor's caches.
-    """
+    """A model at the lines of a record, without a derivative, in b blocks of k lines that fit the
+    processor's caches."""
 
     record: Record
     W: Float[Array, "b k 2p 2p"]
@@ -325,49 +323,46 @@ class Resolved(NamedTuple):
     H: Float[Array, "b k 2p 2n"]
     """W C (zI - Ad)^-1"""
     effects: Float[Array, "b k 2 e"]
-    """what drives a state that ends elsewhere than it began and, but in a very short record, what
-    does where a slow gust that pushes it does"""
+    """spectrum of a jump between the ends of a state and, except in a very short record, of a slow
+    gust that acts on it"""
     S: Float[Array, "m m"]
-    """`basis_of` times this is orthonormal, but for columns of zeros where a state leaves no
-    trace"""
+    """makes `basis_of` orthonormal; columns of zeros for states without effect"""
 
     def lines(self, v: Float[Array, "f N *c"]) -> Float[Array, "b k 2 *c f"]:
-        """The record's part of signals over whole flights, at the lines of each block."""
-        # An input that acts in a part may have been logged before it: signals are delayed already.
+        """Return the transform of the record's part of signals over whole flights, by block."""
+        # Signals are delayed before they are cut: an input may be logged before it acts.
         part = jnp.moveaxis(v[:, self.record.first : self.record.last], 0, -1)
         return by_block(stacked(lines_of(part)), len(self.W))
 
 
 def by_block(v: Array, count: int) -> Array:
-    """Lines (K, ...) cut into blocks (b, k, ...), the last one filled up with zeros."""
+    """Return lines (K, ...) in blocks (b, k, ...), the last one padded with zeros."""
     size = -(-len(v) // count)
     v = jnp.pad(v, [(0, count * size - len(v)), *((0, 0) for _ in v.shape[1:])])
     return v.reshape(count, size, *v.shape[1:])
 
 
 def resolved(m: Matrices, record: Record, whitening: Complex[Array, "K p p"]) -> Resolved:
-    """A model at the lines of a record."""
+    """Evaluate a model at the lines of a record."""
     (p, n), K = m.C.shape, record.lines
-    # Each part of a complex normal error has half of the variance.
+    # The real part of a complex normal error has half of its variance.
     W = by_block(2.0**0.5 * real(whitening).astype(m.C.dtype), -(-K * m.C.size // _NUMBERS))
     count, size = W.shape[:2]
-    # Beyond the last line those that would follow it, so that nothing is singular there.
+    # The padding continues the lines, so that nothing is singular there.
     k = np.arange(1, count * size + 1)
     z = np.exp(2j * np.pi * k / np.where(k <= K, record.samples, record.samples + 2 * size))
     z = z.astype(np.result_type(m.Ad.dtype, np.complex64))
-    # A gust that ends elsewhere than it began has its leap at all lines: taken for noise of each
-    # line by itself it moves slow modes by several standard deviations. Above its corner it is an
-    # integrated push. Over the length, so that it is no larger than the states' own ends.
+    # A gust that ends elsewhere than it began has a jump, which is in all lines. As noise of each
+    # line by itself it would move slow modes by several standard deviations. Above its corner
+    # frequency it is an integrated push; over the length it is no larger than the states' ends.
     effects = np.stack([z, z / (z - 1.0) / record.samples], axis=1)
     if 2 * n > _SPARED * 2 * p * K:
         effects = effects[:, :1]
     effects = by_block(stacked(jnp.asarray(effects)), count)
 
-    triangle = _triangle(m.Ad)
-
     def of_block(of: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         z, W, effects = of
-        R = _inverse(z, *triangle)
+        R = jnp.linalg.inv(z[:, None, None] * jnp.eye(n, dtype=z.dtype)[None] - m.Ad[None])
         H = W @ real(m.C[None].astype(z.dtype) @ R)
         basis = basis_of(H, effects)
         return real(R), H, basis.T @ basis
@@ -376,34 +371,9 @@ def resolved(m: Matrices, record: Record, whitening: Complex[Array, "K p p"]) ->
     return Resolved(record, W, R, H, effects, orthonormal(jnp.sum(grams, axis=0)))
 
 
-def _triangle(Ad: Float[Array, "n n"]) -> tuple[Complex[Array, "n n"], Complex[Array, "n n"]]:
-    """T and V with Ad = V T V^H, V unitary; T is triangular on the CPU, where JAX has Schur's."""
-    dtype = np.result_type(Ad.dtype, np.complex64)
-
-    def triangle(Ad: Array) -> tuple[Array, Array]:
-        T, V = jax.scipy.linalg.schur(Ad, output="complex")
-        return T, V
-
-    def whole(Ad: Array) -> tuple[Array, Array]:
-        return Ad.astype(dtype), jnp.eye(len(Ad), dtype=dtype)
-
-    return jax.lax.platform_dependent(Ad, cpu=triangle, default=whole)
-
-
-def _inverse(z: Complex[Array, " k"], T: Array, V: Array) -> Complex[Array, "k n n"]:
-    """(zI - Ad)^-1, by substitution where T is triangular: half the time of an inverse."""
-    M = z[:, None, None] * jnp.eye(len(T), dtype=z.dtype)[None] - T[None]
-    back = jnp.broadcast_to(jnp.conj(V.T), M.shape)
-    return V[None] @ jax.lax.platform_dependent(
-        M,
-        back,
-        cpu=functools.partial(jax.lax.linalg.triangular_solve, left_side=True, lower=False),
-        default=jnp.linalg.solve,
-    )
-
-
 def basis_of(H: Float[Array, "k 2p 2n"], effects: Float[Array, "k 2 e"]) -> Float[Array, "s m"]:
-    """The additions of the ends' states, and behind these the gusts', to the rows of a block."""
+    """Return the effects of the ends of the states, and then of the gusts, on the rows of a
+    block."""
     n = H.shape[2] // 2
     re, im = H[:, :, None, :n], H[:, :, None, n:]
     made = re * effects[:, None, 0, :, None] + im * effects[:, None, 1, :, None]
@@ -414,17 +384,17 @@ class Errors(NamedTuple):
     """Errors of one record of each flight of a group, by block."""
 
     rows: Float[Array, "b s f"]
-    """measured less simulated, whitened, the ends of the record taken off; zero beyond the lines"""
+    """measured less modelled, whitened, without the effects of the ends; zero in the padding"""
     X: Float[Array, "b k 2 n f"]
     """the states"""
     y: Float[Array, "b k 2 p f"]
-    """measured less what the inputs add to the outputs past the states"""
+    """measured less the direct feedthrough of the inputs"""
 
 
 def errors_of_record(
     at: Resolved, m: Matrices, driving: Driving, outputs: Float[Array, "f N p"]
 ) -> Errors:
-    """Errors of one record of each flight of a group.
+    """Return the errors of one record of each flight of a group.
 
     Args:
         driving: over the whole flights, as `outputs`.
@@ -452,14 +422,14 @@ def errors_of_record(
 
 
 def parts_of_group(layout: Layout, noise: Noise, members: list[int]) -> list[tuple[Record, Array]]:
-    """The records of each flight of a group, with their whitening."""
-    # Records of one length have one spectrum (`smoothed`): that of the first flight serves all.
+    """Return the records of each flight of a group, with their whitening."""
+    # Records of one length have one spectrum (`smoothed`): that of the first flight.
     pairs = zip(records_of(layout), noise.whitening, strict=True)
     return [(record, W) for record, W in pairs if record.flight == members[0]]
 
 
 def measured(layout: Layout, data: Data, members: list[int]) -> Float[Array, "f N p"]:
-    """The measured signals of a group's flights."""
+    """Return the measured outputs of a group's flights."""
     names = layout.outputs[members[0]]
     columns = [[data.flights[i].outputs[n] for n in names] for i in members]
     return jnp.stack([jnp.stack([jnp.asarray(v) for v in of], axis=1) for of in columns])
@@ -469,14 +439,14 @@ class LineErrors(NamedTuple):
     """Errors of all records."""
 
     errors: list[Complex[Array, "K p"]]
-    """by record, its ends taken off, not whitened"""
+    """by record, without the effects of its ends, not whitened"""
     model: Matrices
     """of the first flight"""
 
 
 @jitted
 def errors_of_lines(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> LineErrors:
-    """The errors at the lines of every record."""
+    """Return the errors at the lines of every record."""
     u, errors, first = unpack(layout, data, z), dict[tuple[int, int], Array](), None
     for members in alike(layout, data):
         m, driving = discretised(layout, data, u, members)

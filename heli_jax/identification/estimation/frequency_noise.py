@@ -1,4 +1,4 @@
-"""The spectra of noise and of gusts, by what a model or the inputs leave of the outputs."""
+"""Spectra of noise and gusts, estimated from residuals of a model or of regressions on inputs."""
 
 import functools
 from collections import Counter
@@ -24,35 +24,34 @@ from heli_jax.identification.unknowns.layout import Data, Layout, unpack
 
 
 LEAST, PART = 6.0, 0.08
-"""sd of the Gaussian that smooths the noise's spectrum over frequency: lines at least, and as a
-part of the frequency. Narrower ones follow the noise itself: intervals are then too narrow"""
+"""least sd of the Gaussian that smooths the noise's spectrum over frequency, in lines and as a part
+of the frequency. Narrower ones overfit the noise: intervals are then too narrow"""
 AVERAGES = 2.0 * np.pi**0.5 * LEAST
-"""independent lines of one record in a smoothed spectrum, at least: (sum w)^2 / sum w^2"""
+"""least number of independent lines of one record in a smoothed spectrum: (sum w)^2 / sum w^2"""
 _ROUNDING = 1e-10
-"""of the mean over all frequencies, below which a spectrum is not taken to fall"""
+"""least spectrum, as a part of the mean over all frequencies"""
 _KNOTS = 4.0
-"""in one sd of the Gaussian: between two of them a smoothed spectrum is a straight line to a
-hundredth"""
+"""knots in one sd of the Gaussian; between them a smoothed spectrum is linear to a hundredth"""
 
 
 def smoothed(
     lines: Sequence[Complex[np.ndarray, "K p"]], part: float = PART, *, least: float = LEAST
 ) -> list[Complex[np.ndarray, "K p p"]]:
-    """By record the spectrum E e e^H (K, p, p) of all records, smoothed over frequency.
+    """Return by record the spectrum E e e^H (K, p, p) of all records, smoothed over frequency.
 
     Args:
         lines: by record at its own frequencies, those of N samples K = (N - 1) // 2.
         part: sd of the Gaussian as a part of the frequency.
-        least: the same in lines, at least.
+        least: least sd in lines.
     """
     p, counts = lines[0].shape[1], Counter(len(v) for v in lines)
     # Records of one length have one spectrum and one kernel: their powers are added first. A
-    # spectrum is Hermitian: the half that lies below the diagonal will do.
+    # spectrum is Hermitian: the half below the diagonal is enough.
     below = np.tril_indices(p)
     sums = {}
     for K in counts:
         power = summed_powers(np.stack([v for v in lines if len(v) == K]))[:, below[0], below[1]]
-        # In single precision too: the view is of double numbers.
+        # Complex in double precision, whatever the lines are: the view is of doubles.
         sums[K] = np.ascontiguousarray(power, dtype=complex).view(float)
     spectra = {}
     for K in counts:
@@ -69,7 +68,7 @@ def smoothed(
 
 
 def once_a_length(make: Callable[..., Any], *records: Sequence[Any]) -> list[Any]:
-    """By record what is made of arrays that records of one length share, like their spectra."""
+    """Return by record the result of arrays that records of one length share, like spectra."""
     made: dict[int, Any] = {}
     each = list(zip(*records, strict=True))
     for v in each:
@@ -79,7 +78,7 @@ def once_a_length(make: Callable[..., Any], *records: Sequence[Any]) -> list[Any
 
 
 def summed_powers(v: Complex[np.ndarray, "f K p"]) -> Complex[np.ndarray, "K p p"]:
-    """The sum of e e^H over records."""
+    """Return the sum of e e^H over records."""
     at_line = v.transpose(1, 2, 0)
     return at_line @ np.conj(at_line.transpose(0, 2, 1))
 
@@ -87,7 +86,7 @@ def summed_powers(v: Complex[np.ndarray, "f K p"]) -> Complex[np.ndarray, "K p p
 def whitening_alone(
     lines: Sequence[Complex[np.ndarray, "K p"]],
 ) -> tuple[Complex[np.ndarray, "K p p"], ...]:
-    """By record what makes white each signal by itself, with nothing of what they share.
+    """Return by record the whitening of each signal by itself, without their correlations.
 
     Raises:
         numpy.linalg.LinAlgError: a signal is zero throughout.
@@ -108,8 +107,8 @@ def whitening_alone(
 def knots_of(
     K: int, part: float = PART, least: float = LEAST
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Lines (from 0) at which a spectrum of K lines is computed, and of each line the knot below
-    and how far it is on the way to the next."""
+    """Return the knots, lines (from 0) at which a spectrum of K lines is computed, and for each
+    line the knot below and the weight of the next."""
     knots = [0]
     while knots[-1] < K - 1:
         width = max(least, part * (knots[-1] + 1))
@@ -121,7 +120,7 @@ def knots_of(
 
 
 def _between_knots(at_knots: np.ndarray, K: int, part: float, least: float) -> np.ndarray:
-    """Straight lines (K, ...) between what is known at the knots (knots, ...)."""
+    """Interpolate values at the knots (knots, ...) to all lines (K, ...)."""
     _, (low, share) = knots_of(K, part, least)
     share = share.reshape(-1, *(1 for _ in at_knots.shape[1:]))
     return at_knots[low] + share * np.diff(at_knots, axis=0)[low]
@@ -131,9 +130,9 @@ def _between_knots(at_knots: np.ndarray, K: int, part: float, least: float) -> n
 def _kernel(
     K: int, other: int, part: float, least: float
 ) -> tuple[Float[np.ndarray, "knots other"], Float[np.ndarray, " knots"]]:
-    """Weights that the lines of a record of `other` lines have at the knots of one of K, and their
-    sums."""
-    # In parts of the rate, which all records have in common.
+    """Return the weights of the lines of a record of `other` lines at the knots of one of K lines,
+    and their sums."""
+    # Frequencies over the rate, which all records have in common.
     f, first = (knots_of(K, part, least)[0] + 1) / (2 * K + 1), 1 / (2 * other + 1)
     g = first * np.arange(1, other + 1)
     width = np.maximum(least * first, part * f)
@@ -145,10 +144,10 @@ def _kernel(
 def averages(
     K: int, counts: tuple[tuple[int, int], ...], part: float = PART, least: float = LEAST
 ) -> Float[np.ndarray, " K"]:
-    """Independent lines in a smoothed spectrum of K lines: (sum w)^2 / sum w^2.
+    """Return the independent lines (K,) in a smoothed spectrum, (sum w)^2 / sum w^2.
 
     Args:
-        counts: lines of a record and how many there are of them, for each length.
+        counts: for each length, lines of a record and number of records.
     """
     at, _ = knots_of(K, part, least)
     kernels = [(n, *_kernel(K, other, part, least)) for other, n in counts]
@@ -158,7 +157,7 @@ def averages(
 
 
 def inverse_roots(S: Complex[np.ndarray, "K p p"]) -> Complex[np.ndarray, "K p p"]:
-    """L^-1, where S = L L^H.
+    """Return L^-1, where S = L L^H.
 
     Raises:
         numpy.linalg.LinAlgError: one is not positive definite.
@@ -167,25 +166,24 @@ def inverse_roots(S: Complex[np.ndarray, "K p p"]) -> Complex[np.ndarray, "K p p
 
 
 def log_determinants(W: Complex[np.ndarray, "K p p"]) -> Float[np.ndarray, " K"]:
-    """log |det W| of what makes noise white: products of triangles, whose diagonals say it."""
+    """Return log |det W| of triangular whitening matrices."""
     return np.sum(np.log(np.abs(np.diagonal(np.asarray(W), axis1=1, axis2=2))), axis=1)
 
 
-# The noise's spectrum by what the vehicle makes of gusts, and a mean over lines of what is left.
+# The noise's spectrum as that of gusts through the vehicle, times a mean over lines of the rest.
 #
-# Gusts come out of a vehicle with its integrations and modes in them: outputs that are coherent
-# with a gain that changes from line to line. A mean over lines makes something else of that,
-# estimates lose most of what the record tells, and intervals are too narrow. So the spectrum is
-# first described as
+# Gusts pass the integrations and modes of a vehicle: the outputs are coherent, with a gain that
+# changes from line to line. A mean over lines loses that coherence; estimates are then inaccurate,
+# and intervals too narrow. So the spectrum is first described as
 #
 # $$S_0 = \sum_i h_i\, q_i\, h_i^H + R, \qquad [h_1 \ldots h_n] = C (zI - A_d)^{-1}$$
 #
-# with a gust at every state whose spectrum $q_i \ge 0$ falls with frequency somehow, and white
-# noise of each output in R. The errors, whitened by $S_0$, have a spectrum that is nearly flat, and
-# the mean over lines is taken of that: it may be wide, and corrects whatever the description lacks.
+# with a gust at every state whose spectrum $q_i \ge 0$ falls with frequency, and white noise of
+# each output in R. The errors, whitened by $S_0$, have a nearly flat spectrum. The mean over lines
+# is taken of that: it may be wide, and corrects errors of the description.
 #
-# A spectrum from n averages of p outputs weighs by $n / (n - p)$ too much, and the estimate is by
-# about the same worse than with the true one: both are allowed for.
+# Weights by a spectrum from n averages of p outputs are too large by $n / (n - p)$, and the
+# variance of the estimate is larger by about the same factor: both are allowed for.
 #
 # Sources: Blackman and Tukey (1958) for prewhitening; Sawada, Kameoka, Araki and Ueda (2013) for
 # the multiplicative steps to the largest likelihood; Brillinger (1981), chapter 8, for weights that
@@ -193,30 +191,30 @@ def log_determinants(W: Complex[np.ndarray, "K p p"]) -> Float[np.ndarray, " K"]
 
 
 GUST_LEAST, GUST_PART = 12.0, 0.12
-"""sd of the Gaussian that smooths what is left: lines at least, and as a part of the frequency"""
+"""least sd of the Gaussian that smooths the rest, in lines and as a part of the frequency"""
 _CELLS = 0.16, 6.0
-"""the same of what the description rests on: each line by itself up to the fiftieth, since slow
-modes are no wider, and from there on 4 % of the frequency"""
+"""part and least sd for the cells of the description: single lines up to the fiftieth, since slow
+modes are no wider, and above that 4 % of the frequency"""
 _OCTAVES = 2
 """from one corner of the gusts' spectra to the next"""
 _STEPS = 24
-"""towards the largest likelihood: what they leave is for the mean over lines"""
+"""multiplicative steps towards the largest likelihood; the mean over lines corrects the rest"""
 _NOTHING = 1e-9
-"""of an output's power, below which none of it is noise"""
+"""least noise, as a part of an output's power"""
 _UNSEEN = 1e-20
-"""part of the largest power of a state's effect below which outputs do not show one"""
+"""power of a state's effect over the largest one, below which it is rounding"""
 
 
 @eqx.filter_jit
 def first_model(layout: Layout, data: Data, z: Float[Array, " q"]) -> Matrices:
-    """The discretised model of the first flight."""
+    """Return the discretised model of the first flight."""
     return discretised(layout, data, unpack(layout, data, z), [0])[0]
 
 
 def whitening_by(
     vehicle: Matrices, errors: Sequence[Complex[np.ndarray, "K p"]]
 ) -> tuple[Complex[np.ndarray, "K p p"], ...]:
-    """By record what makes its errors white; of records of one length the same array."""
+    """Return by record the whitening of its errors; the same array for records of one length."""
     counts = Counter(len(e) for e in errors)
     before = _prewhitening(vehicle, errors, list(counts))
     left = smoothed(
@@ -235,7 +233,7 @@ def whitening_by(
 def _prewhitening(
     vehicle: Matrices, errors: Sequence[Complex[np.ndarray, "K p"]], lengths: list[int]
 ) -> dict[int, Complex[np.ndarray, "K p p"]]:
-    """By length of the record S0^(-1/2); ones where the vehicle says nothing of the errors."""
+    """Return S0^(-1/2) by length of the record; the identity if the description fails."""
     Ad, C = np.asarray(vehicle.Ad, float), np.asarray(vehicle.C, float)
     cells = []
     for K in lengths:
@@ -266,16 +264,17 @@ def gust_spectrum(
     power: Complex[np.ndarray, "c p p"],
     lines: Float[np.ndarray, " c"],
 ) -> Complex[np.ndarray, "c p p"] | None:
-    """The spectrum S0 that is the most likely for complex normal errors; None where there is none.
+    """Return the spectrum S0 of largest likelihood for complex normal errors; None if there is
+    none.
 
     Args:
-        ways: by cell and state what a gust of power 1 at the state makes of the outputs.
-        f: of the cells, in cycles a sample.
+        ways: by cell and state the outputs' spectrum in a gust of power 1 at the state.
+        f: frequencies of the cells, in cycles per sample.
         power: mean of e e^H over the lines of a cell.
         lines: of each cell.
     """
     size = np.sqrt(np.average(np.real(np.einsum("cii->ci", power)), axis=0, weights=lines))
-    # A line on a mode that does not decay has no finite response.
+    # The response at the frequency of an undamped mode is infinite.
     fine = np.flatnonzero(np.isfinite(ways).all((1, 2, 3)))
     if not (fine.size and np.isfinite(size).all() and (size > 0).all()):
         return None
@@ -284,8 +283,8 @@ def gust_spectrum(
     # A gust's spectrum is a sum of a white one and first-order lags.
     shapes = [np.ones((1, fine.size)), 1.0 / (1.0 + (f[fine] / corners[:, None]) ** 2)]
     shapes, ways = np.concatenate(shapes), ways[fine] / scale
-    # What rounding leaves of a state that no output shows would pass for the way of a huge gust,
-    # and the spectrum would jump with the last digit of the parameters.
+    # A state without effect on the outputs has a rounding error for its effect. It would be taken
+    # for a huge gust, and the spectrum would depend on the last digit of the parameters.
     effects = np.max(np.real(np.einsum("cnii->cni", ways)), axis=(0, 2))
     ways = np.where((effects > _UNSEEN * np.max(effects))[:, None, None], ways, 0.0)
     q, r = _powers_of_gusts(ways, shapes, power[fine] / scale, lines[fine])
@@ -301,32 +300,31 @@ def _powers_of_gusts(
     power: Complex[np.ndarray, "c p p"],
     lines: Float[np.ndarray, " c"],
 ) -> tuple[Float[np.ndarray, "n b1"], Float[np.ndarray, " p"]]:
-    """Powers of gusts, by state and shape, and of the outputs' own white noise."""
+    """Return the powers of gusts, by state and shape, and of the outputs' own white noise."""
     own, gains = (np.real(np.einsum("...ii->...i", v)) for v in (power, ways))
     gains = np.swapaxes(gains, 1, 2)
-    # To begin with as much as the output that shows least of a state leaves room for.
+    # Initially as much as the output with the least effect of a state allows.
     room = np.median(np.min(own[:, :, None] / np.maximum(gains, 1e-300), axis=1), axis=0)
     room = np.where(np.max(gains, axis=(0, 1)) > 0, room, 0.0)
     c, n, p, _ = ways.shape
-    # An output's own noise comes by a way that leads to it alone, and is white: the first shape.
+    # An output's own noise has an effect on it alone, and is white: the first shape.
     powers = np.zeros((len(shapes), n + p))
     powers[:, :n], least = room / len(shapes), np.zeros_like(powers)
     powers[0, n:], least[0, n:] = np.maximum(0.3 * np.median(own, axis=0), _NOTHING), _NOTHING
     alone = np.eye(p)[:, :, None] * np.eye(p)[:, None, :]
     ways = np.concatenate([ways, np.broadcast_to(alone, (c, p, p, p))], axis=1)
-    # By cell and way its numbers in a row: sums over ways, and what of a matrix comes by each, are
-    # then products of real matrices.
+    # Matrices as rows of real numbers, so that sums over effects are products of real matrices.
     ways = np.ascontiguousarray(ways.reshape(c, n + p, -1), complex).view(float)
     by_way, matrices = np.swapaxes(ways, 1, 2).copy(), np.empty((c, 2, p, p), complex)
     by_shape = shapes * lines
-    # With a quarter of them a peak of gusts stayed at the flybar's mode where there were none, and
-    # a third more in the interval of If.
+    # With a quarter of these steps a false peak of gusts stayed at the flybar's mode, and the
+    # interval of If was a third wider.
     for _ in range(_STEPS):
         S = ((shapes.T @ powers)[:, None, :] @ ways).view(complex).reshape(c, p, p)
         matrices[:, 1] = np.linalg.inv(S)
         matrices[:, 0] = matrices[:, 1] @ power @ matrices[:, 1]
-        # By shape and way what of it the errors show, and what they should. Without the root that
-        # would make sure that each step gains: half as many are enough.
+        # By shape and effect, its power in the errors and the expected one. The root that
+        # guarantees an increase in each step is left out: half as many steps are enough.
         told = (matrices.view(float).reshape(c, 2, -1) @ by_way).reshape(c, -1)
         shown, due = np.moveaxis((by_shape @ told).reshape(-1, 2, n + p), 1, 0)
         powers = np.maximum(powers * (shown / np.where(due > 0, due, 1.0)), least)
@@ -334,11 +332,11 @@ def _powers_of_gusts(
 
 
 _ALONE = 1e-9
-"""of the inputs' power, below which two of them move as one, and of the outputs', below which
-nothing is left"""
+"""part of the inputs' power below which two of them move as one, and of the outputs' below which
+there is no residual"""
 
 
-# The noise's spectrum before any model: what the inputs leave of the outputs, line by line.
+# The noise's spectrum without a model: the residual of local regressions of the outputs on inputs.
 #
 # Source: Brillinger, Time Series (1981), chapter 8, for regression of spectra; Pintelon and
 # Schoukens (2012), chapter 7, for the ends of a record as a smooth function of the frequency beside
@@ -346,10 +344,10 @@ nothing is left"""
 
 
 def whitening_without_model(layout: Layout, data: Data) -> tuple[np.ndarray, ...] | None:
-    """By record what makes white (K, p, p) that which no response to the inputs explains.
+    """Return by record the whitening (K, p, p) of the part of the outputs that no response to the
+    inputs explains; None with too few lines.
 
-    None where there are too few lines to tell. In a closed loop it is too small where feedback
-    moves the inputs more than the excitation does.
+    In a closed loop it is too small where feedback moves the inputs more than the excitation does.
     """
     flights = jax.device_get(data.flights)
     lines = []
@@ -361,9 +359,9 @@ def whitening_without_model(layout: Layout, data: Data) -> tuple[np.ndarray, ...
     p = len(layout.outputs[0])
     powers = np.sum([np.sum(np.abs(v) ** 2, axis=0) for v in lines], axis=0)
     moving = p + np.flatnonzero(powers[p:] > 0)
-    # A response changes over the lines that a spectrum is smoothed over, a mode's by much.
+    # A response varies over the lines of a smoothed spectrum, near a mode by much.
     order = next((q for q in (2, 1) if (q + 1) * (moving.size + 1) <= 0.5 * AVERAGES), 0)
-    # What the ends of a record add is smooth over the lines around: a constant beside the inputs.
+    # The effects of the ends of a record are smooth over the lines: a constant beside the inputs.
     size = np.sqrt(np.mean(powers[:p]) / sum(len(v) for v in lines))
     lines = [np.column_stack([v[:, :p], *_powers(v[:, moving], size, order)]) for v in lines]
     counts, spectra = tuple(Counter(len(v) for v in lines).items()), smoothed(lines)
@@ -379,15 +377,16 @@ def whitening_without_model(layout: Layout, data: Data) -> tuple[np.ndarray, ...
 
 
 def _powers(inputs: np.ndarray, size: float, order: int) -> list[np.ndarray]:
-    """Inputs (K, m) and a constant, times powers of the frequency up to an order: locally a
-    response that is a polynomial of it."""
+    """Return inputs (K, m) and a constant, times powers of the frequency up to an order: regressors
+    of a response that is locally a polynomial."""
     beside = np.column_stack([inputs, np.full(len(inputs), size)])
     f = np.arange(1, len(inputs) + 1)[:, None] / len(inputs)
     return [beside * f**q for q in range(order + 1)]
 
 
 def _left(S: np.ndarray, p: int) -> np.ndarray:
-    """Spectra (K, p, p) of the first p signals without what the others explain."""
+    """Return the spectra (K, p, p) of the first p signals without the part that the others
+    explain."""
     size = np.sqrt(np.real(np.einsum("kii->ki", S)))
     R = S / (size[:, :, None] * size[:, None, :])
     others = R[:, p:, p:] + _ALONE * np.eye(S.shape[1] - p)

@@ -1,15 +1,15 @@
-r"""Fit of a linear model to measured frequency responses, with intervals that are true.
+r"""Fit of a linear model to measured frequency responses.
 
-With Z, U the transforms of instruments (or of the inputs) and of the inputs in Hann windows, and e
-the measured outputs less the simulated ones, what the model misses of the responses is
+With Z, U, E the transforms of instruments (or inputs), inputs, and measured less modelled outputs
+in Hann windows, the error of the model's responses is
 
 $$\Delta H = \overline{E Z^*}\; \overline{U Z^*}^{-1}.$$
 
-The model goes through the same windows as the record: what windows do to a response they do to
-both, and nothing is biased. Its bounded solution is taken in place of a simulation, so that it may
-be unstable, and what the ends of the record add to it is projected out. Errors are complex and
-linear, whitened between outputs and inputs by the noise's spectral matrix: what no response
-explains of the errors. Lines of a window count for as much as they are independent.
+The model goes through the same windows as the record, so that windows bias nothing. Its bounded
+solution replaces a simulation, so that it may be unstable, and the effects of the ends of the
+record are projected out. Errors are complex and linear. They are whitened between outputs and
+inputs by the noise's spectral matrix, which is that of the part of the errors that no response
+explains. Lines of a window are weighted by how independent they are.
 
 Sources: Pintelon and Schoukens (2012), chapters 2 and 9; Bendat and Piersol (2010), chapter 9;
 Tischler and Remple (2012), chapters 7 to 12, for the approach, whose logarithmic errors and weights
@@ -77,10 +77,10 @@ from heli_jax.identification.unknowns.layout import (
 # The model through the windows of the record.
 #
 # With $z = e^{i \pi (2 k + 1) / N}$ the sums $X = (zI - A_d)^{-1} B U$ are those of the solution
-# with $x_N = -x_0$. It is bounded where a simulation diverges, and the response over the record is
-# this and $n$ numbers times the effects of the ends: those of stable modes decay from the beginning
-# on, those of unstable ones towards the end. Lines half a line away from those of Fourier have no
-# pole of an integrator among them.
+# with $x_N = -x_0$. It is bounded where a simulation diverges. The response over the record is the
+# sum of this solution and of $n$ effects of the ends: those of stable modes decay from the start,
+# those of unstable ones towards the end. Lines half-way between the Fourier lines avoid the pole of
+# an integrator.
 #
 # Sources: Devasia, Chen and Paden (1996) for bounded solutions of unstable plants; Golub and
 # Pereyra (1973) and Kaufman (1975) for the projection.
@@ -92,18 +92,18 @@ def bounded_outputs(
     R: Complex[Array, "K n n"],
     ends: Float[Array, " n"] | None = None,
 ) -> Float[Array, "p N"]:
-    """The outputs over a record by the bounded solution.
+    """Return the outputs over a record by the bounded solution.
 
     Args:
         R: of `inverses`.
-        ends: of the states, factors of `effects_of_ends`; zero unless given.
+        ends: factors of `effects_of_ends`; zero unless given.
     """
     z, turns = _lines(len(driving.U))
     U = _at_lines(driving.U, turns) @ m.B.T.astype(z.dtype)
     if ends is not None:
         U = U + z[:, None] * ends.astype(z.dtype)[None]
-    # Products in place of the derivative of an inverse: dY = H (dAd X + dU) + dC X. What is
-    # subtracted here is zero but for its derivative.
+    # Products in place of the derivative of an inverse: dY = H (dAd X + dU) + dC X. The differences
+    # are zero but for their derivatives.
     X = jax.lax.stop_gradient(jnp.einsum("kij,kj->ki", R, U))
     C = jax.lax.stop_gradient(m.C).astype(z.dtype)
     dA, dC = ((v - jax.lax.stop_gradient(v)).astype(z.dtype) for v in (m.Ad, m.C))
@@ -119,15 +119,15 @@ def inverses(m: Matrices, samples: int) -> Complex[Array, "K n n"]:
 
 
 def effects_of_ends(m: Matrices, R: Complex[Array, "K n n"], samples: int) -> Array:
-    """The additions (p, n, N) of a record's ends to the outputs, for each state."""
+    """Return the effects (p, n, N) of a record's ends on the outputs, for each state."""
     z, turns = _lines(samples)
     H = jax.lax.stop_gradient(m.C)[None].astype(z.dtype) @ R
     return _in_time(jnp.moveaxis(H * z[:, None, None], 0, -1), turns)
 
 
 def _lines(N: int) -> tuple[np.ndarray, np.ndarray]:
-    """Windows of half of the lines z (K,), the others being conjugate, and exp(i pi t / N) (N,)."""
-    # The odd record's line at Nyquist's frequency is its own conjugate.
+    """Return half of the lines z (K,), the others being conjugate, and exp(i pi t / N) (N,)."""
+    # With odd N the line at the Nyquist frequency is its own conjugate.
     k = np.arange((N + 1) // 2)
     return np.exp(1j * np.pi * (2 * k + 1) / N), np.exp(1j * np.pi * np.arange(N) / N)
 
@@ -149,7 +149,7 @@ def _in_time(
 
 
 def _groups(layout: Layout, data: Data, weights: ResponseWeights) -> list[list[int]]:
-    """Flights that have windows and differ in numbers alone."""
+    """Return groups of flights that have windows and equal layouts."""
     return [g for g in alike(layout, data) if weights.windows.starts[g[0]]]
 
 
@@ -165,7 +165,7 @@ class _Measured(NamedTuple):
 
 
 def _measured(data: Data, w: Windowed, members: list[int]) -> _Measured:
-    """The sums of each of some flights, with a leading axis."""
+    """Return the windows of some flights, with a leading axis."""
     first, made = np.cumsum([0, *(len(s) for s in w.starts)]), []
     for i in members:
         outputs, own = data.flights[i].outputs, slice(first[i], first[i + 1])
@@ -184,12 +184,11 @@ def _by_flight(
     ends: Float[Array, "f n"] | None,
     body: Callable[[Array, Array, _Measured], Any],
 ) -> Any:
-    """`body(E, effects, measured)` of each flight of a group, with a leading axis: E (p, W, k) what
-    the model misses of the outputs in windows, effects (p, n, W, k) what the ends of the record add
-    there.
+    """Return `body(E, effects, measured)` of each flight of a group, with a leading axis: E (p, W,
+    k) are the errors of the outputs in windows, effects (p, n, W, k) those of the record's ends.
 
     Args:
-        ends: of each flight; zero unless given.
+        ends: factors of the effects, of each flight; zero unless given.
     """
     w = weights.windows
     N = next(iter(data.flights[group[0]].outputs.values())).shape[0]
@@ -208,12 +207,12 @@ def _by_flight(
         left = measured.y - bounded_outputs(m, driving, R, ends)
         return body(windows(left), effects, measured)
 
-    # One at a time: what is made of a flight's windows for each unknown fills the caches.
+    # One flight at a time: derivatives of its windows fill the caches.
     return jax.lax.map(of_one, (driving, _measured(data, w, group), ends))
 
 
 def _cross(measured: _Measured, E: Complex[Array, "p c W k"]) -> Complex[Array, "k p m c"]:
-    """Products with the instruments in windows, summed over a flight."""
+    """Return the products with the instruments in windows, summed over a flight."""
     E = E * measured.seen.T[:, None, :, None].astype(E.dtype)
     return jnp.einsum("wkz,pcwk->kpzc", jnp.conj(measured.Z), E)
 
@@ -223,19 +222,19 @@ def _summed(each: Iterable[Array]) -> Array:
 
 
 def _whitened(weights: ResponseWeights, S: Complex[Array, "k p m c"]) -> Float[Array, "r c"]:
-    """The responses that sums over all flights make, in rows of variance 1."""
+    """Return the responses of sums over all flights, in rows of variance 1."""
     w, (k, c) = weights.windows, (S.shape[0], S.shape[3])
     S = S / jnp.sum(w.seen, axis=0).astype(S.dtype)[None, :, None, None]
     dH = jnp.einsum("pkmz,kpzc->kpmc", weights.averages.P, S)
     rows = weights.whitening @ dH.reshape(k, -1, c)
-    # Each part of a complex normal error has half of the variance.
+    # The real part of a complex normal error has half of its variance.
     return 2.0**0.5 * jnp.concatenate([jnp.real(rows), jnp.imag(rows)]).reshape(-1, c)
 
 
 def rows_of_responses(
     layout: Layout, data: Data, weights: ResponseWeights, u: Unknowns
 ) -> Float[Array, " r"]:
-    """Whitened errors of all responses, without what the ends of the records may add."""
+    """Return the whitened errors of all responses, with the effects of the ends projected out."""
     v, groups = shared_of(layout, u), _groups(layout, data, weights)
     at, rest = jax.lax.stop_gradient((v, u))
 
@@ -249,13 +248,13 @@ def rows_of_responses(
 
     made = sums(at, [None] * len(groups), with_effects)
     rows = _whitened(weights, _summed(S for S, _ in made))[:, 0]
-    # Directions of what the ends add: the states of each flight in turn, as columns.
+    # Effects of the ends as columns: the states of each flight in turn.
     columns = [jnp.moveaxis(e, 0, 3).reshape(*e.shape[1:4], -1) for _, e in made]
     basis = _whitened(weights, jnp.concatenate(columns, axis=3))
     S = orthonormal(basis.T @ basis)
     Q = basis @ S
     along = Q.T @ rows
-    # By group the ends that suit the errors best.
+    # By group the factors of the effects, by least squares.
     each = jnp.split(S @ along, np.cumsum([c.shape[3] for c in columns])[:-1])
     ends = [v.reshape(len(e), -1) for v, (_, e) in zip(each, made, strict=True)]
 
@@ -264,8 +263,8 @@ def rows_of_responses(
             weights, _summed(sums(v, ends, lambda E, _, own: _cross(own, E[:, None])))
         )[:, 0]
 
-    # Variable projection: about the ends that suit these unknowns best, whose own effect moves
-    # with the unknowns. Once for the unknowns that all flights share, and not for each nuisance.
+    # Variable projection (Kaufman): derivatives with these factors fixed. Only by the unknowns that
+    # all flights share: nuisances have no effect here.
     J = jax.jacfwd(errors)(at)
     rows, J = jax.lax.stop_gradient((rows - Q @ along, J - Q @ (Q.T @ J)))
     return rows + J @ (v - at)
@@ -275,9 +274,10 @@ def rows_of_responses(
 def errors_in_windows(
     layout: Layout, data: Data, weights: ResponseWeights, z: Array
 ) -> Complex[Array, "W k p"]:
-    """Transforms of measured less modelled outputs; zero where an output is not seen."""
+    """Return the transforms of measured less modelled outputs; zero where an output is not
+    seen."""
     u, of_flight = unpack(layout, data, z), dict[int, Array]()
-    # Of all that is seen in the windows, each output by its noise, and not of the responses alone.
+    # The ends are fitted to all windows, each output by its noise, and not to the responses alone.
     power = jnp.real(jnp.einsum("kii->ki", weights.density))
 
     def left(E: Array, effects: Array, own: _Measured) -> Array:
@@ -300,21 +300,21 @@ def errors_in_windows(
 
 
 class FrequencyResponse(Objective):
-    """The model's frequency responses against those of the flights together."""
+    """Errors of the model's frequency responses, over all flights together."""
 
     noise_model = "spectrum"
     fits_responses = True
 
     def tags(self, layout: Layout, data: Data, count: int) -> RowTags:
-        """Rows are responses of all flights together."""
+        """Return empty tags: rows are responses of all flights together."""
         return untagged(count)
 
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
-        """The whitened errors of all responses, real and imaginary parts."""
+        """Return the whitened errors of all responses, real and imaginary parts."""
         return Residuals(rows_of_responses(layout, data, noise.whitening, u), None)
 
     def refusal(self, problem: Problem) -> str | None:
-        """Other than linear models, and flights with too little in windows."""
+        """Return a reason for nonlinear models, and for flights with too few windows."""
         if not problem.model.linear:
             return (
                 f"model {problem.model.name} is not linear; expected frequency-error, which "
@@ -330,13 +330,13 @@ class FrequencyResponse(Objective):
         return None
 
     def first_noise(self, problem: Problem, noise: Noise, flights: Sequence[Flight]) -> Noise:
-        """The weights to begin with, of what is measured."""
+        """Return the noise with the weights of the measured signals."""
         return noise._replace(whitening=on_device(first_weights(problem, flights)))
 
     def relax(
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
     ) -> tuple[Float[Array, " q"], Noise]:
-        """The spectrum of what no response explains of the errors."""
+        """Estimate the spectrum of the part of the errors that no response explains."""
         z = in_time(layout, data, noise, z)
         weights = back(noise.whitening)
         errors = np.asarray(errors_in_windows(layout, data, noise.whitening, z))
@@ -347,8 +347,8 @@ class FrequencyResponse(Objective):
         return z, Noise(sd, np.asarray(level), on_device(weights))
 
     def log_likelihood(self, layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
-        """Log-likelihood of complex normal errors of the responses, in SI units of output over
-        input.
+        """Return the log-likelihood of complex normal errors of the responses, in SI units of
+        output over input.
 
         Args:
             noise: that `e` was evaluated with.
@@ -359,24 +359,25 @@ class FrequencyResponse(Objective):
         return 2.0 * weights.log_determinant - 0.5 * squares - constant
 
     def numbers(self, layout: Layout, data: Data, noise: Noise) -> int:
-        """The windows that the noise's spectrum is taken from at the lines used."""
-        # The nuisances are not taken from them.
+        """Return the number of values that the noise's spectrum is estimated from."""
+        # They do not determine the nuisances.
         return int(noise.whitening.numbers_of_noise) + layout.determined
 
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
-        """The simulated flights: what disturbs them is in the noise."""
+        """Return the simulated flights: disturbances are in the noise."""
         return OUTPUT_ERROR.records(reached, u, runs, seed)
 
     def errors_in_windows(
         self, layout: Layout, data: Data, noise: Noise, z: Array
     ) -> Complex[Array, "W k p"]:
-        """Transforms of measured less modelled outputs; zero where an output is not seen."""
+        """Return the transforms of measured less modelled outputs; zero where an output is not
+        seen."""
         return errors_in_windows(layout, data, noise.whitening, z)
 
     def response_agreement(
         self, layout: Layout, data: Data, noise: Noise, z: Array
     ) -> ResponseAgreement | None:
-        """Chi-squared and Tischler's J of every response."""
+        """Return chi-squared and Tischler's J of every response."""
         weights = back(noise.whitening)
         w, used = weights.windows, weights.used
         E = response_of(
@@ -384,7 +385,6 @@ class FrequencyResponse(Objective):
         )
         H = response_of(w, weights.averages, w.Y)
         white = np.einsum("kab,kb->ka", weights.whitening, E.reshape(len(E), -1))
-        # What the ends of the records add takes its part.
         ends = len(data.flights) * len(layout.states)
         taken = len(layout.of_interest)
         freedom = max(2.0 * weights.numbers - taken - ends, 1.0)
@@ -405,8 +405,8 @@ class FrequencyResponse(Objective):
 
 
 def _sd(layout: Layout, data: Data, weights: ResponseWeights, z: Array) -> tuple[dict, ...]:
-    """By flight and output the residual's in time, or where no simulation stands that of the noise
-    in the band."""
+    """Return by flight and output the sd of the residual in time, or of the noise in the band where
+    the simulation diverges."""
     runs = by_output(layout, jax.device_get(simulated_at(layout, data, z)))
     w, sd = weights.windows, [dict[str, Any]() for _ in data.flights]
     in_band = np.mean(np.real(np.einsum("kpp->kp", weights.density)), axis=0)

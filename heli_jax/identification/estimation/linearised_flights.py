@@ -7,25 +7,20 @@ moves with the parameters: its derivative is that of an implicit function.
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optimistix as optx
 from jaxtyping import Array
 
 from heli_jax import naming
-from heli_jax.analysis.operating_point import flown, mean_condition, mean_heading
+from heli_jax.analysis.operating_point import mean_condition, mean_heading
 from heli_jax.analysis.trim import Condition, equilibrium, is_full_nonlinear, trim
 from heli_jax.dynamics.jacobians import about, linearised
 from heli_jax.dynamics.model import Model
-from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.evaluation import Evaluation, deviations
-from heli_jax.identification.estimation.residual import rows_of
 from heli_jax.identification.estimation.simulated_flights import Drive
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.layout import Layout, Solution
+from heli_jax.identification.unknowns.layout import Layout
 
 # Params, State and Inputs are a model's own classes: they are annotated Any.
 
@@ -99,45 +94,3 @@ def _equilibrium_at(model: Model, params: Any, inputs: Any) -> Any:
     # One more step of Newton's, which has the derivative of the root by the parameters.
     x = x - inverse @ rates(x, (params, inputs))
     return naming.unravel(model.State, jnp.where(rest, x, start))
-
-
-_NOTABLE = 0.3
-"""standard deviations from which on an estimate is named"""
-
-
-def linearisation_notes(at: Solution, e: Evaluation) -> list[Finding]:
-    """Return the point of linearisation, and the shifts of the estimates that it causes: those
-    which the model's own simulation, in place of the record, gives in one step of Gauss and Newton.
-    """
-    layout, data, noise, _ = at
-    if layout.model.linear:
-        return []
-    flights = tuple(
-        flight._replace(outputs={n: jnp.asarray(run[n]) for n in flight.outputs})
-        for flight, run in zip(data.flights, e.simulated, strict=True)
-    )
-    rows = eqx.filter_jit(rows_of)(layout, data._replace(flights=flights), noise, jnp.asarray(e.z))
-    # The rows of priors are no error of the model.
-    J, r, q = np.asarray(e.J), np.zeros(len(e.J)), len(layout.of_interest)
-    r[:q] = np.asarray(rows)[:q]
-    shifts: dict[str, float] = {}
-    # An unstable model's simulation leaves the record.
-    if np.isfinite(r).all() and np.isfinite(J).all():
-        step = -np.linalg.lstsq(J, r, rcond=1e-10)[0]
-        shifts = dict(zip(layout.of_interest, step[:q] * e.slopes, strict=True))
-    sds = dict(zip(layout.of_interest, deviations(J)[:q] * np.abs(e.slopes), strict=True))
-    in_sds = {n: v / sds[n] for n, v in shifts.items()}
-    facts = layout.flight_facts
-    conditions = [None if f.condition is None else flown(f.condition) for f in facts]
-    where = [f"the trim {c}" if c else "the equilibrium at its mean inputs" for c in conditions]
-    moved = [f"{n} by {v:+.2g}" for n, v in in_sds.items() if abs(v) >= _NOTABLE]
-    return [
-        found(
-            "dynamics.linearised",
-            "note",
-            value=max((abs(v) for v in in_sds.values()), default=None),
-            shifts=shifts,
-            where=list(dict.fromkeys(where)),
-            moved=moved or [f"no estimate by {_NOTABLE:g}"],
-        )
-    ]

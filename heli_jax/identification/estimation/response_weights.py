@@ -1,13 +1,13 @@
-"""Weights of the fit of frequency responses: covariance and whitening of the responses' errors.
+"""Weights of fits of frequency responses: covariance and whitening of the errors of responses.
 
-With Z, U, E the transforms of instruments, inputs and errors in each window, the response that is
-left in the errors is dH = S_zu^-1 S_ze. Given the inputs, its covariance between outputs i and j is
+With Z, U, E the transforms of instruments, inputs and errors in each window, the response in the
+errors is dH = S_zu^-1 S_ze. Given the inputs, its covariance between outputs i and j is
 
     P_i V_ij P_j^H S_ij,    P = S_zu^-1,
 
 with S the noise's spectral matrix and V_ij the sum of conj(Z) Z over windows that both outputs
-have, overlapping ones by their correlation: exact for a chirp too, whose power at one frequency is
-in one window.
+have, overlapping windows by their correlation. It is exact for a chirp too, whose power at one
+frequency is in one window.
 
 Sources: Bendat and Piersol, Random Data (2010), chapter 9; Pintelon and Schoukens (2012), chapter
 2, for the estimate by instrument.
@@ -38,26 +38,24 @@ from heli_jax.identification.estimation.frequency_instrument import instruments_
 from heli_jax.identification.problem import Problem
 
 _WIDEST = 2.0
-"""sd of the Gaussian that smooths the noise's spectrum over frequency, in lines of the window: half
-of it where averages are many enough"""
+"""sd of the Gaussian that smooths the noise's spectrum over frequency, in lines of the window; half
+of it where there are enough averages"""
 _PART = 0.04
-"""the same as a part of the frequency, of each line"""
+"""least sd of this Gaussian as a part of the frequency"""
 _ENOUGH = 30.0
-"""independent averages for each output that a spectral matrix is taken from. A wider mean takes a
-mode of gusts for a wide one: with twice the width errors were by 20 % larger"""
+"""independent averages per output for a spectral matrix"""
 _LINES = 2.0 * np.pi**0.5 / (STEPS / PER_AVERAGE)
 """independent lines in a Gaussian of one line, of Hann windows"""
 _NEIGHBOURS = 3
 """lines to either side with which a line is correlated in Hann windows"""
 _ROUNDING = 1e-14
-"""of a signal's density, below which noise is not taken to fall"""
+"""least density of the noise, as a part of the signal's"""
 _SMALLEST = 1e-9
-"""eigenvalue of the noise's matrix of coherences: outputs that were computed from one another have
-none of their own"""
+"""least eigenvalue of the noise's coherence matrix, for outputs computed from one another"""
 
 
 class Averages(NamedTuple):
-    """The errors of responses as the inputs alone determine them; p outputs, m inputs, k lines."""
+    """Errors of responses as determined by the inputs; p outputs, m inputs, k lines."""
 
     P: np.ndarray
     """(p, k, m, m) inverses of the cross-spectra from instruments to inputs, of the windows that
@@ -65,24 +63,24 @@ class Averages(NamedTuple):
     V: np.ndarray
     """(p, p, k, m, m) covariance of the cross-spectra over the density of the noise"""
     share: np.ndarray
-    """(p, k, m) of each error how much of an independent one it is: errors at neighbouring lines
-    are correlated, and responses are smooth"""
+    """(p, k, m) share of an independent error: errors at neighbouring lines are correlated"""
     freedom: np.ndarray
-    """(k, p) squares of white noise of density 1 that no response explains, summed over windows"""
+    """(k, p) expected sum over windows of the squares of white noise of density 1, without the part
+    that a response explains"""
 
 
 def averages(w: Windowed) -> Averages:
-    """The spectra of flights in windows."""
+    """Compute the averages of flights in windows."""
     turns = np.outer(w.lines, np.arange(w.length)) / w.length
     g = hann(w.length) * np.exp(-2j * np.pi * turns)
     g = g - np.mean(g, axis=1, keepdims=True)
     near = [_correlations(g, d, w.step) for d in range(min(_NEIGHBOURS + 1, len(g)))]
-    # Most outputs miss samples in the same windows, or nowhere: each case once.
+    # Most outputs lack the same windows or none: each case is computed once.
     cases, case = np.unique(w.seen, axis=1, return_inverse=True)
     masks, case = cases.T, case.reshape(-1)
     V = np.array([[_spread(w, a, b, near[0]) for b in masks] for a in masks])
     P, share, freedom = [], [], []
-    # White noise at the first line has a density below 1: the mean takes a part of it.
+    # The mean takes off a part of white noise at the first line.
     power = np.real(near[0][0])
     for i, seen in enumerate(masks):
         S = _cross(seen, w.Z, w.U)
@@ -100,16 +98,16 @@ def averages(w: Windowed) -> Averages:
 
 
 def _cross(seen: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(k, m, m) mean over the windows seen of conj(a) b."""
+    """Return the mean (k, m, m) of conj(a) b over the windows seen."""
     return np.einsum("w,wkx,wky->kxy", seen, np.conj(a), b, optimize=True) / np.sum(seen)
 
 
 def _correlations(g: np.ndarray, d: int, step: int) -> dict[int, np.ndarray]:
-    """Correlation of the transform of white noise at each line in a window with that at the d-th
-    line after it in another window, (k - d,), by how many steps that one begins later.
+    """Return the correlation (k - d,) of the transform of white noise at each line in a window with
+    that at the d-th line after it in a window j steps later, by j.
 
     Args:
-        g: windows times the turning of each line (k, samples), less their means.
+        g: window times complex exponential of each line (k, samples), less their means.
     """
     a, b = g[: len(g) - d], np.conj(g[d:])
     size, found = np.sum(hann(g.shape[1]) ** 2), {}
@@ -124,8 +122,8 @@ def _correlations(g: np.ndarray, d: int, step: int) -> dict[int, np.ndarray]:
 def _spread(
     w: Windowed, first: np.ndarray, second: np.ndarray, c: dict[int, np.ndarray]
 ) -> np.ndarray:
-    """(k - d, m, m) covariance of two means of conj(Z) E of white noise E of density 1, the second
-    at the d-th line after the first."""
+    """Return the covariance (k - d, m, m) of two means of conj(Z) E, with white noise E of density
+    1, the second mean at the d-th line after the first."""
     k = len(c[0])
     a = first[:, None, None] * w.Z[:, :k]
     b = second[:, None, None] * w.Z[:, len(w.numbers) - k :]
@@ -142,7 +140,8 @@ def _spread(
 def _share(
     w: Windowed, seen: np.ndarray, P: np.ndarray, near: list[dict[int, np.ndarray]]
 ) -> np.ndarray:
-    """(k, m) one over the sum of an error's correlations with those at the lines around it."""
+    """Return one over the sum of the correlations of an error with those at lines around it, (k,
+    m)."""
     size, total = np.ones(P.shape[:2]), np.ones(P.shape[:2])
     for d, c in enumerate(near):
         k = len(c[0])
@@ -151,7 +150,7 @@ def _share(
         if d == 0:
             size = np.sqrt(np.maximum(C, 1e-300))
             continue
-        # Where they alternate nothing is gained: no response moves that fast.
+        # A negative correlation is no gain: no response varies that fast.
         rho = np.maximum(C / (size[:k] * size[d:]), 0.0)
         total[:k] += rho
         total[d:] += rho
@@ -161,7 +160,7 @@ def _share(
 def response_of(
     w: Windowed, at: Averages, E: Complex[np.ndarray, "W k p"]
 ) -> Complex[np.ndarray, "k p m"]:
-    """The response dH from the inputs that errors have; NaN where inputs move as one.
+    """Return the response dH of errors to the inputs; NaN where inputs move as one.
 
     Args:
         E: errors, or the outputs themselves; zero in windows that an output does not have.
@@ -225,18 +224,19 @@ def _inverse_power(w: Windowed, seen: Float[np.ndarray, " W"]) -> Complex[np.nda
 
 
 def _definite(S: np.ndarray, floor: np.ndarray) -> np.ndarray:
-    """A spectral matrix (k, p, p) that has an inverse; `floor` (p,) of its diagonal."""
+    """Return a spectral matrix (k, p, p) that has an inverse, with a diagonal of at least `floor`
+    (p,)."""
     power = np.maximum(np.real(np.einsum("kii->ki", S)), floor)
     scale = np.sqrt(power)
     rho = S / (scale[:, :, None] * scale[:, None, :])
-    # Of more outputs than averages, or of some that were computed from others, none is left.
+    # The matrix is singular with more outputs than averages, and with outputs computed from others.
     values, vectors = np.linalg.eigh(0.5 * (rho + np.conj(np.swapaxes(rho, 1, 2))))
     rho = np.einsum("kia,ka,kja->kij", vectors, np.maximum(values, _SMALLEST), np.conj(vectors))
     return rho * scale[:, :, None] * scale[:, None, :]
 
 
 def covariance(at: Averages, S: Complex[np.ndarray, "k p p"]) -> Complex[np.ndarray, "k p m p m"]:
-    """Covariance of the errors of all responses at one frequency."""
+    """Return the covariance of the errors of all responses at each line."""
     P = np.nan_to_num(at.P)
     return np.einsum("ikxa,ijkab,jkyb,kij->kixjy", P, at.V, np.conj(P), S, optimize=True)
 
@@ -244,13 +244,13 @@ def covariance(at: Averages, S: Complex[np.ndarray, "k p p"]) -> Complex[np.ndar
 def whitening(
     at: Averages, S: Complex[np.ndarray, "k p p"], used: Bool[np.ndarray, "k p m"]
 ) -> Complex[np.ndarray, "k r r"]:
-    """Factors that make rows of variance 1 of the errors of the responses that are used,
-    independent of one another at a line; the rows of the others are zero. r = p m."""
+    """Return factors that make the errors of the responses used white at each line; the rows of the
+    others are zero. r = p m."""
     k, p, m = used.shape
     taken = used.reshape(k, -1)
     C = covariance(at, S).reshape(k, p * m, p * m)
     size = np.sqrt(np.real(np.einsum("krr->kr", C)))
-    # A response that is not used is one of variance 1 that goes with no other.
+    # A response that is not used has variance 1 and no correlation.
     scale = np.where(taken & (size > 0), size, 1.0)
     both = taken[:, :, None] & taken[:, None, :]
     C = np.where(both, C / (scale[:, :, None] * scale[:, None, :]), 0.0)
@@ -259,7 +259,7 @@ def whitening(
 
 
 def partial_coherence(w: Windowed, at: Averages) -> Float[np.ndarray, "k p m"]:
-    """Partial coherence of each output with each input; 0 where inputs move as one."""
+    """Return the partial coherence of each output with each input; 0 where inputs move as one."""
     H = response_of(w, at, w.Y)
     left = (w.Y - np.einsum("wkm,kpm->wkp", w.U, np.nan_to_num(H))) * w.seen[:, None, :]
     density = np.sum(np.abs(left) ** 2, axis=0) / np.sum(w.seen, axis=0)
@@ -278,7 +278,7 @@ def pairs_used(
     coherence: Float[np.ndarray, "k p m"],
     sound: Bool[np.ndarray, "k p m"],
 ) -> Bool[np.ndarray, "k p m"]:
-    """The responses that take part, by frequency."""
+    """Return which responses are used, by frequency."""
     used = np.zeros(sound.shape, bool)
     omega = 2.0 * np.pi * w.hz
     everything = tuple(PairOptions(i, o) for i in w.inputs for o in w.outputs)
@@ -288,14 +288,14 @@ def pairs_used(
         at = (slice(None), w.outputs.index(pair.output), w.inputs.index(pair.input))
         low, high = pair.band or (0.0, np.inf)
         least = options.coherence if pair.coherence is None else pair.coherence
-        # The mean over an octave: a single frequency that reaches a limit by chance has too large
-        # a gain by the same chance.
+        # The mean over an octave: a line that exceeds a limit by chance has too large a gain by the
+        # same chance.
         enough = octave_mean(omega, coherence[at]) >= least
         used[at] = sound[at] & enough & (w.hz >= low * (1 - 1e-9)) & (w.hz <= high * (1 + 1e-9))
     return used
 
 
-# Numbers of these classes are arrays, NumPy's or JAX's once they are traced: Any or Array.
+# Fields of this class are arrays of NumPy, or of JAX once they are traced: Any.
 
 
 class ResponseWeights(NamedTuple):
@@ -303,21 +303,21 @@ class ResponseWeights(NamedTuple):
 
     windows: Windowed
     averages: Averages
-    """with zeros in place of what is not determined"""
+    """with zeros where they are not determined"""
     coherence: Any
     """(k, p, m) partial"""
     used: Any
-    """(k, p, m) which take part: asked for, and coherent enough"""
+    """(k, p, m) True for responses that are used"""
     density: Any
     """(k, p, p) the noise's spectral matrix, per Hz"""
     whitening: Any
-    """(k, r, r), r = p m: rows whose squares count for as much as a line is independent"""
+    """(k, r, r), r = p m: whitening times the root of `share`"""
     share: Any
-    """(k,) of each line how much of an independent one it is"""
+    """(k,) share of an independent line"""
 
     @property
     def log_determinant(self) -> float:
-        """Weights of the responses that take part, lines by their share."""
+        """Log-determinant of the weights of the responses used, lines by their share."""
         r = np.arange(self.whitening.shape[1])
         diagonal = np.real(np.asarray(self.whitening)[:, r, r])
         taken = np.asarray(self.used).reshape(diagonal.shape)
@@ -327,12 +327,12 @@ class ResponseWeights(NamedTuple):
 
     @property
     def numbers(self) -> float:
-        """Independent complex ones that take part."""
+        """Number of independent complex responses used."""
         return float(np.sum(np.asarray(self.share)[:, None, None] * np.asarray(self.used)))
 
     @property
     def numbers_of_noise(self) -> float:
-        """Independent real ones that the noise's spectrum is taken from."""
+        """Number of independent real values that the noise's spectrum is estimated from."""
         averages = np.maximum(self.windows.averages - len(self.windows.inputs), 1.0)
         seen = np.any(np.asarray(self.used), axis=2)
         return float(np.sum(2.0 * np.asarray(self.share)[:, None] * seen * averages))
@@ -344,8 +344,8 @@ class ResponseWeights(NamedTuple):
 
 
 def first_weights(problem: Problem, flights: Sequence[Flight]) -> ResponseWeights:
-    """The spectra of the measured signals alone: the noise is what no response explains of the
-    outputs.
+    """Return the weights of the measured signals: the noise is the part of the outputs that no
+    response explains.
 
     Raises:
         ValueError: windows, band or pairs do not fit the flights, or too little is left.
@@ -370,7 +370,7 @@ def first_weights(problem: Problem, flights: Sequence[Flight]) -> ResponseWeight
 
 
 def weighed(weights: ResponseWeights, density: Complex[np.ndarray, "k p p"]) -> ResponseWeights:
-    """The same with another spectrum of the noise."""
+    """Return the weights with another spectrum of the noise."""
     used = weights.used
     each = np.moveaxis(weights.averages.share, 0, 1)
     share = np.sum(each * used, axis=(1, 2)) / np.maximum(np.sum(used, axis=(1, 2)), 1)
@@ -421,10 +421,10 @@ def _require_numbers(problem: Problem, weights: ResponseWeights) -> None:
 
 
 def on_device(weights: ResponseWeights) -> ResponseWeights:
-    """The same, what a trace needs of it as JAX's arrays: copied once, not with every call."""
+    """Return the weights with arrays of JAX: they are copied once, and not with every call."""
     return jax.tree.map(lambda v: jax.device_put(v) if isinstance(v, np.ndarray) else v, weights)
 
 
 def back(weights: ResponseWeights) -> ResponseWeights:
-    """The same in NumPy."""
+    """Return the weights with arrays of NumPy."""
     return jax.tree.map(lambda v: np.asarray(v) if isinstance(v, jax.Array) else v, weights)

@@ -255,9 +255,6 @@ class Noise(NamedTuple):
     det(spectrum)"""
     whitening: Any = ()
     """frequency error: by record (K, p, p) the whitening matrices of its lines; () else"""
-    by_instrument: Any = ()
-    """frequency error: 1 where instruments weigh the errors, 0 where the model's own response does,
-    as it does until the search by instrument has somewhere to begin"""
     corrections: Any = ()
     """filter error: by parameter the slope of a correction of the likelihood, and where it is zero
     (2,), see `noise_scales`; () where the model integrates no sensor"""

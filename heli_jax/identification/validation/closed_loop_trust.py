@@ -88,8 +88,8 @@ def moved_by_feedback(at: Solution, poles: Sequence[float]) -> dict[str, float]:
 
 
 def _room_of_records(at: Solution) -> list[Float[np.ndarray, " K"]]:
-    """By record and line the part of the inputs that feedback may have brought in; empty if all
-    inputs are taken by instrument."""
+    """Return by record and line the part of the inputs that may be feedback; empty if all inputs
+    are taken by instrument."""
     layout, data, noise, _ = at
     joint, inputs = [], list(naming.asdict(data.flights[0].inputs))
     for record in records_of(layout):
@@ -110,13 +110,13 @@ def _room_of_records(at: Solution) -> list[Float[np.ndarray, " K"]]:
 
 
 def _room_of_responses(at: Solution) -> list[Float[np.ndarray, " k"]]:
-    """The same of fitted responses, by line of their windows."""
+    """Return this part for fitted responses, by line of their windows."""
     layout, data, noise, z = at
     w, density = noise.whitening.windows, np.asarray(noise.whitening.density)
     direct = np.array([n not in w.instruments for n in w.inputs])
     if not direct.any():
         return []
-    # A method of the estimator: its module stands above this one in the order of imports.
+    # A method of the objective: its module stands above this one in the order of imports.
     E = np.asarray(layout.objective.errors_in_windows(layout, data, noise, z))
     joint = np.concatenate([np.asarray(w.U), np.asarray(w.Y)], axis=2)
     S, See = (np.einsum("wka,wkb->kab", v, np.conj(v)) / len(v) for v in (joint, E))
@@ -128,7 +128,7 @@ def shares(
 ) -> Float[np.ndarray, " q"]:
     """Return the share that each unknown has of a part of the information, 0 to 1."""
     sd = np.sqrt(np.maximum(np.diagonal(whole), 1e-300))
-    # A parameter that is not determined has no standard deviation to be moved by.
+    # A parameter that is not identifiable has no standard deviation.
     covariance = np.linalg.pinv(whole / np.outer(sd, sd), rcond=1e-12, hermitian=True)
     of_part = np.diagonal(covariance @ (part / np.outer(sd, sd)) @ covariance)
     with np.errstate(all="ignore"):
@@ -141,14 +141,14 @@ def held_poles(at: Solution) -> list[float]:
     layout, data, *_, z = at
     if layout.noise_model != "spectrum" or layout.objective.fits_responses:
         return [0.0]
-    with np.errstate(divide="ignore"):  # what a sample forgets altogether
+    with np.errstate(divide="ignore"):  # modes at zero
         modes = np.log(np.linalg.eigvals(first_model(layout, data, z).Ad).astype(complex))
     held = []
     for names, flight in zip(layout.outputs, data.flights, strict=True):
         y = [np.asarray(flight.outputs[n]) for n in names]
         half = len(y[0]) // 2
         grown = max(float(np.nanstd(v[half:]) / max(np.nanstd(v[:half]), 1e-300)) for v in y)
-        # Alone it would grow by half of the e-foldings from one half to the other.
+        # Without a loop it would grow by half of the e-foldings from one half to the other.
         growing = modes[2 * half * np.real(modes) > _GROWS]
         alone = np.max(np.real(growing), initial=0.0)
         stays = alone > 0.0 and np.log(grown) < 0.5 * half * alone
@@ -159,18 +159,23 @@ def held_poles(at: Solution) -> list[float]:
 def _room(
     W: np.ndarray, S: np.ndarray, See: np.ndarray, direct: np.ndarray
 ) -> Float[np.ndarray, " k"]:
-    """By frequency the part of the input that a constant gain may have brought in, from the
-    whitening, the spectra of inputs and outputs together, those of the residual, and by input True
-    if it is taken for given (`direct`)."""
+    """Return by frequency the part of the input that feedback at a constant gain may bring in.
+
+    Args:
+        W: whitening (k, p, p).
+        S: spectra (k, m + p, m + p) of inputs and outputs.
+        See: spectra (k, p, p) of the residual.
+        direct: (m,) True for inputs that are not taken by instrument.
+    """
     m = S.shape[1] - See.shape[1]
     e, u = (np.real(np.einsum("kii->ki", v)) for v in (See, S[:, :m, :m]))
     u = np.where(u > 0, u, 1e-300)
     ratio = e[:, None, :] / u[:, :, None]
     white = np.real(np.einsum("kij,kjl,kil->k", W, S[:, m:, m:], np.conj(W))) / W.shape[1]
     seen = white > _SEEN if np.any(white > _SEEN) else np.ones(len(white), bool)
-    # The largest gain that leaves the input no less than it has, at any frequency.
+    # The largest gain at which feedback exceeds the input at no frequency.
     room = np.minimum(ratio / np.max(ratio[seen], axis=0)[None], 1.0).mean(axis=2)
-    # Each input by what it does: one that hardly acts moves no estimate.
+    # Inputs are weighted by their effect: one with little effect moves no estimate.
     H = np.swapaxes(np.linalg.pinv(S[:, :m, :m], rcond=1e-9, hermitian=True) @ S[:, :m, m:], 1, 2)
     effect = np.sum(np.abs(W @ np.conj(H)) ** 2, axis=1) * u
     room, effect = room[:, direct], effect[:, direct]
@@ -180,8 +185,8 @@ def _room(
 def information(
     at: Solution, weights: Sequence[Float[np.ndarray, " K"]]
 ) -> Float[np.ndarray, "q q"]:
-    """Information on the unknowns of interest, each frequency by its weight; weights by record, or
-    those of the windows of fitted responses."""
+    """Return the information on the unknowns of interest, each frequency times its weight; weights
+    by record, or one array for the lines of fitted responses."""
     layout, data, noise, z = at
     q = len(layout.of_interest)
     if not any(np.any(w) for w in weights):
@@ -198,28 +203,28 @@ def information(
             for W, w in zip(noise.whitening, weights, strict=True)
         )
     )
-    # The program of the fit, with other weights; the priors' rows are no information of these.
+    # The compiled function of the fit with other weights, without the rows of priors.
     J = np.asarray(residual_and_jacobian(layout, data, weighed, z).J)[:q, :q]
     return J.T @ J
 
 
-# Which estimates by instrument are not to be trusted: the excitation is weak where they show.
+# Estimates by instrument that are not trusted, since the excitation is weak at their frequencies.
 #
-# An input follows its excitation only where that has power. Elsewhere the estimate leans on what
-# chance makes of the coherence of both, and its interval with it: the more so of derivatives of the
-# speed, which show in a slow mode below the lowest frequency of a sweep.
+# An input follows its excitation only where that has power. Elsewhere estimate and interval rest on
+# chance coherence. This concerns speed derivatives most: their slow mode lies below the lowest
+# frequency of a sweep.
 #
-# Sources: Cragg and Donald (1993) for several inputs together: the least of their canonical
-# correlations with the instruments; Stock and Yogo (2005) for the limit of F.
+# Sources: Cragg and Donald (1993) for several inputs: the least canonical correlation with the
+# instruments; Stock and Yogo (2005) for the limit of F.
 
 
-_MOST = 0.25
-"""part of what is known of a parameter that may come of frequencies at which an instrument is
-weak"""
+_WEAK = 0.25
+"""part of a parameter's information from frequencies of a weak instrument, above which it is not
+trusted"""
 
 
 def weak_by_instrument(problem: Problem, at: Solution) -> tuple[str, ...]:
-    """The unknowns of interest of which instruments tell too little; () of a fit without any."""
+    """Return the unknowns of interest with too little information by instrument; () without any."""
     layout, data, noise, _ = at
     if layout.noise_model != "spectrum" or not instruments_of(problem):
         return ()
@@ -242,20 +247,25 @@ def weak_by_instrument(problem: Problem, at: Solution) -> tuple[str, ...]:
             for flight in (data.flights[r.flight] for r in records)
         ]
         followed, F = _followed(signals, [(r.first, r.last) for r in records])
-        direct = at._replace(noise=noise._replace(by_instrument=np.zeros(())))
+        flights = tuple(f._replace(by_instrument=None) for f in data.flights)
+        direct = at._replace(data=data._replace(flights=flights))
     weak = [g * (f < STRONG) for g, f in zip(followed, F, strict=True)]
     part, whole = information(direct, weak), information(direct, followed)
     each = zip(layout.of_interest, shares(part, whole), strict=True)
-    return tuple(n for n, share in each if share > _MOST)
+    return tuple(n for n, share in each if share > _WEAK)
 
 
 def _followed(
     signals: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]],
     spans: Sequence[tuple[int, int]],
 ) -> tuple[list[Float[np.ndarray, " K"]], list[Float[np.ndarray, " K"]]]:
-    """By record and line the least canonical correlation of the inputs with their instruments,
-    squared, and its F; by record are given its flight's inputs with what of them follows the
-    instruments (N,), and its first sample with that behind its last."""
+    """Return by record and line the least squared canonical correlation of the inputs with their
+    instruments, and its F.
+
+    Args:
+        signals: by record the inputs (N,) of its flight, and their parts that follow instruments.
+        spans: by record its first sample, and the one after its last.
+    """
     first = signals[0]
     names = [n for n, u in first[0].items() if np.any(np.asarray(u) != np.asarray(first[1][n]))]
     lines = []
@@ -272,7 +282,7 @@ def _followed(
         least = np.clip(np.min(np.real(values), axis=1), 0.0, 1.0 - 1e-12)
         width = np.maximum(LEAST, PART * np.arange(1, len(S) + 1))
         n = 2.0 * np.pi**0.5 * width * len(lines)
-        # What chance makes of it is no information.
+        # Chance correlation is no information.
         followed.append(np.maximum(least - m / n, 1e-6))
         F.append((n / m) * least / (1.0 - least))
     return followed, F

@@ -1,15 +1,15 @@
 """Excitation: the power of a signal that follows others, in bands of a record's lines.
 
 In a narrow band a response is a constant gain, so that least squares over the band's lines gives
-the power of a signal that follows others. Chance makes as much of it as the unknown gains do
-(Wilks, for complex normal errors). Three questions are asked in this way:
+the power of a signal that follows others. The likelihood ratio is compared with chance (Wilks, for
+complex normal errors). This gives
 
-- Do outputs follow what excites the vehicle: the logged excitation where inputs are taken by it,
-  else the inputs?
-- Does the residual of a model in frequency? That of the right model does not. Nothing is
-  simulated, so that the verdict holds for unstable vehicles, and gusts raise the noise and not the
-  test. By instrument it is the test of overidentification (Sargan, 1958).
-- Do inputs move together?
+- the part of the outputs that follows the excitation: the logged one where inputs are taken by
+  instrument, else the inputs;
+- the part of a residual in frequency that does, which is zero for the right model. Nothing is
+  simulated, so that it holds for unstable vehicles. By instrument it is the test of
+  overidentification (Sargan, 1958);
+- the coherence between inputs.
 
 Sources: Sargan (1958); Goodman (1963) for complex normal errors; Ljung, System Identification
 (1999), 16.6, for residuals against inputs; Bendat and Piersol, Random Data (2010), chapter 7, for
@@ -38,13 +38,13 @@ from heli_jax.identification.unknowns.layout import Solution
 LEVEL = 0.01
 """of the test of all outputs together"""
 _FIRST, _GROWTH = 12, 1.15
-"""lines of the lowest band, and how much wider the next one is"""
+"""lines of the lowest band, and the ratio of the widths of one band and the next"""
 _LOW, _HIGH = 0.05, 0.95
-"""parts of an input's power between which its band lies"""
+"""parts of an input's power below the edges of its band"""
 _LEAST_POWER = 1e-3
-"""of an input's largest density of power: below that it does not excite"""
+"""least density of power that excites, as a part of an input's largest"""
 _SEEN = 0.8
-"""part of an output's samples that has to be measured: the holes are bridged by straight lines"""
+"""least part of an output's samples that is measured: gaps are bridged by straight lines"""
 _ROUNDING = 1e-6
 """part of the inputs' power below which a combination of them is rounding"""
 
@@ -53,10 +53,10 @@ class Followed(NamedTuple):
     """The part of a signal that follows the excitation."""
 
     p_value: float
-    """probability that noise alone follows as much"""
+    """probability that noise follows as much by chance"""
     explained: float
-    """part of an output's power that follows; of a residual, part of the power that follows of the
-    output which the model explains"""
+    """part of an output's power that follows the excitation; for a residual, the part of that power
+    which the model explains"""
     by_chance: float = 0.0
     """standard deviation of that part"""
 
@@ -66,30 +66,30 @@ class Pair(NamedTuple):
 
     inputs: tuple[str, str]
     coherence: float
-    """the other inputs taken out, averaged by the power that both have"""
+    """partial, in the mean over frequencies weighted by the power that both have"""
 
 
 class Excitation(NamedTuple):
-    """The inputs of some flights, and what follows them."""
+    """Inputs of some flights, and the outputs that follow them."""
 
     powers: dict[str, tuple[float, float]]
-    """by input that moves, the band [Hz] that holds 90 % of its power"""
+    """by input that moves, the band [Hz] of 90 % of its power"""
     outputs: dict[str, Followed]
-    """by output; without those that lack samples or never move, and where records are too short"""
+    """by output; without those that lack samples or never move; empty for short records"""
     pairs: tuple[Pair, ...]
-    """of the inputs that move, the most alike first"""
+    """of the inputs that move, the most coherent first"""
 
 
 def excitation_of(problem: Problem) -> Excitation:
-    """Return what the inputs of the fitted flights excite."""
+    """Return the excitation of the fitted flights."""
     flights, by = problem.training, instruments_of(problem)
-    # A flight at rest has lines without power, among which those of another would be few in a band.
+    # The lines of a flight at rest would leave too few lines of other flights in a band.
     flown = [f for f in flights if any(np.ptp(u) > 0 for u in f.inputs.values())]
     if not flown:
         return Excitation({}, {}, ())
     names = [n for n in flown[0].inputs if any(np.ptp(f.inputs[n]) > 0 for f in flown)]
     lines = [lines_of(np.stack([f.inputs[n] for n in names], 1)) * f.dt**0.5 for f in flown]
-    # The lines of all flights in one order, as if of one record.
+    # The lines of all flights in one order, as if from one record.
     each = zip(flown, lines, strict=True)
     hz = np.concatenate([np.arange(1, len(v) + 1) / (f.n_samples * f.dt) for f, v in each])
     order = np.argsort(hz, kind="stable")
@@ -106,7 +106,7 @@ def excitation_of(problem: Problem) -> Excitation:
 
 
 def _outputs(flights: Sequence[Flight], by: Sequence[str]) -> dict[str, Followed]:
-    """By output the part that follows the excitation."""
+    """Return by output the part that follows the excitation."""
     sums: dict[str, np.ndarray] = {}
     for flight in flights:
         X = _drives(flight, by)
@@ -114,8 +114,8 @@ def _outputs(flights: Sequence[Flight], by: Sequence[str]) -> dict[str, Followed
         measured = {n: y for n, y in measured.items() if np.ptp(y) > 0}
         if X is None or not measured:
             continue
-        # What ends elsewhere than it began, as a slow mode does, has its leap at all lines: what is
-        # left above a straight line between its ends is asked, too.
+        # A signal that ends elsewhere than it began, as a slow mode does, has a jump, which is in
+        # all lines: the test is also made without a straight line between its ends.
         above = [y - np.linspace(y[0], y[-1], y.size) for y in measured.values()]
         for k, v in enumerate((list(measured.values()), above)):
             y = lines_of(np.stack(v, axis=1))
@@ -127,7 +127,7 @@ def _outputs(flights: Sequence[Flight], by: Sequence[str]) -> dict[str, Followed
             for name, statistics in zip(measured, totals, strict=True):
                 sums.setdefault(name, np.zeros((2, 4)))[k] += statistics
     return {
-        # Of two questions about one record.
+        # Two tests of one record (Bonferroni).
         name: Followed(
             min(1.0, 2.0 * float(np.min(scipy.special.chdtrc(s[:, 1], s[:, 0])))),
             float(np.max(s[:, 2] / np.maximum(s[:, 3], 1e-300))),
@@ -140,8 +140,8 @@ def _outputs(flights: Sequence[Flight], by: Sequence[str]) -> dict[str, Followed
 def _drives(
     flight: Flight, by: Sequence[str], part: slice = slice(None)
 ) -> Complex[np.ndarray, "K m"] | None:
-    """The lines of what excites a part of a flight: the logged excitation of the inputs `by` which
-    it is taken, else the inputs; None if nothing moves."""
+    """Return the transform of the excitation of a part of a flight: the logged one of the inputs
+    `by` instrument, else the inputs; None if nothing moves."""
     drives = [flight.instruments[n] if n in by else u for n, u in flight.inputs.items()]
     moving = [v[part] for v in drives if np.ptp(v[part]) > 0]
     return lines_of(np.stack(moving, axis=1)) if moving else None
@@ -157,7 +157,7 @@ def _bridged(y: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
 
 
 def _pairs(X: Complex[np.ndarray, "K m"], moving: Sequence[str]) -> tuple[Pair, ...]:
-    """The coherence of each two inputs, from the inverse of their spectra in each band."""
+    """Return the coherence of each two inputs, from the inverse of their spectra in each band."""
     powers, coherences, m = list[np.ndarray](), list[np.ndarray](), len(moving)
     for band in _band_slices(*X.shape):
         S = X[band].T @ np.conj(X[band])
@@ -166,7 +166,7 @@ def _pairs(X: Complex[np.ndarray, "K m"], moving: Sequence[str]) -> tuple[Pair, 
         P = np.linalg.pinv(S / np.outer(size, size), rcond=_ROUNDING, hermitian=True)
         own = np.real(np.diag(P))
         part = np.abs(P) ** 2 / np.maximum(np.outer(own, own), 1e-300)
-        # Less what chance makes of so many lines.
+        # Less the coherence that is expected by chance.
         n = band.stop - band.start - m + 2
         coherences.append(np.clip((n * part - 1.0) / (n - 1), 0.0, 1.0))
     if not powers:
@@ -174,7 +174,7 @@ def _pairs(X: Complex[np.ndarray, "K m"], moving: Sequence[str]) -> tuple[Pair, 
     parts = np.stack(powers) / np.maximum(np.sum(powers, axis=0), 1e-300)
     pairs = []
     for a, b in itertools.combinations(range(m), 2):
-        # Where both have power: that is where each could be taken for the other.
+        # Where both have power, the effect of one can be taken for that of the other.
         weights = np.minimum(parts[:, a], parts[:, b])
         values = np.stack(coherences)[:, a, b]
         mean = float(weights @ values / max(float(np.sum(weights)), 1e-300))
@@ -183,7 +183,7 @@ def _pairs(X: Complex[np.ndarray, "K m"], moving: Sequence[str]) -> tuple[Pair, 
 
 
 def _band_slices(lines: int, m: int) -> Iterator[slice]:
-    """Bands of a number of lines, each wide enough for m excitations."""
+    """Yield bands of lines, each wide enough for m excitations."""
     first, size = 0, float(max(_FIRST, 4 * m))
     while first + int(size) <= lines:
         yield slice(first, first + int(size))
@@ -191,8 +191,8 @@ def _band_slices(lines: int, m: int) -> Iterator[slice]:
 
 
 def least_rough(flights: Sequence[Flight]) -> tuple[str, float]:
-    """Return the output that shows most of a motion, and its mean squared step from sample to
-    sample over that of white noise (von Neumann).
+    """Return the smoothest output, and its mean squared step from sample to sample over that of
+    white noise (von Neumann).
 
     Args:
         flights: with one output at least.
@@ -242,10 +242,10 @@ def errors_against_excitation(
         # Records of one length share their whitening.
         if id(W) not in sizes:
             root = np.linalg.inv(np.asarray(W))
-            # Of one size over each band, as chance is taken to be: by the noise's own spectrum.
+            # The test assumes noise of constant power in each band: divide by the noise's spectrum.
             sizes[id(W)] = np.sqrt(np.sum(np.abs(root) ** 2, axis=2))
         bands = _in_bands(np.stack([e, y], axis=2), X, sizes[id(W)])
-        # Not the model's response: a wrong model's may be larger than anything that was measured.
+        # Not the model's response: that of a wrong model may be larger than the measured output.
         asked, scale = bands.asked, bands.scale
         powers = np.sum((asked * scale)[:, :, None] * bands.followed, axis=0)
         chance = np.sum(asked * bands.rank * (scale * bands.per_line[:, :, 0]) ** 2, axis=0)
@@ -264,32 +264,32 @@ def errors_against_excitation(
 
 
 class _Bands(NamedTuple):
-    """Powers of signals in bands, each by output and signal of it."""
+    """Powers of signals in bands, by output and signal."""
 
     lines: Float[np.ndarray, "b 1"]
     rank: Float[np.ndarray, "b p"]
     """of the excitation"""
     whole: Float[np.ndarray, "b p c"]
     parts: Float[np.ndarray, "b p c"]
-    """that least squares explains by the excitation"""
+    """explained by the excitation"""
     scale: Float[np.ndarray, "b p"]
-    """mean square of what the signals were divided by"""
+    """mean square of the divisors of the signals"""
     excited: Bool[np.ndarray, " b"]
-    """where an excitation has power"""
+    """True where an excitation has power"""
 
     @property
     def per_line(self) -> Float[np.ndarray, "b p c"]:
-        """Power that is not explained, by line."""
+        """Power that is not explained, per line."""
         return np.maximum(self.whole - self.parts, 0.0) / (self.lines - self.rank)[:, :, None]
 
     @property
     def followed(self) -> Float[np.ndarray, "b p c"]:
-        """The power that follows the excitation, less what chance makes."""
+        """Power that follows the excitation, less that expected by chance."""
         return self.parts - self.rank[:, :, None] * self.per_line
 
     def test(self) -> Float[np.ndarray, "p 2"]:
-        """By output the likelihood ratio of its first signal with and without the excitation, and
-        its degrees of freedom."""
+        """Return by output the likelihood ratio of its first signal with and without the
+        excitation, and its degrees of freedom."""
         asked, n, m = self.asked, self.lines, self.rank
         share = self.parts[:, :, 0] / np.where(asked, self.whole[:, :, 0], np.inf)
         statistic = np.where(asked, -(2.0 * n - m - 1.0) * np.log1p(-share), 0.0)
@@ -299,7 +299,7 @@ class _Bands(NamedTuple):
 
     @property
     def asked(self) -> Bool[np.ndarray, "b p"]:
-        """True if the first signal is more than what follows the excitation."""
+        """True if the first signal has a part that does not follow the excitation."""
         return (self.rank > 0) & (self.whole[:, :, 0] > self.parts[:, :, 0])
 
 
@@ -308,16 +308,16 @@ def _in_bands(
     X: Complex[np.ndarray, "K m"],
     size: Float[np.ndarray, "K s"] | None = None,
 ) -> _Bands:
-    """Explain signals by an excitation in each band.
+    """Regress signals on an excitation in each band.
 
     Args:
-        size: of each output, or (s = 1) of all; one unless given.
+        size: divisors of each output, or (s = 1) of all; one unless given.
     """
     size = np.ones((len(X), 1)) if size is None else size
     found = list[tuple[_Bands, np.ndarray]]()
     for band in _band_slices(*X.shape):
         over = 1.0 / size[band].T
-        # All outputs side by side: each has excitations of its own size.
+        # All outputs at once: each divides the excitation by its own size.
         Q, R = np.linalg.qr(X[None, band] * over[:, :, None])
         along = np.abs(np.einsum("pii->pi", R))
         kept = along > 1e-9 * np.max(along, axis=1, initial=0.0, keepdims=True)

@@ -1,4 +1,4 @@
-"""Flights held out: predicted with the estimates, their own initial states and biases adjusted."""
+"""Held-out flights: predictions with the estimates, and tests in frequency."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -34,31 +34,30 @@ from heli_jax.identification.validation.excitation import LEVEL, errors_against_
 
 
 class Validation(NamedTuple):
-    """Flights held out, at the optimum of what is their own."""
+    """Held-out flights, at the optimum of their initial states and biases."""
 
     e: Evaluation
     free_run: tuple[dict[str, np.ndarray], ...] | None
-    """with windows: by flight and output the simulation (N,) in one piece from the initial state of
-    the first window, with the bias; None without windows"""
+    """with windows: by flight and output the simulation (N,) without windows, from the initial
+    state of the first one; None without windows"""
 
 
 def validate(
     problem: Problem, layout: Layout, z: Array, noise: Noise, held: tuple[Flight, ...]
 ) -> Validation:
-    """Predict the flights held out with the estimates; only their initial states (of every window)
-    and biases are adjusted, by least squares.
+    """Predict held-out flights with the estimates; only their initial states (of every window) and
+    biases are fitted.
 
     Args:
         z: (q,) the optimum of the fitted flights in `layout`.
     """
-    # What is shared stands first in z and in the same order, whichever flights there are.
+    # Shared unknowns are first in z and in the same order, whichever flights there are.
     other = layout_of(problem, held)
-    # What no line of a spectrum knows, the initial states and biases, shows in time alone.
+    # Initial states and biases are in no line of a spectrum, but in time.
     if other.objective.noise_model == "spectrum":
         other = replace(other, objective=objective_of("output-error"))
     data, first = data_of(problem, held, other), layout.first_nuisance
-    # From any point a linear model's are found in one step, so zero, the middle of their weak
-    # priors, will do.
+    # Those of a linear model are found in one step from any point, also from zero.
     begin = jnp.zeros(other.size - first, z.dtype)
     if not problem.model.linear:
         begin = start_vector(other, data, problem)[first:]
@@ -70,8 +69,7 @@ def validate(
     else:
         full = in_time(other, data, their_noise, full)
     e = evaluate(other, data, their_noise, full)
-    # With windows the agreement is that of many short runs. How far the model is good for by itself
-    # only a run in one piece shows.
+    # With windows the agreement is that of many short simulations; one without windows shows drift.
     free_run = None
     if any(count > 1 for count, _ in other.windows):
         one_piece, whole = _in_one_piece(other, full)
@@ -80,10 +78,9 @@ def validate(
 
 
 def _noise_of(problem: Problem, layout: Layout, noise: Noise, held: tuple[Flight, ...]) -> Noise:
-    """The noise of the flights held out: what was estimated where all flights share it, else a
-    guess from their own records."""
-    # A spectrum is that of flights with the same outputs, which those held out need not be; in time
-    # it is not asked for.
+    """Return the noise of held-out flights: the estimate if all flights share it, else a guess from
+    their own records."""
+    # A spectrum needs flights with the same outputs, and is not needed in time.
     in_rows = layout.noise_model != "spectrum"
     guess = first_noise(problem, held) if in_rows else first_noise_sizes(problem, held)
     if layout.noise_model != "disturbance":
@@ -96,78 +93,76 @@ def _noise_of(problem: Problem, layout: Layout, noise: Noise, held: tuple[Flight
 
 
 def _in_one_piece(layout: Layout, z: Array) -> tuple[Layout, Array]:
-    """The same without windows: each flight from the initial state of its first."""
-    # Of each flight's entries in z the first window's state stays, and the biases and offsets.
+    """Return layout and unknowns without windows, with the initial state of the first window."""
+    # Each flight keeps the state of its first window, the biases and the offsets.
     kept = [np.arange(layout.first_nuisance)]
     for places in flight_places(layout):
         kept += [places.states[0], places.constants]
-    # As long as one window that holds them all.
     windows = tuple((1, count * m) for count, m in layout.windows)
     return replace(layout, windows=windows, continuity=None), z[np.concatenate(kept)]
 
 
-# Flights held out, judged in frequency: nothing is simulated, so that unstable models can be
-# judged too, and gusts raise the noise and not the doubt.
+# Tests of held-out flights in frequency. Nothing is simulated, so that they hold for unstable
+# models too, and gusts raise the noise.
 #
-# Each flight gets a spectrum of its own residual and is asked two questions. Would it, by itself,
-# give other estimates? One step of Gauss and Newton from the fit's, in the flight's own noise, is
-# compared with the errors of both (Chow's test). And does the model explain what follows the
-# excitation, as is asked of the fitted flights?
+# Each flight has its own noise spectrum. One Gauss-Newton step from the fit's estimates to the
+# flight's own is compared with the errors of both (Chow's test). And the residual must not follow
+# the excitation by more than the output does.
 #
 # Source: Chow (1960).
 
 
 _ROUNDS = 3
-"""of the flight's noise"""
+"""iterations for the spectrum of the flight's noise"""
 _NO_EFFECT = 1e-10
-"""part of the largest size below which a direction has no effect"""
+"""eigenvalue over the largest one, below which a direction has no effect"""
 _SURE = 0.05
-"""sd of the explained share by chance, above which it is not reported"""
+"""largest sd of an explained part that is reported"""
 
 
 class Furthest(NamedTuple):
-    """The parameter whose estimate from a flight is the furthest from the fit's."""
+    """The parameter whose estimate from a flight is furthest from that of the fit."""
 
     parameter: str
     own: float
-    """from the flight by itself, after one step [SI]"""
+    """estimate from the flight alone, after one step [SI]"""
     fitted: float
     sds: float
     """joint standard deviations between the two"""
 
 
 class HeldOutFlight(NamedTuple):
-    """A flight held out."""
+    """A held-out flight."""
 
     flight: str
     estimates_p_value: float | None
-    """the chance that errors alone make the flight's own estimates as far from the fit's; null
-    where the flight says nothing of them"""
+    """probability that the flight's own estimates are as far from those of the fit by chance; null
+    if they cannot be compared"""
     furthest: Furthest | None
     explained: dict[str, float]
     """by output the part that the model explains of the power that follows the excitation; below 0
-    it is worse than no model; only where gusts leave at most 0.05 of it to chance"""
+    it is worse than no model; only if its sd is at most 0.05"""
     worse: tuple[str, ...]
-    """the outputs that a model without any response would explain better"""
+    """outputs that a model without any response explains better"""
 
     @property
     def differs(self) -> bool:
-        """True if the flight gives other estimates."""
+        """True if the flight's own estimates differ."""
         return self.estimates_p_value is not None and self.estimates_p_value < LEVEL
 
 
 class HeldOutFrequency(NamedTuple):
-    """The flights held out of a fit in frequency."""
+    """Held-out flights of a fit in frequency."""
 
     flights: tuple[HeldOutFlight, ...]
     not_judged: tuple[str, ...]
-    """the flights that cannot be compared with the fitted ones"""
+    """flights that cannot be compared with the fitted ones"""
 
 
 def validate_in_frequency(
     problem: Problem, at: Solution, e: Evaluation, held: Sequence[Flight], *, feedback: bool
 ) -> HeldOutFrequency | None:
-    """Judge the flights held out of a fit in frequency; None of a fit in time.
+    """Test held-out flights of a fit in frequency; None for a fit in time.
 
     Args:
         feedback: True if inputs follow the outputs and no instrument is used.
@@ -188,8 +183,8 @@ def validate_in_frequency(
 
 
 def _comparable(problem: Problem, at: Solution, flight: Flight, *, feedback: bool) -> Flight | None:
-    """The flight with the outputs that can be judged; None if there are none, no instrument moves,
-    or inputs follow the outputs and no instrument is used."""
+    """Return the flight with the outputs that can be compared; None if there are none, no
+    instrument moves, or inputs follow the outputs and no instrument is used."""
     by = instruments_of(problem)
     if feedback or (by and not any(np.ptp(flight.instruments.get(n, [0.0])) > 0 for n in by)):
         return None
@@ -205,15 +200,15 @@ def _comparable(problem: Problem, at: Solution, flight: Flight, *, feedback: boo
 def _judged(
     problem: Problem, at: Solution, fitted: Evaluation, label: str, flight: Flight
 ) -> HeldOutFlight | None:
-    """One flight; None if its errors have no spectrum."""
-    # At the lines of the whole flight, also after a fit of responses.
+    """Test one flight; None if its errors have no spectrum."""
+    # At the lines of the full flight, also after a fit of responses.
     problem = replace(problem, method="frequency-error")
     layout = layout_of(problem, (flight,))
     data, noise = data_of(problem, (flight,), layout), first_noise(problem, (flight,))
     first, q = layout.first_nuisance, len(layout.of_interest)
     z = jnp.zeros(layout.size, at.z.dtype).at[:first].set(at.z[:first])
     if not layout.model.linear:
-        # Such a model is linearised where the nuisances put it.
+        # The nuisances are part of the point of linearisation.
         z = z.at[first:].set(start_vector(layout, data, problem)[first:])
         z = in_time(layout, data, noise, z)
     for _ in range(_ROUNDS):
@@ -222,7 +217,7 @@ def _judged(
         return None
     there = Solution(layout, data, noise, z)
     made = residual_and_jacobian(*there)
-    # A row for each parameter and one for the rest of the errors; the priors are no news.
+    # A row for each parameter and one for the rest of the errors, without those of priors.
     r, J = np.asarray(made.r)[: q + 1], np.asarray(made.J)[: q + 1, :q]
     by = instruments_of(problem) if data.flights[0].by_instrument is not None else ()
     errors = jax.device_get(errors_of_lines(*there).errors)
@@ -237,11 +232,11 @@ def _judged(
 def _own_estimates(
     r: Float[np.ndarray, " r"], J: Float[np.ndarray, "r q"], at: Solution, fitted: Evaluation
 ) -> tuple[float | None, Furthest | None]:
-    """The chance that the flight's own estimates lie as far from the fit's, and the furthest; None
-    where the two have no direction in common.
+    """Return the p-value of the difference of the flight's own estimates, and the furthest one;
+    None if the two determine no direction in common.
 
     Args:
-        r: the flight's errors, in units of its own noise.
+        r: errors of the flight over its noise.
     """
     names, values = at.layout.of_interest, np.asarray(fitted.named)
     of_fit, slopes = np.asarray(fitted.J, float)[:, : len(names)], np.asarray(fitted.slopes)
@@ -255,7 +250,7 @@ def _own_estimates(
     kept = sums > _NO_EFFECT * sums[-1]
     root = vectors[:, kept] / np.sqrt(sums[kept])
     shares, turned = np.linalg.eigh(root.T @ own @ root)
-    # A direction that only one of the two determines cannot be compared.
+    # Directions that only one of the two determines cannot be compared.
     both = (shares > _NO_EFFECT) & (shares < 1.0 - _NO_EFFECT)
     if not both.any():
         return None, None
