@@ -117,7 +117,7 @@ def test_nothing_is_written_over(run):
 
 
 def test_a_figure_of_the_report_is_drawn(run):
-    assert run.figure("response_roll").axes[0].get_title("left").startswith("roll")
+    assert run.figure("response_roll").axes[0].get_ylabel().startswith("roll")
     with pytest.raises(ValueError, match=r"expected one of .*response_roll.*got 'roll'"):
         run.figure("roll")
 

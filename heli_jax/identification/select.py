@@ -65,7 +65,7 @@ class Alternatives(NamedTuple):
 
 
 class _Form(NamedTuple):
-    """What a candidate assumes."""
+    """Assumptions of a candidate."""
 
     axes: tuple[str, ...]
     """disturbed axes or states"""

@@ -177,11 +177,11 @@ def test_noise_of_the_gyros_is_a_random_walk_of_the_angle():
 def test_what_no_sensor_shows_is_refused():
     rates = dict.fromkeys("pqr", np.linspace(-100.0, 80.0, 50))
     flight = Flight(dt=0.1, inputs=rates, outputs={"phi": np.zeros(50)})
-    with pytest.raises(InputError, match=r"a: p reaches 100 rad/s, .*: is its unit another\?"):
+    with pytest.raises(InputError, match=r"a: p reaches 100 rad/s, .*: check its unit"):
         prepared(kinematics.attitude, flight, "a")
     dead = Flight(dt=0.1, inputs={}, outputs={"psi": np.full(50, 0.5)})
-    with pytest.raises(InputError, match=r"a: psi is 0\.5 in all samples, expected one that moves"):
+    with pytest.raises(InputError, match=r"a: psi is 0\.5 in all samples"):
         prepared(kinematics.attitude, dead, "a")
     far = Flight(dt=0.1, inputs={}, outputs={"theta": np.linspace(0, 30, 50)})
-    with pytest.raises(InputError, match=r"theta reaches 1719 deg, .*: is its unit another\?"):
+    with pytest.raises(InputError, match=r"theta reaches 1719 deg, "):
         prepared(kinematics.attitude, far, "a")

@@ -58,7 +58,7 @@ def test_what_cannot_be_told_is_refused():
     with pytest.raises(NotAligned, match="hardly correlated"):
         lag_between(*noise)
     waves = [signal(t, np.sin(6 * t) + 0.1 * rng.standard_normal(t.size)) for _ in range(2)]
-    with pytest.raises(NotAligned, match="explain nearly the same"):
+    with pytest.raises(NotAligned, match="fit nearly equally"):
         lag_between(*waves)
     x = motion(3)(t)
     with pytest.raises(NotAligned, match="against one another"):

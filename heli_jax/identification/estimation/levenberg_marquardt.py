@@ -191,7 +191,9 @@ def gain_ahead(
         return np.inf
     if not moves.any():
         return 0.0
-    Q, R, _ = scipy.linalg.qr(J, mode="economic", pivoting=True)
+    # Any: the stubs know no economic factors.
+    factors: Any = scipy.linalg.qr(J, mode="economic", pivoting=True)
+    Q, R, _ = factors
     sizes = np.abs(np.diag(R))
     return float(np.sum(np.square(Q[:, : sizes.size][:, sizes > _RANK].T @ r)))
 
