@@ -1,9 +1,9 @@
-"""Rates of a log beside the modes of the model, at the start values or the estimates.
+"""Sampling rates of a log against the modes of the model, at the start values or the estimates.
 
-Two rates count. Outputs that are sampled at less than twice the frequency of a mode show its
-aliases. An input that was sampled while it moved is known at its samples alone: between them a
-straight line misses a part (pi f / rate)^2 / 3 of a motion at f, a staircase pi f / rate of it. At
-twice the frequency nothing is left of the motion; at five times a line misses a seventh.
+Outputs that are sampled at less than twice the frequency of a mode show its aliases. An input that
+moves between its samples is known at the samples alone: a straight line misses a part
+(pi f / rate)^2 / 3 of a motion at f, a staircase pi f / rate. At twice the frequency nothing of the
+motion is left; at five times the frequency a line misses a seventh.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,32 +27,30 @@ from heli_jax.numerics.white_noise import white_part
 @dataclass(frozen=True)
 class _Limits:
     hopeless: float = 2.0
-    """samples in a period of a mode, below which it is not seen"""
+    """samples in a period of a mode, below which it is not visible"""
     settled: float = 1.0
-    """the same for a mode that does not swing: in 2 pi of its time constants it is over"""
+    """the same for a mode that does not oscillate, whose period is 2 pi time constants"""
     enough: float = 5.0
-    """samples in a period of a mode, from which on it is seen"""
+    """samples in a period of a mode, from which on it is visible"""
     shows: float = 3.0
-    """times the noise by which a mode moves an output, from which on it matters"""
+    """motion of an output by a mode over its noise, from which on the mode matters"""
     part: float = 0.1
-    """of an output's own motion, from which on a mode matters whatever the noise is guessed to be:
-    a guess from slow samples takes the motion between them for noise"""
+    """the same over the output's motion, since the noise guessed from slow samples is too large"""
     regular: float = 0.8
-    """part of the steps of a staircase that have the usual length, from which on it is a slow
-    clock"""
+    """least share of the steps of a staircase that have the usual length, for a slow clock"""
     slower: float = 1.05
-    """steps of the grid, from which on a topic's own is longer"""
+    """step of a topic over that of the grid, from which on it is longer"""
     bends: int = 8
-    """samples in a row at which straight lines bend: of more each is a sample of the signal"""
+    """samples in a row at which straight lines bend; if more, each is a sample of the signal"""
     levels: int = 10
-    """distinct values of a staircase at least: a commanded sequence of steps has fewer"""
+    """fewest distinct values of a staircase; commanded steps have fewer"""
     steps: int = 20
-    """likewise its steps"""
+    """fewest steps of a staircase"""
     fast_share: float = 0.005
     """part of an input's power above a quarter of its rate, from which on it may move between its
     samples"""
     falls: float = 0.5
-    """its power density there over that of the octave below, likewise"""
+    """power density there over that of the octave below, likewise"""
 
 
 RATE = _Limits()
@@ -168,12 +166,11 @@ def rates_against_modes(
 def _modes_that_show(
     problem: Problem, params: Any, flight: Flight, noise: Mapping[str, Any]
 ) -> Iterator[_Mode]:
-    """Yield those whose part in the response to a step of an input's size stands out."""
+    """Yield the modes that show in the response to a step of an input's size."""
     sizes = {}
     for name, y in flight.outputs.items():
         own = RATE.part * float(np.nanstd(y))
         sizes[name] = RATE.shows * float(noise[name])
-        # One that stays where it is shows no mode, however small its noise seems.
         if name not in flight.sd and own > 0:
             sizes[name] = min(sizes[name], own)
     known = {n: jnp.asarray(v) for n, v in flight.known.items()}
@@ -181,11 +178,10 @@ def _modes_that_show(
     behind = states_behind(problem.model)
     vehicle = [n not in behind for n in naming.names(problem.model.State)]
     for k, eigenvalue in enumerate(modes.eigenvalues if modes is not None else ()):
-        # Slower than the record is a drift, and a pair of integrators is no oscillation.
+        # A mode slower than the record is a drift.
         if modes is None or abs(eigenvalue) < 2.0 * np.pi / (flight.n_samples * flight.dt):
             continue
-        # A filter's own mode has no part in the vehicle. Its constants are known, and it is no
-        # motion that a log would have to show.
+        # The mode of a filter alone is known.
         right = modes.right[:, k]
         if np.linalg.norm(right[vehicle]) < 1e-6 * np.linalg.norm(right):
             continue
@@ -211,8 +207,7 @@ def input_rate(flight: Flight, name: str, u: Float[np.ndarray, " N"]) -> float |
     at = np.flatnonzero(np.diff(u) != 0)
     if at.size < RATE.steps or np.unique(u).size < RATE.levels:
         return None
-    # A slow clock's staircase: all stairs of one length but for the sample that rounding adds. What
-    # a pilot or a generator commands in steps is held unequally.
+    # All steps of a slow clock's staircase have one length, but for rounding.
     stairs = np.diff(at)
     usual = float(np.median(stairs))
     regular = np.mean(np.abs(stairs - usual) <= max(1.0, 0.05 * usual))
@@ -224,7 +219,7 @@ def input_rate(flight: Flight, name: str, u: Float[np.ndarray, " N"]) -> float |
 def _corner_rate(dt: float, u: np.ndarray) -> float:
     """Return the rate of the samples between which an input follows straight lines."""
     bends = np.abs(np.diff(u, 2))
-    # Of most samples: a single absurd one would make the stick's own corners look like rounding.
+    # A quantile: one outlier would make the corners look like rounding.
     low, high = np.quantile(u, [0.01, 0.99])
     corners = np.flatnonzero(bends > 1e-6 * ((high - low) or np.ptp(u)))
     if corners.size < RATE.steps:
@@ -251,8 +246,7 @@ def power_between_samples(flight: Flight, name: str) -> tuple[float, float] | No
     """Return the rate [Hz] of an input, and the part of its power above a quarter of it; None if
     that power falls off before half of the rate.
 
-    A controller that runs faster than the log moves its input between the samples, by what it saw
-    of the response there.
+    A controller that runs faster than the log moves its input between the samples.
     """
     u = flight.inputs[name]
     # Held because somebody said so: then it is known between its samples.
@@ -269,23 +263,21 @@ def power_between_samples(flight: Flight, name: str) -> tuple[float, float] | No
     return (rate, share) if share > RATE.fast_share and last > RATE.falls * before else None
 
 
-# Modes that the samples cannot show, and the free parameters that move them.
+# Modes past the Nyquist frequency, and the free parameters that move them.
 #
-# Samples at a rate f show a mode at w + 2 pi f as they show one at w. So an optimum whose mode lies
-# past the Nyquist frequency is one of many that fit as well, each with a narrow interval.
+# Samples at a rate f do not distinguish w + 2 pi f from w. So an optimum with a mode past the
+# Nyquist frequency is one of many that fit as well, each with a narrow interval.
 
 
 _NEAR = 0.8
-"""part of the Nyquist frequency from which on the samples hardly show a mode, and an alias beyond
-it fits as well"""
+"""part of the Nyquist frequency, from which on an alias of a mode fits as well"""
 _MOVED = 1e-6
-"""relative change of a mode, for a relative change of a parameter, that is none"""
+"""relative change of a mode for that of a parameter, below which the mode is known"""
 _TURNED = 0.2
-"""the same of its frequency from which on a parameter can take the mode to an alias; a frequency
-that goes with the parameter's root has 0.5"""
+"""relative change of its frequency, from which on a parameter can move the mode to an alias; 0.5 if
+the frequency goes with the parameter's root"""
 _SWINGS = 10.0
-"""frequency over decay of a mode that is called a swing, however soon it is over: its cycle is lost
-between the samples, and any other frequency past them fits as well"""
+"""frequency over decay, above which a mode oscillates even if it decays within a sample"""
 _STEP = 1e-4
 """relative step of the parameters for these changes"""
 
@@ -306,7 +298,7 @@ def measurement_noise(
     problem: Problem, sd: Sequence[Mapping[str, Any]]
 ) -> tuple[dict[str, float], ...]:
     """Return by flight and output the sd of the noise in residuals without what a model misses."""
-    # What a wrong optimum misses passes for noise in its residuals, and would hide its fast mode.
+    # The residuals of a wrong optimum are larger than the noise, and would hide its fast mode.
     return tuple(
         {n: max(min(float(s), white_part(flight.outputs[n])), 1e-300) for n, s in one.items()}
         for flight, one in zip(problem.training, sd, strict=True)
@@ -322,7 +314,7 @@ def fast_modes(
 
     Args:
         values: of the free parameters, SI; gains and shifts among them move no mode.
-        noise: sd by flight and output, SI; without it nothing is said to be undetermined.
+        noise: sd by flight and output, SI; None leaves `undetermined` empty.
     """
     fast = []
     for i, flight in enumerate(problem.training):
@@ -340,14 +332,13 @@ def fast_modes(
         past &= np.any([np.abs(s) > _MOVED for s in slopes.values()], axis=0)
         if not past.any():
             continue
-        # What is gone within a sample swings in none, under any alias, unless it swings many times
-        # before it is gone: then its frequency was told by nothing.
+        # A mode that decays within a sample has no visible alias, unless it oscillates many times.
         lost = past & ((decay * flight.dt < 1.0) | (swing > decay * _SWINGS))
         lost &= [
             noise is not None and modes.strongest(k, problem, flight, noise[i])[0] >= RATE.shows
             for k in range(lost.size)
         ]
-        # A prior excludes the alias; the modes of a delay are an approximation's.
+        # A prior excludes the alias; the modes of a delay are those of its approximation.
         undetermined = tuple(
             n
             for n, s in slopes.items()

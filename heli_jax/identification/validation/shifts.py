@@ -33,10 +33,9 @@ from heli_jax.identification.unknowns.layout import Data, Solution
 @dataclass(frozen=True)
 class _ShiftLimits:
     clear: float = 25.0
-    """gain of twice the log-likelihood, from which on another time is clear: 5 sd, so that of a
-    hundred candidates one is clear by chance in 20,000 records"""
+    """gain of twice the log-likelihood, from which on a shift is significant: 5 sd"""
     farthest: float = 0.5
-    """[s] that a signal is moved at most"""
+    """[s] largest shift"""
     block: float = 1.0
     """[s] over which rows may be correlated"""
 
@@ -48,8 +47,8 @@ class Shift(NamedTuple):
     """Signals at another time."""
 
     kind: str
-    """input or output: it is logged late; response: that to an input comes later than the model
-    makes it; hold: inputs are held that were taken as linear"""
+    """input, output: logged late; response: to an input, later than in the model; hold: inputs are
+    held that were taken as linear"""
     names: tuple[str, ...]
     seconds: float
     """by which the first of them is late"""
@@ -74,8 +73,7 @@ def shift_in_time(
         return None
     inputs = naming.names(problem.model.Inputs)
     moving = [n for n in inputs if any(np.ptp(f.inputs[n]) > 0 for f in problem.training)]
-    # A held input is a linear one that is late by half a sample, but for terms of second order in
-    # the sample time; a command that changes at every sample is taken for a linear one.
+    # To first order in the sample time a held input is a linear one that is late by half a sample.
     guessed = [n for n in moving if all(_linear_by_guess(f, n) for f in problem.training)]
     signals = [*(("input", n) for n in moving), *(("output", n) for n in outputs)]
     found = {one: _best_place(at, e, *one) for one in [*signals, *(("hold", n) for n in guessed)]}
@@ -96,7 +94,7 @@ def shift_in_time(
 
 
 def _linear_by_guess(flight: Flight, name: str) -> bool:
-    """True if an input is taken as linear, which nobody stated and no low-pass made so."""
+    """True if an input is taken as linear by a guess, and was not low-passed."""
     linear = flight.hold[name] == "linear" and name in flight.hold_reason
     return linear and not is_low_passed(flight, name)
 
