@@ -32,12 +32,11 @@ _FILES = (
 )
 _DB = 20.0 / np.log(10.0)
 _SURE = 0.3
-"""of a response, random error up to which it is usable: what a coherence of 0.6 makes of five
-averages, the least for an interval to mean something"""
+"""largest relative random error of a usable response: of five averages at a coherence of 0.6"""
 _TOO_LARGE = 2.0
-"""chi-squared per degree of freedom from which on a transfer function is called too simple"""
+"""chi-squared per degree of freedom from which on the order of a transfer function is too low"""
 _NEAR_ZERO = 0.1
-"""of a pole's size, within which a zero all but cancels it"""
+"""relative distance of a zero that nearly cancels a pole"""
 
 
 def write_responses(
@@ -102,7 +101,7 @@ def write_responses(
 
 
 def _averages(responses: FlightResponses, request: Wanted) -> str:
-    """Describe the averages of the response that a transfer function is fitted to."""
+    """Return the number of averages of a fitted response as text."""
     output = responses.outputs.get(request.output)
     return NOTHING if output is None else number(output.averages, 3)
 
@@ -124,7 +123,7 @@ def _draw(responses: FlightResponses, units: Mapping[str, str], input: str, outp
 
 
 def table(responses: FlightResponses) -> dict[str, Any]:
-    """A row for each frequency of each pair: the columns of responses.csv."""
+    """Return the columns of responses.csv, with a row for each pair and frequency."""
     parts: dict[str, list[Any]] = {}
     omega = responses.omega
     for name, output in responses.outputs.items():
@@ -151,19 +150,18 @@ def table(responses: FlightResponses) -> dict[str, Any]:
 
 
 def transfer_status(fit: TransferFit | str) -> str:
-    """In the words of fit.json: converged, not-identifiable or not-converged."""
+    """Return converged, not-identifiable or not-converged, as in fit.json."""
     if isinstance(fit, str):
         return "not-identifiable"
     if not fit.converged:
         return "not-converged"
-    # A search that arrived is no result where a number is not determined.
     delay = () if fit.delay is None else (fit.delay,)
     known = all(c.determined for c in (*fit.numerator, *fit.denominator, *delay))
     return "converged" if known else "not-identifiable"
 
 
 def _content(request: Wanted, fit: TransferFit | str, window: float) -> dict[str, Any]:
-    """One entry of transfer_functions.json; what the response does not determine has no number."""
+    """Return an entry of transfer_functions.json."""
     status, found = transfer_status(fit), None if isinstance(fit, str) else fit
     numerator: list[dict[str, float]] = [{}] * (request.zeros + 1)
     denominator: list[dict[str, float]] = [{}] * request.poles
@@ -192,7 +190,7 @@ def _content(request: Wanted, fit: TransferFit | str, window: float) -> dict[str
 
 
 def _roots_of(roots: np.ndarray, of: Sequence[Coefficient]) -> list[list[float]] | None:
-    """Real and imaginary part of each; roots of coefficients that are not known are no numbers."""
+    """Return real and imaginary part of each root; None if a coefficient is not determined."""
     return [[r.real, r.imag] for r in roots] if all(c.determined for c in of) else None
 
 
@@ -244,7 +242,7 @@ def fit_sentences(fit: TransferFit | str, window: float) -> list[str]:
 
 
 def _cancelled(fit: TransferFit) -> list[complex]:
-    """The poles with a zero of its own within a tenth of their size."""
+    """Return the poles that a zero nearly cancels."""
     zeros, beside = list(fit.zeros), []
     for pole in fit.poles:
         distances = [abs(pole - zero) for zero in zeros]
@@ -258,7 +256,7 @@ FIT_HEAD = ("numerator", "denominator", "poles [rad/s]", "delay [ms]", "chi² pe
 
 
 def fit_row(fit: TransferFit | str) -> tuple[str, ...]:
-    """Numerator, denominator, delay with their sd, poles, chi-squared and J, as text."""
+    """Return the cells of `FIT_HEAD`."""
     if isinstance(fit, str):
         return ("not fitted", *("–" for _ in FIT_HEAD[1:]))
     delay = "–" if fit.delay is None else _measured(fit.delay, 1e3)
@@ -281,8 +279,7 @@ def _polynomial(coefficients: tuple[Coefficient, ...], lead: str) -> str:
 
 
 def _roots(fit: TransferFit) -> str:
-    """Poles as frequency and damping of a pair, or as a number: as transfer functions are written
-    in handling qualities."""
+    """Return poles as text: frequency and damping of a pair, or a number."""
     if not all(c.determined for c in fit.denominator):
         return "not determined"
     return _root_words(fit.poles)
@@ -331,7 +328,7 @@ def useful_band(omega: np.ndarray, pair: Pair) -> tuple[str, str, str]:
 
 def write_netcdf(path: Path, responses: FlightResponses, units: Mapping[str, str]) -> None:
     """Write responses.nc; `units` are SI, of inputs and outputs by name."""
-    # Here: it takes long to load, for this file alone.
+    # Slow to import.
     import xarray as xr
 
     outputs = responses.outputs
@@ -348,7 +345,7 @@ def write_netcdf(path: Path, responses: FlightResponses, units: Mapping[str, str
 
     H, parts = stacked("H"), "in the coordinate unit, output over input"
     sd = f"of the real and of the imaginary part, {parts}"
-    # An attribute is that of all pairs; where these differ the coordinate `unit` has each.
+    # The attribute has a unit only if all pairs share it.
     every = {u for row in unit for u in row}
     one = every.pop() if len(every) == 1 else None
     together = "coherence with all inputs together"
@@ -385,7 +382,7 @@ def write_netcdf(path: Path, responses: FlightResponses, units: Mapping[str, str
 
 
 def quotient(output: str, input: str) -> str:
-    """The unit of output over input."""
+    """Return the unit of output over input."""
     if input == "1":
         return output
     return f"{output}/({input})" if "/" in input else f"{output}/{input}"

@@ -94,7 +94,7 @@ class Column:
         """from the least to the largest value drawn"""
 
     def edges(self, count: int) -> np.ndarray:
-        """Edges of so many even cells, or of one for each of few values, ascending."""
+        """Return edges of even cells, or of one cell for each value of a grid, ascending."""
         if self.few and self.distinct.size > 1:
             between = 0.5 * (self.distinct[1:] + self.distinct[:-1])
             first, last = 2 * self.distinct[0] - between[0], 2 * self.distinct[-1] - between[-1]
@@ -103,7 +103,7 @@ class Column:
         return (np.geomspace if self.log else np.linspace)(*self.view, count + 1)
 
     def scale(self, ax: Axes, which: Which, ends: ArrayLike) -> None:
-        """Give an axis of a panel its scale, limits, ticks and label."""
+        """Set scale, limits, ticks and label of an axis of a panel."""
         low, *_, high = map(float, np.asarray(ends))
         ax.set(**{f"{which}lim": (low, high)})
         axis = ax.xaxis if which == "x" else ax.yaxis
@@ -124,13 +124,13 @@ class Table:
         self.size, self.n_ok = ok.size, int(np.count_nonzero(ok))
         lots = _by_lot(np.flatnonzero(ok), DRAWN), _by_lot(np.flatnonzero(~ok), DRAWN // 2)
         self.elements = np.sort(np.concatenate(lots))
-        """which elements, ascending, (n,)"""
+        """indices of the drawn elements, ascending, (n,)"""
         self.ok = ok[self.elements]
         self.results = results(ds)
         self._columns: dict[str, Column] = {}
 
     def column(self, name: str) -> Column:
-        """An axis or a result, read when it is first asked for."""
+        """Return an axis or a result, read once."""
         if name not in self._columns:
             axis = name in self._ds.attrs["axes"]
             self._columns[name] = Column(self._ds[name], self.elements, self.ok, axis=axis)
@@ -138,16 +138,16 @@ class Table:
 
     @property
     def axes(self) -> list[Column]:
-        """The axes that have a finite value."""
+        """Axes with a finite value."""
         return [c for c in map(self.column, self._ds.attrs["axes"]) if not c.empty]
 
     def failed(self, *columns: Column) -> np.ndarray:
-        """Elements that are not ok where these columns are finite, not too many."""
+        """Return elements that are not ok where these columns are finite, at most `_MARKS`."""
         where = np.logical_and.reduce([~self.ok, *(c.finite for c in columns)])
         return _by_lot(np.flatnonzero(where), _MARKS)
 
     def head(self, figure: Figure, what: str, *notes: str) -> None:
-        """Title with the number of elements that are ok, and what is drawn below it."""
+        """Write the title, with the number of elements that are ok, and the legend."""
         failed = self.size - self.n_ok
         lot = f"{self.elements.size} drawn, by lot" if self.elements.size < self.size else ""
         marks = "red marks: not ok" + (f" ({_MARKS} of {failed})" if failed > _MARKS else "")
@@ -156,18 +156,15 @@ class Table:
 
     @property
     def nothing(self) -> str:
-        """Reason why there is no number to draw."""
+        """Text of an empty panel."""
         return "no finite value" if self.n_ok else "no element is ok"
 
 
 def write_figures(directory: Path, ds: xr.Dataset) -> list[Path]:
-    """Write slices-RESULT and maps-RESULT of the first six results as PNG and SVG into a
-    directory, which is made; returns the files.
-    """
-    # One table for all figures: each column is read once.
+    """Write slices-RESULT and maps-RESULT of the first results as PNG and SVG; return the files."""
     table, written = Table(ds), []
     directory.mkdir(parents=True, exist_ok=True)
-    # One after another: a figure that is written is let go before the next is drawn.
+    # One after another, for memory.
     for result, stem in stems(table.results[:RESULTS]).items():
         for draw in (slices, maps):
             path = directory / f"{draw.__name__}-{stem}"
@@ -179,7 +176,7 @@ def write_figures(directory: Path, ds: xr.Dataset) -> list[Path]:
 
 
 def stems(names: Sequence[str]) -> dict[str, str]:
-    """A different file name for each name, on file systems that fold case too."""
+    """Return a file name for each name, unique without regard to case."""
     stems: dict[str, str] = {}
     for name in names:
         first = stem = re.sub(r"[^\w-]", "_", name)[:50]
@@ -193,7 +190,7 @@ def stems(names: Sequence[str]) -> dict[str, str]:
 
 
 def results(ds: xr.Dataset) -> list[str]:
-    """The results that are drawn: those with a number for each element, or for each and flight."""
+    """Return the results with a number for each element, or for each element and flight."""
     return [
         str(n)
         for n, v in ds.data_vars.items()
@@ -204,16 +201,14 @@ def results(ds: xr.Dataset) -> list[str]:
 
 
 def slices(table: Table, result: str) -> Figure | None:
-    """A result against each axis: dots, and the median with a 5-95 % band in bins of equal count.
+    """Draw a result against each axis: dots, and the median with a 5-95 % band in bins.
 
-    An axis with few values has a bin for each. None where there is no element, no axis, or no
-    number for each element.
+    None without an axis, or if the result is not drawn.
     """
     axes = table.axes[:_SLICES]
     if result not in table.results or not axes:
         return None
     y = table.column(result)
-    # Four panels are two rows of two, and no row of three with one alone.
     columns = {1: 1, 2: 2, 4: 2}.get(len(axes), 3)
     figure, panels = _panels(len(axes), columns, 2.9 if columns == 1 else 2.3)
     shown = _by_lot(np.flatnonzero(y.used), _DOTS)
@@ -225,7 +220,7 @@ def slices(table: Table, result: str) -> Figure | None:
             ax.fill_between(middle, low, high, **band)
             marks = {"marker": "o", "ms": 3.5} if x.few else {}
             ax.plot(middle, median, color=style.BLUE, lw=1.5, zorder=4, label="median", **marks)
-        # What failed has no result to be placed by: it is marked at the foot of the panel.
+        # Failed elements are marked at the foot of the panel.
         failed = table.failed(x)
         foot = np.full(failed.size, 0.03)
         _crosses(ax, x.values[failed], foot, transform=ax.get_xaxis_transform(), marker="|")
@@ -253,7 +248,7 @@ def slices(table: Table, result: str) -> Figure | None:
 
 
 def _with_margin(y: Column) -> tuple[float, float]:
-    """A view with some room to either side: the marks of what failed lie there."""
+    """Return the view with a margin."""
     low, high = y.view
     if y.log:
         wide = (high / low) ** 0.07
@@ -262,8 +257,8 @@ def _with_margin(y: Column) -> tuple[float, float]:
 
 
 def _binned(x: Column, y: Column) -> tuple[np.ndarray, np.ndarray] | None:
-    """Medians of an axis (b,) in bins of equal count, or at each of few values, with quantiles 5,
-    50 and 95 % of a result (3, b); None for fewer than two bins."""
+    """Return medians of an axis (b,) in bins of equal count, or its grid, and quantiles 5, 50 and
+    95 % of a result (3, b); None for fewer than two bins."""
     order = np.flatnonzero(x.used & y.used)
     order = order[np.argsort(x.values[order])]
     along, values = x.values[order], y.values[order]
@@ -272,31 +267,29 @@ def _binned(x: Column, y: Column) -> tuple[np.ndarray, np.ndarray] | None:
     else:
         count = min(_BINS, along.size // _A_BIN)
         starts = np.linspace(0, along.size, count + 1).astype(int)[:-1]
-        # Equal values stay together: an element's bin shall not hang on the order of the sweep.
+        # Equal values are in one bin.
         starts = np.unique(np.searchsorted(along, along[starts]))
     if starts.size < 2:
         return None
-    # Quantiles and not mean and sd: a few runs that nearly diverge would move both out of the
-    # panel.
     parts = [np.quantile(part, [0.05, 0.5, 0.95]) for part in np.split(values, starts[1:])]
     return np.array([np.median(p) for p in np.split(along, starts[1:])]), np.array(parts).T
 
 
 def maps(table: Table, result: str) -> Figure | None:
-    """The median of a result over each pair of axes. None as for `slices`, and for one axis."""
+    """Draw the median of a result over each pair of axes; None for fewer than two axes."""
     every = list(itertools.combinations(table.axes, 2))
     if result not in table.results or not every:
         return None
-    # All pairs of four axes rather than one axis with many.
+    # All pairs of the first axes.
     pairs = sorted(every, key=lambda p: max(map(table.axes.index, p)))[:_PAIRS]
     z = table.column(result)
     columns = min(len(pairs), 2)
     figure, panels = _panels(len(pairs), columns, 3.2 if columns == 1 else 2.5)
-    # About four elements a cell: the median of fewer is as rough as they are.
+    # About four elements a cell.
     k = int(np.clip(np.sqrt(np.count_nonzero(z.used) / 4), 4, _CELLS))
     grids = [(x.edges(k), y.edges(k)) for x, y in pairs]
     medians = [_medians(x, y, z, grid) for (x, y), grid in zip(pairs, grids, strict=True)]
-    # One scale for all panels, so that a colour means one value; a few cells far off do not count.
+    # One scale for all panels, without outliers.
     values = np.concatenate([m[np.isfinite(m)] for m in medians])
     low, high = np.quantile(values, [0.01, 0.99]) if values.size else (0.0, 1.0)
     norm = LogNorm(low, high) if low > 0.0 and high > _WIDE * low else None
@@ -330,7 +323,7 @@ def maps(table: Table, result: str) -> Figure | None:
 
 
 def _medians(x: Column, y: Column, z: Column, grid: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """The median of z in each cell, (cells of x, cells of y); NaN where there is none."""
+    """Return the median of z in each cell, (cells of x, cells of y); NaN if it is empty."""
     use = x.used & y.used & z.used
     if not use.any():
         return np.full([e.size - 1 for e in grid], np.nan)
@@ -339,7 +332,7 @@ def _medians(x: Column, y: Column, z: Column, grid: tuple[np.ndarray, np.ndarray
 
 
 def _panels(count: int, columns: int, height: float) -> tuple[Figure, list[Axes]]:
-    """Panels in rows, each of a height [inch]."""
+    """Return a figure and its panels in rows of a height [inch]."""
     rows = -(-count // columns)
     figure = style.figure(0.6 + rows * height)
     every = figure.subplots(rows, columns, squeeze=False).ravel()
@@ -349,15 +342,14 @@ def _panels(count: int, columns: int, height: float) -> tuple[Figure, list[Axes]
 
 
 def _dots(ax: Axes, x: np.ndarray, y: np.ndarray) -> None:
-    """Elements, the fainter the more there are."""
-    # Many are pixels in an SVG, or a browser takes seconds to draw them.
+    """Draw elements as dots, many of them as pixels in an SVG."""
     size, alpha = (4.5, 0.8) if x.size <= 50 else (3.0, 0.6) if x.size <= 300 else (2.0, 0.45)
     look = {"ms": size, "mew": 0, "alpha": alpha, "color": style.PALE, "zorder": 1}
     ax.plot(x, y, "o", rasterized=x.size > 50, label="_elements", **look)
 
 
 def _crosses(ax: Axes, x: np.ndarray, y: np.ndarray, **looks: Any) -> None:
-    """Marks of elements that are not ok."""
+    """Mark elements that are not ok."""
     if x.size:
         look = {"ls": "", "marker": "x", "mew": 0.7, "ms": 4.0, "alpha": 0.7, "zorder": 3, **looks}
         colour = {"color": style.VERMILLION, "rasterized": x.size > 50, "clip_on": False}
@@ -374,17 +366,16 @@ def _not_finite(table: Table, y: Column) -> str:
 
 
 def _by_lot(elements: np.ndarray, most: int) -> np.ndarray:
-    """At most so many of the elements, drawn by lot."""
+    """Return at most `most` of the elements, a random choice."""
     if elements.size <= most:
         return elements
-    # Not every k-th: of a grid that would show a few values of an axis alone. The seed is always
-    # the same, so that a figure that is drawn again is the same.
+    # Every k-th element of a grid would show a few values of an axis only.
     return elements[np.sort(np.random.default_rng(0).choice(elements.size, most, replace=False))]
 
 
 def _numbers(variable: xr.DataArray, elements: np.ndarray) -> np.ndarray:
-    """A number (n,) for each of some elements, ascending: the mean over flights, NaN where it is
-    not finite. Numbers that no picture can hold are taken as infinite, or as zero."""
+    """Return a number (n,) for each of some elements, ascending: the mean over flights, NaN if it
+    is not finite or too large for Matplotlib."""
     parts = []
     for which, part in chunks_of(variable):
         first, last = np.searchsorted(elements, [which.start, which.stop])
@@ -393,7 +384,6 @@ def _numbers(variable: xr.DataArray, elements: np.ndarray) -> np.ndarray:
     if values.ndim > 1:
         with np.errstate(invalid="ignore", over="ignore"):
             values = values.mean(axis=1)
-    # Matplotlib multiplies and divides them, which near the ends of float64 makes infinities.
     sizes = np.abs(values)
     return np.where(sizes < 1e100, np.where(sizes > 1e-100, values, 0.0), np.nan)
 
@@ -405,7 +395,7 @@ _KINDS = {
     "slices": ("{} against each axis", "dots, and the median with a 5 to 95 % band"),
     "maps": ("{} over pairs of axes", "colours: median of the elements in each cell"),
 }
-"""by what a figure's file begins with: its title, and what it draws"""
+"""title and caption of a figure by the beginning of its file name"""
 
 
 def write_page(path: Path, directory: Path, title: str) -> None:
@@ -437,7 +427,7 @@ def _results(content: dict[str, Any]) -> tables.Table:
 
 
 def _elements(content: dict[str, Any]) -> tables.Table:
-    """Result, whether worst or best, value, and where it lies: a column for each axis."""
+    """Return the worst and best elements of each result, with their axes."""
     listed = [
         (name, words, pretty(content["results"].get(name, {}).get("unit")), element)
         for words in ("worst", "best")
@@ -447,14 +437,13 @@ def _elements(content: dict[str, Any]) -> tables.Table:
     axes = list(dict.fromkeys(axis for *_, e in listed for axis in e["axes"]))
     rows = []
     for name, words, unit, e in listed:
-        # `number` writes a dash for what is not there.
         value, *places = (number(v, _DIGITS) for v in (e.get("value"), *map(e["axes"].get, axes)))
         rows.append((name, words, value, unit, str(e["element"]), *places))
     return tables.Table(("result", "which", "value", "unit", "element", *axes), rows)
 
 
 def _pictures(content: dict[str, Any], folder: Path) -> Iterator[tuple[Picture, str]]:
-    """The figures with their captions: titles in words, and what they show in numbers."""
+    """Yield the figures with their captions."""
     for name, stem in stems(list(content["results"])).items():
         result = content["results"][name]
         unit, ends = pretty(result.get("unit")), (number(result.get(k), 3) for k in ("min", "max"))

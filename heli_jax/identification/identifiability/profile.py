@@ -1,10 +1,9 @@
 """Profile likelihood: the likelihood along one parameter with all other unknowns at their best.
 
 A parameter is held at values further and further from the optimum. Its 95 % interval ends where the
-deviance (twice the loss of log-likelihood, priors included) passes the point of chi-squared with
-one degree of freedom. A fit does this for each parameter whose interval by the slopes is wide: the
-slopes at the optimum of a record with little information may bound a parameter that the likelihood
-does not.
+deviance (twice the loss of log-likelihood, priors included) passes the point of chi-squared. A fit
+does this for each parameter whose interval by the slopes is wide: the slopes at the optimum of a
+record with little information may bound a parameter that the likelihood does not.
 """
 
 import math
@@ -13,6 +12,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+import scipy.special
 
 from heli_jax.identification.estimation.evaluation import Evaluation, pseudoinverse
 from heli_jax.identification.estimation.levenberg_marquardt import measured_count
@@ -158,12 +158,17 @@ def profile_wide_intervals(
     # What is open already follows any other unknown.
     J = np.array(e.J, np.float64)
     J[:, [i for i, n in enumerate(verdict.names) if n in lacking]] = 0.0
+    wide = [
+        (i, u)
+        for i, u in enumerate(unknowns_of(problem, at.layout, e))
+        if not (u.name in lacking or u.at_bound or reaches[i] >= _INFLATED * Z95)
+        and _is_wide(problem, u, float(sds[i] * reaches[i]))
+    ]
+    # Simultaneous intervals: single ones of three wide parameters covered 85 % (50 of 59 records).
+    together = math.sqrt(scipy.special.chdtri(max(len(wide), 1), 0.05)) / Z95
     limits, one_sided = {}, []
-    for i, u in enumerate(unknowns_of(problem, at.layout, e)):
-        reach = float(reaches[i])
-        skipped = u.name in lacking or u.at_bound or reach >= _INFLATED * Z95
-        if skipped or not _is_wide(problem, u, float(sds[i]) * reach):
-            continue
+    for i, u in wide:
+        reach = together * float(reaches[i])
         line = _line(at, Rows(np.asarray(e.r), J), i)
         ends = [_end(problem, line, e, u, side, reach) for side in (-1, 1)]
         bounded = [t for t in ends if t is not None]
