@@ -168,8 +168,7 @@ def _losses(frames: Frames, main: MainFrames) -> tuple[Finding, ...]:
 # An unsigned field has the same bits.
 
 _LONGEST_JUMP = 10_000_000
-"""Longest step between frames [us], as in the firmware's own tools; a longer one is a read error.
-"""
+"""Longest step between frames [us], as in the firmware's tools; a longer one is a read error."""
 
 
 class Runs(NamedTuple):
