@@ -1,9 +1,9 @@
-"""Is the lag between two logs as sure as its standard deviation says?
+"""Accuracy of the standard deviation of the lag between two logs.
 
     .venv/bin/python experiments/alignment.py [RUNS]
 
-The same random motion on two clocks with jitter, of several rates, bands and noise; RUNS (100) of
-each.
+The same random motion is logged on two clocks with jitter, with several rates, bands and noise
+levels; RUNS (100) of each.
 """
 
 import numpy as np
@@ -23,7 +23,7 @@ CASES = [
 
 
 def one(seed: int, rates: tuple[int, int], fastest: float, noise: tuple[float, float]):
-    """The lag that was found, and the true one [s]."""
+    """Return the estimated lag, and the true one [s]."""
     rng = np.random.default_rng(seed)
     w, phase = 2 * np.pi * rng.uniform(0.05, fastest, 100), rng.uniform(0, 2 * np.pi, 100)
     size = rng.standard_normal(100)

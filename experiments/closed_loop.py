@@ -1,13 +1,13 @@
-"""What feedback does to estimates: bias against loop gain and gusts.
+"""Effect of feedback on estimates: bias over loop gain and gusts.
 
     .venv/bin/python experiments/closed_loop.py [RUNS] [delay]
 
-A roll machine, p' = Lp p + Lda da + gusts, flown by a pilot who holds the bank angle with a delay
-of 0.1 s and adds test steps. Each record is fitted by output error and by filter error with a
-disturbance on roll; the table has the mean relative error of Lp and Lda over the runs, and in how
-many of them the loop was detected. With `delay` the aileron acts 60 ms after the stick, and the
-fits have that delay free as well, from the five starts that a free delay has. The frequency domain
-is in closed_loop_frequency.py.
+A vehicle in roll, p' = Lp p + Lda da + gusts, is flown by a pilot who holds the bank angle with a
+delay of 0.1 s and adds test steps. Each record is fitted by output error, and by filter error with
+a disturbance on roll. The table has the mean relative error of Lp and Lda over the runs, and the
+number of runs in which the loop was detected. With `delay` the aileron acts 60 ms after the stick.
+That delay is then free too, with the five starts of a free delay. The frequency domain is in
+closed_loop_frequency.py.
 """
 
 from typing import Annotated, Any, NamedTuple
@@ -69,18 +69,18 @@ DISTURBED = with_disturbance(ROLL, "roll")
 TRUTH = {"Lp": -4.0, "Lda": 25.0}
 DELAY = "delay_da"
 ACTS = 3
-"""samples after which the aileron moves, with `delay`"""
+"""Delay of the aileron with `delay` [samples]."""
 DELAYED = with_delays(ROLL, inputs=["da"])
 DELAYED_DISTURBED = with_disturbance(DELAYED, "roll")
 
 
 def record(gain: float, gust: float, seed: int, acts: int = 0) -> Flight:
-    """A record flown with the pilot's gain [rad/rad] in gusts of a standard deviation [rad/s^2].
+    """Return a record with the pilot's gain [rad/rad] and the gusts' standard deviation [rad/s^2].
 
-    The aileron acts so many samples after the stick.
+    The aileron acts `acts` samples after the stick.
     """
     rng = np.random.default_rng(seed)
-    # States, the stick held, and the gust as it is over one sample.
+    # States, held stick, and gust, constant over one sample.
     A = np.zeros((4, 4))
     A[0] = [TRUTH["Lp"], 0.0, TRUTH["Lda"], 1.0]
     A[1, 0] = 1.0
@@ -101,7 +101,7 @@ def record(gain: float, gust: float, seed: int, acts: int = 0) -> Flight:
 
 
 def estimates(flight: Flight, truth: dict[str, float]) -> dict[str, dict[str, float]]:
-    """By method the relative errors of all parameters; NaN where it did not converge."""
+    """Return the relative errors of all parameters by method; NaN if not converged."""
     free = {"Lp": Free(-2.0), "Lda": Free(10.0)}
     bare, disturbed, values = ROLL, DISTURBED, asdict(Params())
     if DELAY in truth:

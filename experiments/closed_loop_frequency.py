@@ -1,12 +1,12 @@
-"""The R-50 in closed loop in the frequency domain: by instrument, direct, and by filter error.
+"""The R-50 in closed loop in the frequency domain: with instruments, directly, and by filter error.
 
     .venv/bin/python experiments/closed_loop_frequency.py [RUNS] [METHODS]
 
-Each of RUNS (40) runs has four records of 90 s: a pilot who only just keeps the hover, a sweep of
-0.05 to 4 Hz that is added to one cyclic stick and logged, gusts on six axes. 14 derivatives of the
-attitude, 6 of the speed and the delays of both sticks are free and start up to a factor of 1.5 off.
-The records are made with SciPy's matrix exponentials. The folder of --out keeps a line a fit, so
-that a run that was stopped goes on where it was.
+Each of RUNS (40) runs has four records of 90 s. A pilot barely keeps the hover, a logged sweep of
+0.05 to 4 Hz is added to one cyclic stick, and gusts act on six axes. Free are 14 derivatives of the
+attitude, 6 of the speed and the delays of both sticks, with starts off by up to a factor of 1.5.
+The records are made with SciPy's matrix exponentials. The folder of --out stores a line for each
+fit, so that an interrupted run can continue.
 """
 
 import functools
@@ -34,7 +34,7 @@ SPEED = ("Xu", "Yv", "Lu", "Lv", "Mu", "Mv")
 DELAYS = {"delay_lat": 0.033, "delay_lon": 0.047}
 OUTPUTS = ("u", "v", "p", "q", "phi", "theta")
 GUSTS = 1.0
-"""factor of the turbulence of r50_record.py"""
+"""Factor of the turbulence of r50_record.py."""
 
 
 class Step(NamedTuple):
@@ -44,7 +44,7 @@ class Step(NamedTuple):
     now: np.ndarray
     before: np.ndarray
     whole: np.ndarray
-    """d of each input"""
+    """Delay d of each input [samples]."""
     L: np.ndarray
 
 
@@ -67,7 +67,7 @@ def step() -> Step:
         before[:, j], now[:, j] = after @ early[:, j], rest_of[:, j]
     assert model.noise_intensity is not None
     g = np.array([float(v) for v in naming.asdict(model.noise_intensity(params)).values()])
-    # Van Loan (1978): the covariance that the noise adds in one sample.
+    # Van Loan (1978): covariance of the noise of one sample.
     E = scipy.linalg.expm(np.block([[-A, np.diag(g**2)], [np.zeros((n, n)), A.T]]) * DT)
     values, vectors = np.linalg.eigh(E[n:, n:].T @ E[:n, n:])
     return Step(Ad, now, before, whole, vectors * np.sqrt(np.maximum(values, 0.0)))
@@ -75,8 +75,10 @@ def step() -> Step:
 
 @functools.cache
 def pilot() -> np.ndarray:
-    """Gains (4, 13) of a quadratic regulator to which sticks are dear: it mirrors what is unstable
-    and leaves the rest nearly as it is."""
+    """Return gains (4, 13) of a quadratic regulator with expensive sticks.
+
+    It mirrors unstable modes and hardly changes the others.
+    """
     one = step()
     A, B = one.A[:13, :13], (one.now + one.before)[:13]
     weights = {"phi": 1.0, "theta": 1.0, "p": 0.05, "q": 0.05, "u": 0.01, "v": 0.01}
@@ -89,12 +91,12 @@ def pilot() -> np.ndarray:
 def sweep(N: int) -> np.ndarray:
     t = DT * np.arange(N)
     fade = np.minimum(1.0, np.minimum(t, t[::-1]) / 2.0)
-    # From a sine, so that it begins at zero.
+    # Starts as a sine, so that the first value is zero.
     return SWEEP * fade * scipy.signal.chirp(t, BAND[0], t[-1], BAND[1], "logarithmic", -90)
 
 
 def record(seed: int, stick: str) -> Flight:
-    """A flight in closed loop with a sweep on one stick, logged as that stick's instrument."""
+    """Return a flight in closed loop with a sweep on one stick, logged as its instrument."""
     model, one, rng = turbulent(), step(), np.random.default_rng(seed)
     N, n, names = round(SECONDS / DT), step().A.shape[0], naming.names(turbulent().Inputs)
     added = np.zeros((N, 4))
@@ -105,7 +107,7 @@ def record(seed: int, stick: str) -> Flight:
     for k in range(N):
         states[k] = x
         sticks[k] = added[k] - pilot() @ x[:13]
-        # The first sample stays before the record begins, as the package has it.
+        # The first sample is held before the record, as in the package.
         now = sticks[np.maximum(k - one.whole, 0), columns]
         before = sticks[np.maximum(k - one.whole - 1, 0), columns]
         x = one.A @ x + one.now @ now + one.before @ before
@@ -122,7 +124,7 @@ def record(seed: int, stick: str) -> Flight:
 
 @functools.cache
 def models() -> tuple[Any, Any]:
-    """Without and with a disturbance on each axis."""
+    """Return the models without and with a disturbance on each axis."""
     bare = with_delays(linear_model("r50-hover").model, inputs=["lat", "lon"])
     return bare, with_disturbance(bare, ["p", "q", "u", "v"])
 
@@ -159,19 +161,21 @@ METHODS: dict[str, dict[str, Any]] = {
 
 
 def linear_vehicle() -> Any:
-    """The parameters of the model without delays of its inputs."""
+    """Return the parameters of the model without delays of its inputs."""
     return linear_model("r50-hover").vehicle().params
 
 
 def doublet(model: Any, stick: str, N: int) -> Any:
-    """Inputs (N,) with a doublet on one stick."""
+    """Return inputs (N,) with a doublet on one stick."""
     u = np.zeros(N)
     u[25:50], u[50:75] = 0.1, -0.1
     return model.Inputs(**{n: u if n == stick else np.zeros(N) for n in naming.names(model.Inputs)})
 
 
 def doublet_tic(found: dict[str, float]) -> float:
-    """Theil's coefficient of a doublet on each cyclic stick in turn, without gusts; the worse."""
+    """Return the worse of Theil's coefficients for a doublet on each cyclic stick,
+    without gusts.
+    """
     model, vehicle = models()[0], naming.asdict(linear_vehicle())
     N, worst = round(4.0 / DT), 0.0
     for stick in ("lat", "lon"):
@@ -187,7 +191,7 @@ def doublet_tic(found: dict[str, float]) -> float:
 
 
 def one_fit(seed: int, method: str) -> dict[str, Any]:
-    """Relative errors, errors in units of the stated sd, and what the fit says of itself."""
+    """Return relative errors, errors over the stated sd, and the fit's own findings."""
     asked = problem(seed, **METHODS[method])
     begin = time.perf_counter()
     found = fit(asked, starts=1)

@@ -1,14 +1,14 @@
-"""The numbers that have to stay: a fixed set of cases, what each says today, and what has changed.
+"""Regression corpus: a fixed set of cases, their stored results, and changes.
 
     .venv/bin/python experiments/corpus.py [--store | --compare | --matrix] [--quick] [--only WORDS]
 
 Each case records exit code, status, adequacy, estimates with sd and interval, log-likelihood, codes
 of the findings and processor time. `--store` writes them to tests/reference/corpus.json.
-`--compare`, the default, prints what differs from that file (estimates by more than 0.1 sd, sd by
-more than 5 %, status, exit code, adequacy, codes) and ends with exit code 1 where something does.
-`--matrix` prints which diagnostic fires in which cases, and what each of the candidates of
-corpus_matrix.py changes where it is disabled. Cases whose files are absent (`--shared DIR`) are
-skipped with a reason.
+`--compare`, the default, prints differences from that file (estimates by more than 0.1 sd, sd by
+more than 5 %, status, exit code, adequacy, codes). It ends with exit code 1 if there are any.
+`--matrix` prints which diagnostics fire in which cases, and what changes if a candidate of
+corpus_matrix.py is disabled. Cases whose files are absent (`--shared DIR`) are skipped with a
+reason.
 """
 
 import argparse
@@ -32,20 +32,22 @@ sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
 STORED = ROOT / "tests" / "reference" / "corpus.json"
 
 MOVED, SD_CHANGED, NUMBER_CHANGED = 0.1, 0.05, 1e-3
-"""sds of an estimate, part of an sd, and part of a number without an sd that count as a change"""
+"""Least changes that count: of an estimate [sd], of an sd [relative], of a number without an sd
+[relative].
+"""
 DIGITS = 6
-"""of the numbers in the file"""
+"""Significant digits in the file."""
 MAPPED = 42_000
-"""regions of memory above which compiled programs are let go: Linux grants a process 65530"""
+"""Memory regions above which compiled programs are released; Linux allows 65530 per process."""
 Result = dict[str, Any]
-"""of one case, plain data"""
+"""Result of a case, plain data."""
 
 
 def code_of(finding: Any, names: Iterable[str] = ()) -> str:
-    """The stable key of a finding, a note or a doubt.
+    """Return the stable key of a finding, a note or a doubt.
 
-    It is its `code` where it has one. Otherwise it is the sentence without numbers, quoted text,
-    paths and the names of signals and parameters, which differ from one record to another.
+    It is the `code` if there is one. Otherwise it is the sentence without numbers, quoted text,
+    paths and names of signals and parameters, which vary between records.
     """
     if isinstance(finding, Mapping):
         code, words = finding.get("code"), finding.get("sentence", "")
@@ -56,7 +58,7 @@ def code_of(finding: Any, names: Iterable[str] = ()) -> str:
     if code:
         return str(code)
     words = re.sub(r"'[^']*'|\"[^\"]*\"|`[^`]*`|\S*/\S+", "_", " ".join(words.split()))
-    # A parameter `a` is a word of most sentences too.
+    # A parameter `a` is also a word in most sentences.
     known = sorted({n for n in names if len(n) > 1 or n not in "aI"}, key=len, reverse=True)
     if known:
         words = re.sub(rf"(?<![\w.])({'|'.join(map(re.escape, known))})(?![\w])", "_", words)
@@ -66,10 +68,10 @@ def code_of(finding: Any, names: Iterable[str] = ()) -> str:
 
 
 def of_fit(content: Mapping[str, Any], code: int) -> Result:
-    """What is kept of a fit.
+    """Return the stored result of a fit.
 
     Args:
-        content: of its fit.json.
+        content: content of its fit.json.
         code: the exit code.
     """
     findings = content["findings"]
@@ -89,7 +91,7 @@ def of_fit(content: Mapping[str, Any], code: int) -> Result:
     for c in content["determined_combinations"]:
         estimates[c["name"]] = [c["value"], c["sd"], c["lower95"], c["upper95"]]
     for name, by in further.items():
-        # Of a normal distribution with these ends, so that one rule compares all intervals.
+        # Ends are converted to a normal distribution, so that one rule compares all intervals.
         for method, (low, high) in by.items():
             estimates[f"{name} by {method}"] = [(low + high) / 2, (high - low) / 3.92, low, high]
     return {
@@ -104,7 +106,7 @@ def of_fit(content: Mapping[str, Any], code: int) -> Result:
 
 
 def coded(*by_rank: Iterable[str]) -> dict[str, list[str]]:
-    """Codes by what they do: `exit` changes the exit code, `doubt` the trust, `note` nothing."""
+    """Group codes by effect: `exit` changes the exit code, `doubt` the trust, `note` nothing."""
     ranks, seen, out = ("exit", "doubt", "note"), set(), {}
     for rank, codes in zip(ranks, by_rank, strict=False):
         out[rank] = sorted({*codes} - seen)
@@ -113,7 +115,7 @@ def coded(*by_rank: Iterable[str]) -> dict[str, list[str]]:
 
 
 def run(case: Any) -> Result:
-    """One case, in an empty folder of its own."""
+    """Run one case in an empty folder of its own."""
     began = processor_time()
     with tempfile.TemporaryDirectory(prefix="corpus-") as folder:
         quiet = contextlib.redirect_stdout(io.StringIO())
@@ -128,12 +130,12 @@ def run(case: Any) -> Result:
 
 
 def processor_time() -> float:
-    """Of this process and of those that it has started and seen end [s]."""
+    """Return the processor time of this process and its finished children [s]."""
     return sum(os.times()[:4])
 
 
 def rounded(value: Any) -> Any:
-    """The same with few digits, and None for what is no finite number."""
+    """Return the value with few digits, and None for numbers that are not finite."""
     if isinstance(value, Mapping):
         return {k: rounded(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -144,25 +146,26 @@ def rounded(value: Any) -> Any:
 
 
 Entry = tuple[str, str]
-"""a case, and the way in which it runs: `` as it is, others as `corpus_matrix.way` has them"""
+"""A case, and its way: `` is unchanged, others as in `corpus_matrix.way`."""
 
 
 def run_group(
     entries: Sequence[Entry], shared: str, way: Callable[[str], Any] | None = None
 ) -> list[tuple[Entry, Result]]:
-    """Cases of one process, one after another: they share what was compiled.
+    """Run the cases of one process one after another, so that they share compiled programs.
 
     Args:
-        entries: which, and in which way.
-        shared: the folder of records that are no part of the project.
-        way: of a way's name, makes the context of a case, which yields what its result has too.
+        entries: cases, and their ways.
+        shared: folder of records outside the project.
+        way: function from the name of a way to the context of a case, which yields additions to its
+            result.
     """
     import jax
     from corpus_cases import cases
 
     from heli_jax import cli
 
-    # 64 bit before anything is traced: cases of Problems do not pass the command line.
+    # 64 bit before any trace, since cases of Problems do not use the command line.
     cli._prepare_jax()
     known, done = {c.name: c for c in cases(Path(shared))}, []
     for name, how in entries:
@@ -170,7 +173,7 @@ def run_group(
             try:
                 result = run(known[name])
             except Exception:
-                # A fault of ours is a result too: it differs from what was stored.
+                # A bug of ours is a result too, which differs from the stored one.
                 result = {"failed": traceback.format_exc().strip().splitlines()[-1]}
         done.append(((name, how), {**result, **added}))
         print(
@@ -185,7 +188,7 @@ def run_group(
 
 
 def in_words(result: Result) -> str:
-    """One line."""
+    """Return a result in one line."""
     for key in ("skipped", "failed"):
         if key in result:
             return f"{key}: {result[key]}"
@@ -195,7 +198,7 @@ def in_words(result: Result) -> str:
 
 
 def run_all(chosen: Sequence[Any], shared: Path, jobs: int) -> dict[str, Result]:
-    """All cases as they are, in the order of the list."""
+    """Run all cases unchanged, in the order of the list."""
     results = run_entries([(case, "") for case in chosen], shared, jobs)
     return {case.name: results[case.name, ""] for case in chosen}
 
@@ -206,7 +209,7 @@ def run_entries(
     jobs: int,
     way: Callable[[str], Any] | None = None,
 ) -> dict[Entry, Result]:
-    """Cases in ways; groups of them in processes of their own."""
+    """Run cases in ways, each group in a process of its own."""
     groups: dict[str, list[Entry]] = {}
     for case, how in entries:
         groups.setdefault(case.group, []).append((case.name, how))
@@ -214,15 +217,15 @@ def run_entries(
     if jobs == 1:
         done = [run_group(*each) for each in arguments]
     else:
-        # A process a group: memory and compiled programs go with it.
+        # One process for each group, which ends with its memory and compiled programs.
         with multiprocessing.get_context("spawn").Pool(jobs, maxtasksperchild=1) as pool:
             done = pool.starmap(run_group, arguments, chunksize=1)
     return dict(one for group in done for one in group)
 
 
 def differences(before: Result, after: Result) -> Iterator[str]:
-    """What of a case is not as it was, a line each."""
-    # Files that are absent here, or were where the results were stored, say nothing.
+    """Yield the differences of a case, a line each."""
+    # Files that are absent now, or were when the results were stored, cannot be compared.
     if "skipped" in before or "skipped" in after:
         return
     if "failed" in before or "failed" in after:
@@ -266,7 +269,7 @@ def _differing_numbers(before: Result, after: Result) -> Iterator[str]:
 
 
 def compare(stored: Mapping[str, Result], now: Mapping[str, Result]) -> list[str]:
-    """All that differs; cases that nobody stored are named."""
+    """Return all differences, and the names of cases that are not stored."""
     lines = []
     for name, result in now.items():
         if name not in stored:
@@ -277,7 +280,7 @@ def compare(stored: Mapping[str, Result], now: Mapping[str, Result]) -> list[str
 
 
 def store(results: Mapping[str, Result]) -> None:
-    """Write the file: a line a case, so that a change shows as such."""
+    """Write the file with a line for each case, so that changes are visible."""
     rows = [f"{json.dumps(name)}: {json.dumps(r, sort_keys=True)}" for name, r in results.items()]
     text = "{\n" + ",\n".join(rows) + "\n}\n"
     STORED.parent.mkdir(exist_ok=True)
@@ -286,12 +289,12 @@ def store(results: Mapping[str, Result]) -> None:
 
 
 def shared_folder(stated: str | None) -> Path:
-    """Where records lie that are no part of the project."""
+    """Return the folder of records outside the project."""
     return Path(stated or os.environ.get("HELI_JAX_SHARED") or ROOT.parent / "shared").absolute()
 
 
 def main() -> int:
-    """Run what was asked; the exit code."""
+    """Run the requested command; return the exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,4 +1,6 @@
-"""The cases of corpus.py: each a name, a group that shares compiled programs, and what is right."""
+"""Cases of corpus.py: each has a name, a group that shares compiled programs, and the
+right answer.
+"""
 
 import contextlib
 import functools
@@ -22,23 +24,25 @@ class Case(NamedTuple):
 
     name: str
     group: str
-    """what runs in one process"""
+    """Cases that run in one process."""
     run: Callable[[Path], Result]
-    """in a folder of its own; LookupError where something is absent"""
+    """Function that runs the case in a folder of its own; raises LookupError if a
+    file is absent.
+    """
     sound: bool | None = None
-    """whether the right answer is exit 0 and adequate; None where nobody knows"""
+    """True if the right answer is exit code 0 and adequate; None if unknown."""
     ought: tuple[str, ...] = ()
-    """of an unsound case: words of the codes one of which says what is wrong"""
+    """For an unsound case: parts of codes, of which one must appear."""
     quick: bool = False
 
 
 class Ended(NamedTuple):
-    """What a command printed."""
+    """Output of a command."""
 
     code: int
     out: str
     notes: list[str]
-    """lines of standard error"""
+    """Lines of standard error."""
 
 
 def command(*arguments: str | Path) -> Ended:
@@ -56,7 +60,7 @@ def command(*arguments: str | Path) -> Ended:
 
 
 def fit_of(problem: Any) -> tuple[Any, Result]:
-    """A Problem's fit, and what is kept of it."""
+    """Return the fit of a Problem, and its stored result."""
     from heli_jax import fit
     from heli_jax.report import files
 
@@ -66,7 +70,7 @@ def fit_of(problem: Any) -> tuple[Any, Result]:
 
 
 def names_of(config: Path) -> set[str]:
-    """Of signals, parameters and flights that a configuration names."""
+    """Return the names of signals, parameters and flights in a configuration."""
     content = yaml.safe_load(config.read_text(encoding="utf-8"))
     names = {*(content.get("fit") or {}).get("free", {})}
     for flight in content.get("flights", ()):
@@ -79,7 +83,7 @@ def names_of(config: Path) -> set[str]:
 
 
 def fit_config(config: Path, *more: str) -> Result:
-    """`heli-jax fit`."""
+    """Run `heli-jax fit`."""
     ended, names = command("fit", config, "--out", "fit", *more), names_of(config)
     if not Path("fit/fit.json").exists():
         return refused(ended, names)
@@ -91,12 +95,12 @@ def fit_config(config: Path, *more: str) -> Result:
 
 
 def refused(ended: Ended, names: set[str]) -> Result:
-    """A command that wrote nothing."""
+    """Return the result of a command that wrote nothing."""
     return {"exit": ended.code, "codes": coded([f"error {code_of(n, names)}" for n in ended.notes])}
 
 
 def check_config(config: Path, *more: str) -> Result:
-    """`heli-jax check`."""
+    """Run `heli-jax check`."""
     ended, names = command("check", config, "--json", *more), names_of(config)
     if not ended.out.startswith("{"):
         return refused(ended, names)
@@ -116,7 +120,7 @@ SEVERITIES = ("refuse", "doubt", "note")
 
 
 def frf_config(config: Path, *more: str) -> Result:
-    """`heli-jax frf`: gain, phase and coherence of each response at three frequencies."""
+    """Run `heli-jax frf`; keep gain, phase and coherence of each response at three frequencies."""
     import xarray as xr
 
     ended, names = command("frf", config, "--out", "frf", *more), names_of(config)
@@ -148,11 +152,11 @@ def _puzzle(kind: Callable[[int], zoo.Puzzle], seed: int, _: Path) -> Result:
 
 
 def zoo_cases() -> Iterator[Case]:
-    """The hundred problems with known answers."""
+    """Yield the hundred problems with known answers."""
     quick = {"plain", "two_inputs", "product", "something_else"}
     for sound, kinds in ((True, zoo.SOUND), (False, zoo.UNSOUND)):
         for i, (kind, count) in enumerate(kinds):
-            # Problems whose answer is a misfit, and those that are not identifiable.
+            # Misfits, and problems that are not identifiable.
             ought = () if sound else ("exit", "adequacy")
             for seed in range(count):
                 yield Case(
@@ -188,7 +192,7 @@ ASKED = {"fit": fit_config, "check": check_config, "frf": frf_config}
 
 
 def shipped_cases(shared: Path) -> Iterator[Case]:
-    """Every configuration of configs/ with flights."""
+    """Yield every configuration of configs/ with flights."""
     for config in sorted(CONFIGS.glob("*.yaml")):
         content = yaml.safe_load(config.read_text(encoding="utf-8"))
         if "flights" not in content:
@@ -204,14 +208,14 @@ def shipped_cases(shared: Path) -> Iterator[Case]:
             )
 
 
-# Small inputs that failed once: ../shared/cases.
+# Small inputs that once failed: ../shared/cases.
 
 _OUGHT: Mapping[str, tuple[bool | None, tuple[str, ...]]] = {
     "fast-loop-slow-log/fe.yaml": (False, ("loop-between",)),
     "fast-loop-slow-log/fe_from_truth.yaml": (False, ("loop-between",)),
     "fast-loop-slow-log/iv.yaml": (False, ("instrument", "trusted")),
     "delay-wrong-optimum/fe.yaml": (True, ()),
-    # D is 0.4 +- 0.8, which is no value where the start is 0.5.
+    # D is 0.4 +- 0.8, not significant with a start of 0.5.
     "delay-wrong-optimum/fe_from_truth.yaml": (None, ()),
     "doublets-and-chirp/fit.yaml": (True, ()),
     "free-decay/decay.yaml": (True, ()),
@@ -231,7 +235,7 @@ _TRUTH = {
 
 
 def wrong_of(result: Result, sound: bool | None, truth: Mapping[str, float], off: float = 3) -> str:
-    """What is wrong with an answer; empty where it is right."""
+    """Return the error of an answer; empty if it is right."""
     estimates = result.get("estimates", {})
     for name, value in truth.items():
         at, sd = (*estimates.get(name, ()), None, None)[:2]
@@ -259,7 +263,7 @@ def _public(config: Path, do: str, folder: Path) -> Result:
 
 
 def public_cases(shared: Path) -> Iterator[Case]:
-    """Every folder of ../shared/cases: its configurations, and its logs where it has none."""
+    """Yield every folder of ../shared/cases: its configurations, or its logs if it has none."""
     for key, (sound, ought) in _OUGHT.items():
         config = shared / "cases" / key
         for do in ("fit", "check"):
@@ -279,7 +283,7 @@ def public_cases(shared: Path) -> Iterator[Case]:
 
 
 def read_log(path: Path, folder: Path, *more: str) -> Result:
-    """`info`, `new` and `convert` of one log."""
+    """Run `info`, `new` and `convert` on one log."""
     if not path.exists():
         raise LookupError(f"{path} is absent")
     info = command("info", path, "--json", *more)
@@ -310,14 +314,14 @@ def read_log(path: Path, folder: Path, *more: str) -> Result:
             numbers[f"mean {name}"] = float(np.nanmean(rows[name]))
             numbers[f"sd {name}"] = float(np.nanstd(rows[name]))
     done = {"info": info, "new": new, "convert": converted}
-    # Where a signal is named in part, `ekf...`, its beginning is all that a sentence has.
+    # A sentence may only have the start of a signal's name, such as `ekf...`.
     said = [f"{do} {code_of(n, names)}" for do, e in done.items() for n in e.notes]
     codes = {f"exit {do}": e.code for do, e in done.items()}
     return {"exit": max(codes.values()), "codes": coded([], [], said), "numbers": numbers | codes}
 
 
 def _written(path: Path, x: Mapping[str, np.ndarray]) -> None:
-    """Columns in the format of a file's name."""
+    """Write columns in the format of the file's suffix."""
     import h5py
     import pyarrow as pa
     import pyarrow.feather
@@ -388,7 +392,7 @@ _LOGS = (
 
 
 def log_cases(shared: Path) -> Iterator[Case]:
-    """One log a format, and the records of ../shared/data."""
+    """Yield one log for each format, and the records of ../shared/data."""
     for suffix in FORMATS:
         yield Case(
             f"format {suffix[1:]}",
@@ -415,7 +419,7 @@ def _rig(rig: Rig, do: str, folder: Path) -> Result:
 
 
 def rig_cases() -> Iterator[Case]:
-    """The records of corpus_records.py."""
+    """Yield the records of corpus_records.py."""
     quick = {"loop frequency error by instrument fit", "missing samples fit", "p clipped fit"}
     for i, (name, rig) in enumerate(RIGS.items()):
         for do in rig.do:
@@ -430,7 +434,7 @@ def rig_cases() -> Iterator[Case]:
 
 
 def _own_model(folder: Path) -> Result:
-    """By import path: what `heli-jax new-model` writes."""
+    """Fit a model by import path, from `heli-jax new-model`."""
     command("new-model", "swing", "--out", "swing")
     config = folder / "swing" / "swing.yaml"
     command("simulate", config, "--out", folder / "swing" / "swing.csv")
@@ -439,7 +443,7 @@ def _own_model(folder: Path) -> Result:
 
 
 def _study(folder: Path) -> Result:
-    """Eight fits of one record, of windows and starts."""
+    """Run eight fits of one record, with different windows and starts."""
     import xarray as xr
 
     config = written(RIGS["plain"], folder)
@@ -456,7 +460,7 @@ def _study(folder: Path) -> Result:
 
 
 def _sweep(folder: Path) -> Result:
-    """256 vehicles on the stand."""
+    """Run a sweep of 256 vehicles on the stand."""
     import xarray as xr
 
     more = ("--set", "sweep.n=256", "--set", "simulate.duration=20", "--no-figures")
@@ -473,11 +477,11 @@ def _sweep(folder: Path) -> Result:
 
 
 R50: tuple[str, ...] = ("Lb", "Alat", "Blat", "Lu", "Lv")
-"""of the R-50, free where a fit of all 33 would take minutes"""
+"""Free parameters of the R-50; a fit of all 33 would take minutes."""
 
 
 def _r50(method: str, folder: Path) -> Result:
-    """The R-50 that a pilot holds in gusts on six axes."""
+    """Fit the R-50, held by a pilot in gusts on six axes."""
     from r50_record import problem, record, truth
 
     from heli_jax import Free, Nuisance, Problem, linear_model, naming
@@ -499,7 +503,7 @@ def _r50(method: str, folder: Path) -> Result:
 
 
 def other_cases() -> Iterator[Case]:
-    """What is no single fit of a configuration, and the R-50."""
+    """Yield cases that are no single fit of a configuration, and the R-50."""
     yield Case("own model by import path", "other", _own_model, True)
     yield Case("study of 8 fits", "other", _study)
     yield Case("sweep of 256", "other", _sweep)
@@ -514,8 +518,8 @@ def other_cases() -> Iterator[Case]:
 
 
 def cases(shared: Path) -> list[Case]:
-    """All of them; nothing is computed yet."""
-    # What takes longest in one process comes first.
+    """Return all cases, without computing any."""
+    # The slowest processes come first.
     made = [*shipped_cases(shared), *zoo_cases(), *public_cases(shared), *rig_cases()]
     made += [*other_cases(), *log_cases(shared)]
     names = [c.name for c in made]

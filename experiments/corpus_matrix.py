@@ -1,10 +1,10 @@
-"""Which diagnostic fires where, and what is lost without it: `corpus.py --matrix`.
+"""Cases in which each diagnostic fires, and the loss without it: `corpus.py --matrix`.
 
-The first table has a row for each code: in how many sound and unsound cases it fires, in how many
-sound ones that end with another exit code than 0 or not adequate, and in how many unsound ones no
-other finding of its rank or above stands beside it. The second has a row for each candidate for
-deletion: where its entry function gives something other than nothing, and what of exit code,
-status, adequacy, estimates and right answers changes where it is replaced by nothing.
+The first table has a row for each code. It counts the sound and unsound cases in which it fires,
+and the sound ones that end with an exit code other than 0 or not adequate. It also counts unsound
+cases without another finding of its rank or above. The second has a row for each candidate for
+deletion: where its entry function returns something, and what changes without it. Changes concern
+exit code, status, adequacy, estimates and right answers.
 """
 
 import contextlib
@@ -24,17 +24,17 @@ _VALIDATION = f"{_IDENTIFICATION}.validation"
 
 
 class Ablation(NamedTuple):
-    """A candidate and what it gives where it has nothing to say."""
+    """A candidate for deletion, and its neutral result."""
 
     name: str
     entry: str
-    """module:function, or module:Class.method"""
+    """Entry as module:function, or module:Class.method."""
     neutral: Callable[..., Any]
-    """of the same arguments"""
+    """Function of the same arguments that returns the neutral result."""
 
 
 def _untied(valley: Any, null: Any, spread: Any, unknowns: Any) -> Any:
-    """What slopes alone say, without a look far from the optimum."""
+    """Return the result from slopes alone, without values far from the optimum."""
     from heli_jax.identification.identifiability.directions import combinations
 
     return combinations(null, spread, unknowns)
@@ -61,11 +61,11 @@ ABLATIONS: tuple[Ablation, ...] = (
 
 @contextlib.contextmanager
 def replaced(entry: str, make: Callable[[Callable[..., Any]], Any]) -> Iterator[None]:
-    """An entry function replaced wherever the package has imported it.
+    """Replace an entry function wherever the package has imported it.
 
     Args:
-        entry: as of an Ablation.
-        make: of the original, what stands in its place.
+        entry: entry of an Ablation.
+        make: function from the original to its replacement.
     """
     home, _, name = entry.partition(":")
     module: Any = importlib.import_module(home)
@@ -85,7 +85,7 @@ def replaced(entry: str, make: Callable[[Callable[..., Any]], Any]) -> Iterator[
     try:
         yield
     finally:
-        # Modules that were imported meanwhile have the other one too.
+        # Modules imported meanwhile also have the replacement.
         _everywhere(other, original)
 
 
@@ -98,7 +98,7 @@ def _everywhere(old: Any, new: Any) -> None:
 
 
 def same(a: Any, b: Any) -> bool:
-    """Whether two results are one, whatever their kinds."""
+    """True if two results are equal, whatever their types."""
     if a is b:
         return True
     if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
@@ -113,11 +113,10 @@ def same(a: Any, b: Any) -> bool:
 
 @contextlib.contextmanager
 def way(name: str) -> Iterator[Result]:
-    """What is done to the package while a case runs; yields what is added to its result.
+    """Change the package while a case runs; yield additions to its result.
 
     Args:
-        name: `record` notes which candidates fire and what they take; a candidate's is replaced
-            by nothing.
+        name: `record` notes which candidates fire and their time; a candidate's name disables it.
     """
     added: Result = {}
     if name != "record":
@@ -147,7 +146,7 @@ def way(name: str) -> Iterator[Result]:
 
 
 def matrix(cases: Sequence[Any], shared: Path, jobs: int) -> str:
-    """Both tables, and the cases in which nothing is said that should be."""
+    """Return both tables, and the cases without an expected finding."""
     entries = [(c, "record") for c in cases]
     plain = {c: r for (c, _), r in run_entries(entries, shared, jobs, way).items()}
     again = [(c, name) for c in cases for name in plain[c.name].get("fired", ())]
@@ -168,13 +167,15 @@ def _is_bad(result: Result) -> bool:
 
 
 def _silent(case: Any, result: Result) -> bool:
-    """Whether an unsound case says nothing of the kind that it should."""
+    """True if an unsound case lacks every expected code."""
     said = [code for codes in result.get("codes", {}).values() for code in codes]
     return not any(word in code for word in case.ought for code in said)
 
 
 def firing_table(cases: Sequence[Any], results: Mapping[str, Result]) -> list[str]:
-    """A row a code: rank, sound cases, wrongly, unsound cases, alone, the words that it answers."""
+    """Return a row for each code: rank, sound cases, wrong ones, unsound cases, alone, expected
+    words.
+    """
     ranks = ("exit", "doubt", "note")
     rows: dict[str, list[int]] = {}
     where: dict[str, str] = {}
@@ -204,7 +205,7 @@ def ablation_table(
     plain: Mapping[str, Result],
     without: Mapping[tuple[str, str], Result],
 ) -> list[str]:
-    """A row a candidate, and a line for each case that changes."""
+    """Return a row for each candidate, and a line for each changed case."""
     lines = []
     known = {c.name: c for c in cases}
     for one in ABLATIONS:
@@ -233,7 +234,7 @@ def ablation_table(
 
 
 def silences(cases: Sequence[Any], results: Mapping[str, Result]) -> list[str]:
-    """Cases whose answer is wrong, or that lack the code which they should have."""
+    """Return cases with a wrong answer, or without the expected code."""
     lines = []
     for case in cases:
         result = results[case.name]

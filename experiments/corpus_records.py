@@ -1,7 +1,7 @@
-"""Records of corpus.py that a configuration reads: right ones, and ones with a fault each.
+"""Records of corpus.py for configurations: sound ones, and ones with one fault each.
 
-Linear models are written to YAML, logs are made by SciPy and written to CSV. A fault is one of
-those that a diagnostic of the package is there for.
+Linear models are written to YAML; logs are simulated by SciPy and written to CSV. Each fault is one
+that a diagnostic of the package should find.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -17,13 +17,15 @@ from closed_loop import ACTS, DT, STEP, TRUTH, record
 from heli_jax.simulation.inputs import random_steps
 
 Columns = dict[str, np.ndarray]
-"""of a log by name, `t` first"""
+"""Columns of a log by name, `t` first."""
 N = 1500
-"""samples of closed_loop.record"""
+"""Samples of closed_loop.record."""
 
 
 def linear(A: dict, B: dict, outputs: Mapping[str, str], **sections: Any) -> dict[str, Any]:
-    """A model as a file has it; states take their units from `states`, parameters theirs."""
+    """Return a model in the form of a file; states take units from `states`,
+    parameters their own.
+    """
     return {"name": "rig", "outputs": dict(outputs), "A": A, "B": B, **sections}
 
 
@@ -130,7 +132,7 @@ FILTER = {"fit": {"method": "filter-error"}, "disturbance": {"on": ["roll"]}}
 def simulated(
     A: Sequence, B: Sequence, u: np.ndarray, dt: float = DT, push: np.ndarray | None = None
 ) -> np.ndarray:
-    """States (N, n) from zero for a held input (N,) and a push (N, n) that is held too."""
+    """Return states (N, n) from zero, for a held input (N,) and a held push (N, n)."""
     n = len(A)
     M = np.zeros((2 * n + 1, 2 * n + 1))
     M[:n, :n], M[:n, n], M[:n, n + 1 :] = A, B, np.eye(n)
@@ -144,7 +146,7 @@ def simulated(
 
 
 def roll(seed: int = 1, gain: float = 0.0, gust: float = 0.0, acts: int = 0) -> Columns:
-    """Of closed_loop.record, with the excitation that the pilot adds."""
+    """Return the record of closed_loop.record, with the pilot's excitation."""
     flight = record(gain, gust, seed, acts)
     excitation = STEP * random_steps(N, DT, np.random.default_rng(seed), (0.2, 1.5))
     t = np.arange(N) * DT
@@ -152,19 +154,19 @@ def roll(seed: int = 1, gain: float = 0.0, gust: float = 0.0, acts: int = 0) -> 
 
 
 def noisy(y: np.ndarray, part: float, rng: np.random.Generator) -> np.ndarray:
-    """With white noise of so much of its sd."""
+    """Add white noise of a fraction of the signal's sd."""
     return y + part * np.std(y) * rng.standard_normal(y.shape)
 
 
 def steps(n: int, seed: int, dt: float = DT) -> np.ndarray:
-    """Random steps of 0.2 to 1.5 s."""
+    """Return random steps of 0.2 to 1.5 s."""
     return random_steps(n, dt, np.random.default_rng(seed), (0.2, 1.5))
 
 
 def two_axes(turned: float) -> Columns:
-    """Roll and pitch, the gyro turned by so many degrees about the vertical."""
+    """Return roll and pitch, with the gyro turned about the vertical [deg]."""
     rng, n = np.random.default_rng(5), 2000
-    # Each step is taken back after half a second, so that the machine stays about level.
+    # Each step is reversed after half a second, so that the vehicle stays about level.
     random = {"da": 0.05 * steps(n, 6), "de": 0.05 * steps(n, 7)}
     sticks = {name: u - np.r_[np.zeros(25), u[:-25]] for name, u in random.items()}
     p, phi = simulated([[-4.0, 0.0], [1.0, 0.0]], [25.0, 0.0], sticks["da"]).T
@@ -176,7 +178,7 @@ def two_axes(turned: float) -> Columns:
 
 
 def spring() -> Columns:
-    """A mass on a spring five times as fast as the model's values have it."""
+    """Return a mass on a spring five times as fast as the model's values."""
     rng = np.random.default_rng(0)
     f = rng.standard_normal(1000)
     x = simulated([[0.0, 1.0], [-25.0, -0.5]], [0.0, 20.0], f, 0.1)[:, 0]
@@ -184,28 +186,30 @@ def spring() -> Columns:
 
 
 def servo() -> Columns:
-    """A lag of 0.05 s before a damping of 6 1/s."""
+    """Return a lag of 0.05 s before a damping of 6 1/s."""
     u = steps(1000, 11)
     p = simulated([[-6.0, 40.0], [0.0, -20.0]], [0.0, 20.0], u)[:, 0]
     return {"t": DT * np.arange(1000), "u": u, "p": noisy(p, 0.05, np.random.default_rng(2))}
 
 
 def lags() -> Columns:
-    """Two lags in series, of 0.06 and 0.3 s."""
+    """Return two lags in series, of 0.06 and 0.3 s."""
     u = steps(1000, 12)
     b = simulated([[-1 / 0.06, 0.0], [1 / 0.3, -1 / 0.3]], [3.0 / 0.06, 0.0], u)[:, 1]
     return {"t": DT * np.arange(1000), "u": u, "b": noisy(b, 0.05, np.random.default_rng(3))}
 
 
 def damping() -> Columns:
-    """A rate whose damping is the sum of two."""
+    """Return a rate whose damping is the sum of two."""
     u = steps(1000, 13)
     p = simulated([[-3.5]], [20.0], u)[:, 0]
     return {"t": DT * np.arange(1000), "u": u, "p": noisy(p, 0.05, np.random.default_rng(4))}
 
 
 def heave(gust: float, amplitude: float) -> Columns:
-    """A minute of pulses of the collective in gusts of a second; Zw -0.6, Zcol -14."""
+    """Return a minute of collective pulses in gusts with 1 s correlation time; Zw
+    -0.6, Zcol -14.
+    """
     rng, n = np.random.default_rng(0), 3000
     col = amplitude * np.repeat(rng.choice([-1.0, 0.0, 1.0], n // 50), 50)
     keep = np.exp(-DT)
@@ -216,7 +220,7 @@ def heave(gust: float, amplitude: float) -> Columns:
 
 
 def by_rotor_speed(felt: bool) -> Columns:
-    """Heave by the rotor's speed, whose noise the machine felt (a command) or not (a sensor's)."""
+    """Return heave from rotor speed, whose noise acts on the vehicle (command) or not (sensor)."""
     rng, n = np.random.default_rng(4), 3000
     slow = 8.0 * np.asarray(scipy.signal.lfilter([0.02], [1.0, -0.98], rng.standard_normal(n)))
     noise, Zw, Zo = 0.2 * rng.standard_normal(n), -0.7, -0.22
@@ -230,7 +234,7 @@ def by_rotor_speed(felt: bool) -> Columns:
 
 
 def inflow() -> Columns:
-    """Heave with inflow in gusts; the model begins with its two modes exchanged."""
+    """Return heave with inflow in gusts; the model starts with its two modes exchanged."""
     rng, n = np.random.default_rng(5), 2000
     col = 0.1 * np.repeat(rng.choice([-1.0, 0.0, 1.0], n // 50), 50)
     keep = np.exp(-DT / 0.4)
@@ -243,7 +247,7 @@ def inflow() -> Columns:
 
 
 def computed() -> Columns:
-    """A chirp that is computed at each sample and held, which a log shows as a moving stick."""
+    """Return a chirp that is computed and held at each sample; in a log the stick seems to move."""
     t = np.arange(1000) * DT
     da = 0.1 * np.sin(2.0 * np.pi * (0.2 + 0.1 * t) * t)
     p, phi = simulated([[-4.0, 0.0], [1.0, 0.0]], [25.0, 0.0], da).T
@@ -252,22 +256,22 @@ def computed() -> Columns:
     return {"t": t, "da": da, "p": p + sd[0], "phi": phi + 0.1 * sd[1]}
 
 
-# Faults: what they make of the columns.
+# Faults: functions that change the columns.
 
 
 def late(x: Columns) -> Columns:
-    """The stick logged 0.1 s late."""
+    """Log the stick 0.1 s late."""
     return x | {"da": np.r_[np.full(5, x["da"][0]), x["da"][:-5]]}
 
 
 def clipped(x: Columns) -> Columns:
-    """p cut off at two thirds of its range before noise came on top."""
+    """Clip p at half of its largest value before noise is added."""
     rng, top = np.random.default_rng(8), 0.5 * np.max(np.abs(x["p"]))
     return x | {"p": np.clip(x["p"], -top, top) + 0.01 * rng.standard_normal(N)}
 
 
 def held(x: Columns) -> Columns:
-    """p repeated for 5 to 15 samples, 30 times."""
+    """Repeat p for 5 to 15 samples, 30 times."""
     rng, p = np.random.default_rng(4), x["p"].copy()
     for first in np.linspace(50, N - 50, 30).astype(int):
         p[first : first + rng.integers(5, 16)] = p[first]
@@ -275,61 +279,61 @@ def held(x: Columns) -> Columns:
 
 
 def strayed(x: Columns) -> Columns:
-    """p far off at five samples."""
+    """Put p far off at five samples."""
     p = x["p"].copy()
     p[[200, 477, 801, 1100, 1311]] = [31.0, -28.0, 35.5, 22.0, -30.0]
     return x | {"p": p}
 
 
 def dropped(x: Columns) -> Columns:
-    """The stick at -1 for single samples, 40 times."""
+    """Set the stick to -1 for single samples, 40 times."""
     da = np.round(x["da"], 5)
     da[np.random.default_rng(1).choice(np.arange(5, N - 5, 7), 40, replace=False)] = -1.0
     return x | {"da": da}
 
 
 def drifting(x: Columns) -> Columns:
-    """phi integrated from the gyro, as an autopilot does."""
+    """Integrate phi from the gyro, as an autopilot does."""
     return x | {"phi": np.cumsum(x["p"]) * DT}
 
 
 def sparse(x: Columns) -> Columns:
-    """phi at every fifth sample."""
+    """Keep phi at every fifth sample only."""
     return x | {"phi": np.where(np.arange(N) % 5 == 0, x["phi"], np.nan)}
 
 
 def missing(x: Columns) -> Columns:
-    """A tenth of p is missing."""
+    """Remove a tenth of p."""
     gone = np.random.default_rng(2).uniform(size=N) < 0.1
     return x | {"p": np.where(gone, np.nan, x["p"])}
 
 
 def times(**factors: float) -> Callable[[Columns], Columns]:
-    """Columns in other units or with another sign."""
+    """Return a function that scales columns, for other units or signs."""
     return lambda x: x | {n: factor * x[n] for n, factor in factors.items()}
 
 
 class Rig(NamedTuple):
-    """A record and what is asked of it."""
+    """A record and its configuration."""
 
     made: Callable[[], Columns | list[Columns]]
     model: dict[str, Any] = ROLL
     truth: Mapping[str, float] = {}
-    """of a right answer"""
+    """True values of the parameters."""
     asks: Mapping[str, Any] = {}
-    """sections of the configuration; `fit.free` is all of the model's parameters unless stated"""
+    """Sections of the configuration; default of `fit.free`: all parameters of the model."""
     signals: Mapping[str, Any] = {}
     flights: Sequence[Mapping[str, Any]] = ({},)
-    """keys of each beside its log"""
+    """Keys of each flight besides its log."""
     ought: tuple[str, ...] | None = None
-    """words of the codes of which one ought to be said; None: the record is sound"""
+    """Parts of codes, of which one must appear; None: the record is sound."""
     exact: bool = True
-    """whether exit 0 with estimates within 3 sd of the truth is an answer too"""
+    """True if exit code 0 with estimates within 3 sd of the truth is also right."""
     do: Sequence[str] = ("fit",)
 
 
 def written(rig: Rig, folder: Path) -> Path:
-    """Its model, logs and configuration; returns the latter."""
+    """Write model, logs and configuration; return the path of the configuration."""
     made = rig.made()
     logs = made if isinstance(made, list) else [made]
     (folder / "m.yaml").write_text(yaml.safe_dump(rig.model))
@@ -356,7 +360,7 @@ def written(rig: Rig, folder: Path) -> Path:
 
 
 def stated_held(name: str, unit: str) -> dict[str, Any]:
-    """Signals of a log whose one input is stated to be held between samples."""
+    """Return signals of a log with one input that is stated to be held between samples."""
     return {"inputs": {name: {"signal": name, "unit": unit, "hold": "zero-order"}}}
 
 
@@ -372,7 +376,7 @@ def _fit(**keys: Any) -> dict[str, Any]:
 
 
 RIGS: dict[str, Rig] = {
-    # Right answers.
+    # Sound records.
     "plain": Rig(roll, truth=TRUTH, do=("fit", "check", "frf")),
     "filter error": Rig(lambda: roll(2, gust=2.0), truth=TRUTH, asks=FILTER, do=("fit", "check")),
     "loop filter error": Rig(lambda: roll(3, 0.3, 2.0), truth=TRUTH, asks=FILTER),
@@ -417,7 +421,7 @@ RIGS: dict[str, Rig] = {
         lambda: by_rotor_speed(True), BY_SPEED, {"Zw": -0.7, "Zo": -0.22}
     ),
     "heave in calm air": Rig(lambda: heave(0.0, 0.15), HEAVE, {"Zw": -0.6, "Zcol": -14.0}),
-    # Sound records on which a search may go astray, or the reader.
+    # Sound records that may mislead the search or the reader.
     "computed command": Rig(computed, truth=TRUTH, ought=("likelier-hold",)),
     "computed command, stated": Rig(computed, truth=TRUTH, signals=stated_held("da", "rad")),
     "spring far from its start": Rig(

@@ -1,11 +1,10 @@
-"""Do the 95 % intervals cover, and are the reported standard deviations the real ones?
+"""Coverage of the 95 % intervals, and accuracy of the reported standard deviations.
 
-    .venv/bin/python experiments/coverage.py [--runs N | --quick] [--only WORDS]
-        [--out FOLDER]
+    .venv/bin/python experiments/coverage.py [--runs N | --quick] [--only WORDS] [--out FOLDER]
 
 Many records of each case in experiments/coverage_cases are fitted one by one; each case runs at its
-full size unless N is given. FOLDER (runs/coverage) keeps one line a run, so that what was stopped
-goes on where it was; table.md is made of all of them.
+full size unless N is given. FOLDER (runs/coverage) stores a line for each run, so that an
+interrupted study can continue; table.md covers all runs.
 """
 
 import argparse
@@ -25,7 +24,7 @@ from coverage_cases import Case, Interval, Run
 
 jax.config.update("jax_enable_x64", True)
 QUICK = 2
-"""runs of each case with --quick"""
+"""Runs of each case with --quick."""
 
 
 def all_cases() -> list[Case]:
@@ -36,7 +35,7 @@ def all_cases() -> list[Case]:
 
 
 def run_case(case: Case, runs: int, folder: Path) -> list[Run]:
-    """The runs of seeds 0 to runs - 1, those already on file read from there."""
+    """Return the runs of seeds 0 to runs - 1; stored ones are read from file."""
     log = folder / (re.sub(r"\W+", "-", case.name) + ".jsonl")
     lines = log.read_text(encoding="utf-8").splitlines() if log.exists() else []
     done = {}
@@ -64,7 +63,7 @@ HEAD = "| case | parameter | runs | mean error | reported/real sd | coverage | n
 
 
 def rows(case: Case, runs: list[Run]) -> list[str]:
-    """A line for each parameter, then one for what must not happen."""
+    """Return a line for each parameter, then one for events that must not happen."""
     good = [r for r in runs if r.status != "not-converged"]
     failures, lines = len(runs) - len(good), []
     names = list(dict.fromkeys(n for r in good for n in r.parameters))
@@ -72,7 +71,7 @@ def rows(case: Case, runs: list[Run]) -> list[str]:
         intervals = [r.parameters[name] for r in good if name in r.parameters]
         error = np.array([i.value - i.truth for i in intervals])
         real = error.std(ddof=1) if error.size > 1 else np.nan
-        # The median: one run that reports absurdly much must not speak for all.
+        # The median, so that one run with a huge sd does not dominate.
         reported = np.median([i.sd for i in intervals])
         covered = np.mean([i.lower < i.truth < i.upper for i in intervals])
         lines.append(

@@ -1,12 +1,12 @@
-"""How often the intervals of a compatibility analysis hold: sensors with injected errors.
+"""Coverage of the intervals of a compatibility analysis, from sensors with injected errors.
 
     .venv/bin/python experiments/data_compatibility.py [--runs N | --quick]
 
-A flight about hover, of known angles and accelerations, is logged by sensors with errors: gyro
-bias and scale, accelerometer bias and scale, a lever arm, an IMU that is early against the rest.
-The errors and all noise are drawn anew in each run. For each error: the share of runs whose 95 %
-interval holds it, the mean error in sds, and the rms of that error. With `--results FILE` each run
-is written down as it ends, and a later call of the same options goes on behind the last.
+A flight about hover with known angles and accelerations is logged by sensors with errors: gyro bias
+and scale, accelerometer bias and scale, a lever arm, an IMU that is early. Errors and noise are
+drawn anew in each run. The table shows for each error the share of runs whose 95 % interval
+contains it, the mean error in sds, and its rms. With `--results FILE` each run is stored as it
+ends, and a later call with the same options continues.
 """
 
 import argparse
@@ -32,8 +32,10 @@ SIZES = {"b": 0.02, "lambda": 0.03, "ba": 0.2, "la": 0.02, "arm": 0.1, "delay": 
 
 
 class Motion:
-    """A flight whose angles and accelerations are sums of sines; rates by central differences of
-    the rotation matrix, so that no formula of the models is used."""
+    """A flight whose angles and accelerations are sums of sines.
+
+    Rates are central differences of the rotation matrix, so that no formula of the models is used.
+    """
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.frequency = rng.uniform(0.1, 0.9, (3, 5)) * 2 * np.pi
@@ -44,12 +46,12 @@ class Motion:
         self.push = np.array([1.2, 1.2, 1.5])[:, None] / 2.0
 
     def angles(self, t: np.ndarray) -> np.ndarray:
-        """phi, theta, psi (k, 3) [rad]."""
+        """Return phi, theta, psi (k, 3) [rad]."""
         argument = self.frequency * t[:, None, None] + self.phase
         return np.sum(self.amplitude * np.cos(argument), axis=2)
 
     def attitude(self, t: np.ndarray) -> np.ndarray:
-        """Body to ground (k, 3, 3)."""
+        """Return rotation matrices from body to ground (k, 3, 3)."""
         cosines, sines = np.cos(self.angles(t)).T, np.sin(self.angles(t)).T
         one, zero = np.ones(t.size), np.zeros(t.size)
         (c, d, e), (s, z, y) = cosines, sines
@@ -59,37 +61,37 @@ class Motion:
         return np.einsum("ijk,jlk,lmk->kim", yaw, pitch, roll)
 
     def omega(self, t: np.ndarray, h: float = 1e-4) -> np.ndarray:
-        """Rates about the body's axes (k, 3) [rad/s]: R' dR/dt is their cross-product matrix."""
+        """Return body rates (k, 3) [rad/s], from R' dR/dt, their cross-product matrix."""
         slope = (self.attitude(t + h) - self.attitude(t - h)) / (2 * h)
         W = np.einsum("kji,kjl->kil", self.attitude(t), slope)
         return np.stack([W[:, 2, 1], W[:, 0, 2], W[:, 1, 0]], axis=1)
 
     def alpha(self, t: np.ndarray, h: float = 1e-3) -> np.ndarray:
-        """(k, 3) [rad/s^2]"""
+        """Return angular accelerations (k, 3) [rad/s^2]."""
         return (self.omega(t + h) - self.omega(t - h)) / (2 * h)
 
     def _pushes(self, t: np.ndarray, order: int) -> np.ndarray:
-        """Acceleration (0), velocity (1), position (2) over the ground (k, 3)."""
+        """Return acceleration (0), velocity (1) or position (2) over the ground (k, 3)."""
         angle = self.push_frequency * t[:, None, None] + self.push_phase - order * np.pi / 2
         return np.sum(self.push / self.push_frequency**order * np.cos(angle), axis=2)
 
     def velocity(self, t: np.ndarray) -> np.ndarray:
-        """(k, 3) over the ground [m/s]."""
+        """Return velocity over the ground (k, 3) [m/s]."""
         return self._pushes(t, 1)
 
     def position(self, t: np.ndarray) -> np.ndarray:
-        """(k, 3) [m]."""
+        """Return position (k, 3) [m]."""
         return self._pushes(t, 2)
 
     def force(self, t: np.ndarray, arm: np.ndarray) -> np.ndarray:
-        """Specific force (k, 3) at the IMU [m/s^2]."""
+        """Return the specific force at the IMU (k, 3) [m/s^2]."""
         R, w = self.attitude(t), self.omega(t)
         at_reference = np.einsum("kji,kj->ki", R, self._pushes(t, 0) - G)
         return at_reference + np.cross(self.alpha(t), arm) + np.cross(w, np.cross(w, arm))
 
 
 def draw_errors(rng: np.random.Generator, whole: bool) -> dict[str, float]:
-    """Injected errors by the model's names."""
+    """Return injected errors by the model's names."""
 
     def drawn(size: float) -> float:
         return float(size * rng.uniform(-1.5, 1.5))
@@ -108,7 +110,7 @@ def draw_errors(rng: np.random.Generator, whole: bool) -> dict[str, float]:
 def logged(
     rng: np.random.Generator, errors: dict[str, float], gyro_noise: float, times: np.ndarray
 ) -> Flight:
-    """One flight as the sensors have it, at equally spaced times (N,) [s]."""
+    """Return one flight as measured, at equally spaced times (N,) [s]."""
     motion, whole = Motion(rng), "b_ax" in errors
     t, n = times, times.size
     late = t - errors["delay_gyro"]
@@ -122,7 +124,7 @@ def logged(
         }
 
     inputs = shown(motion.omega(t), ("p", "q", "r"), gyro_noise)
-    # Late outputs: what the gyros show now, the others show later.
+    # Other sensors are late relative to the gyros.
     outputs = {
         name: motion.angles(late)[:, i] + 0.006 * rng.standard_normal(n)
         for i, name in enumerate(("phi", "theta", "psi"))
@@ -142,7 +144,9 @@ def logged(
 def compare(
     model: Model, flight: Flight, truth: dict[str, float], method: str
 ) -> dict[str, tuple[bool, float]]:
-    """By error whether its interval holds the truth, and how many sds the estimate is off."""
+    """Return for each error whether its interval contains the truth, and the
+    estimate's error [sd].
+    """
     params = model.Params()
     noise = free_noise(model, params, (flight,)) if method == "filter-error" else {}
     problem = Problem(
@@ -197,7 +201,7 @@ def main() -> None:
     done = max(map(len, table.values()), default=0)
     model = kinematics.attitude if options.angles else kinematics.position
     times, began = np.arange(0.0, options.duration, 1 / options.rate), time.perf_counter()
-    # Interrupted, it shows what it has.
+    # An interrupted run shows its results so far.
     with contextlib.suppress(KeyboardInterrupt):
         for run in range(options.first + done, options.first + runs):
             rng = np.random.default_rng(run)

@@ -1,12 +1,12 @@
-"""What error of doublets the Cramér-Rao bound itself leaves, of the R-50 in closed loop.
+"""Error of doublets that the Cramér-Rao bound allows for the R-50 in closed loop.
 
     .venv/bin/python experiments/doublet_bound.py [RECORDS] [RUNS]
 
-The records, unknowns and doublets of experiments/closed_loop_frequency.py. Parameters are drawn
-about the truth with the covariance of the Cramér-Rao bound (a Kalman filter that knows gusts and
-noise, at the truth) and with that which fits by instrument and direct ones state; of each draw
-Theil's coefficient (TIC) of the worse of both doublets, to first order. RECORDS (10) of four
-flights each; the largest of RUNS (40) draws is what the largest of as many fits compares with.
+Records, unknowns and doublets are those of experiments/closed_loop_frequency.py. Parameters are
+drawn about the truth with the covariance of the Cramér-Rao bound (a Kalman filter with known gusts
+and noise, at the truth), and with those stated by fits with instruments and direct fits. Each draw
+gives Theil's coefficient (TIC) of the worse of both doublets, to first order. There are RECORDS
+(10) sets of four flights. The largest of RUNS (40) draws compares with the largest of as many fits.
 """
 
 import functools
@@ -31,7 +31,7 @@ OWN_NOISE = ("sigma_w", "tau_w")
 
 
 def covariance(e: Evaluation, count: int) -> np.ndarray:
-    """Of the first `count` unknowns, in their own units."""
+    """Return the covariance of the first `count` unknowns, in their own units."""
     J = np.asarray(e.J, np.float64)
     R = np.linalg.qr(J, mode="r")
     root = np.linalg.inv(R)[:count] * np.asarray(e.slopes)[:count, None]
@@ -39,7 +39,7 @@ def covariance(e: Evaluation, count: int) -> np.ndarray:
 
 
 def bound(seed: int) -> np.ndarray:
-    """Of one who knows gusts and noise: the Kalman filter's innovations at the truth."""
+    """Return the bound for known gusts and noise: the Kalman filter's innovations at the truth."""
     model = with_delays(turbulent(), inputs=["lat", "lon"])
     values = {n: float(v) for n, v in naming.asdict(truth()).items()} | study.DELAYS
     flights = [
@@ -63,7 +63,7 @@ def bound(seed: int) -> np.ndarray:
 
 
 def stated(seed: int, method: str) -> np.ndarray:
-    """By a fit."""
+    """Return the covariance that a fit states."""
     found = fit(study.problem(seed, **study.METHODS[method]), starts=1)
     e = evaluate(*found.reached)
     return covariance(e, len(study.truths()))
@@ -71,7 +71,9 @@ def stated(seed: int, method: str) -> np.ndarray:
 
 @functools.cache
 def doublets() -> list[tuple[np.ndarray, np.ndarray]]:
-    """By stick the outputs (k,) at the truth over their noise, and the derivatives (k, q)."""
+    """Return for each stick the outputs (k,) at the truth over their noise, and the derivatives (k,
+    q).
+    """
     model, vehicle = study.models()[0], naming.asdict(study.linear_vehicle())
     names, N, made = list(study.truths()), round(4.0 / study.DT), []
     for stick in ("lat", "lon"):
@@ -88,7 +90,7 @@ def doublets() -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def tics(covariance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Of draws (DRAWS,)."""
+    """Return the TIC of draws (DRAWS,)."""
     errors = rng.multivariate_normal(np.zeros(len(covariance)), covariance, DRAWS)
     each = []
     for y, J in doublets():

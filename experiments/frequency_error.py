@@ -1,9 +1,10 @@
-"""Frequency error on the disturbed bench: errors, and how many intervals hold the truth.
+"""Frequency error on the disturbed bench: errors, and coverage of the intervals.
 
     .venv/bin/python experiments/frequency_error.py [RUNS] [METHOD]
 
-Records of 120 s made with SciPy alone, with gusts as large as the stick's response and with none;
-Ixx, If and kappa start 1.3 times off. METHOD (frequency-error) may be output-error as well.
+Records of 120 s are made with SciPy alone, with gusts as large as the stick's response and without.
+Ixx, If and kappa start off by a factor of 1.3. METHOD (frequency-error) may be output-error as
+well.
 """
 
 from pathlib import Path
@@ -24,13 +25,13 @@ VEHICLE = load_vehicle(
 
 
 def steps(rng: np.random.Generator) -> np.ndarray:
-    """Random steps of 0.2 to 1.5 s, 3 um at most."""
+    """Return random steps of 0.2 to 1.5 s, at most 3 um."""
     lengths = (rng.uniform(0.2, 1.5, SAMPLES) / DT).astype(int) + 1
     return 3e-6 * np.repeat(rng.uniform(-1.0, 1.0, SAMPLES), lengths)[:SAMPLES]
 
 
 def problem(seed: int, sigma: float, method: str) -> Problem:
-    """A record in gusts of sigma [rad/s^2], to be fitted from 1.3 times the truth."""
+    """Return the problem of a record in gusts of sigma [rad/s^2], from 1.3 times the truth."""
     rng = np.random.default_rng(seed)
     u = steps(rng)
     roll = response(VEHICLE, u, DT, sigma, TAU, rng)[:, 0]
@@ -44,7 +45,7 @@ def problem(seed: int, sigma: float, method: str) -> Problem:
 
 
 def one_run(seed: int, sigma: float, method: str) -> tuple[np.ndarray, np.ndarray]:
-    """Relative errors, and errors in units of the sd that the fit states."""
+    """Return relative errors, and errors in units of the stated sd."""
     found = fit(problem(seed, sigma, method))
     truth = np.array([float(getattr(VEHICLE, n)) for n in NAMES])
     value = np.array([found.estimates[n].value for n in NAMES])

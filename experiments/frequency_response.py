@@ -1,13 +1,12 @@
-"""Fits in the frequency domain on the disturbed bench, over the Cramér-Rao bound.
+"""Fits in the frequency domain on the disturbed bench, relative to the Cramér-Rao bound.
 
     .venv/bin/python experiments/frequency_response.py [RUNS] [WINDOW]
 
-Records of 120 s made with SciPy alone, moved by pilot steps or by a chirp, with gusts as large as
-the stick's response and with none; Ixx, If and kappa start 1.3 times off. `frequency-response` (in
-windows of WINDOW, 20 s) and `frequency-error` fit the same records. The bound is that of an
-estimator that knows the gusts' spectrum and the noise: the sensitivities of the response through
-the Kalman filter that makes them white. Covered: of the 95 % intervals that are stated; where a
-parameter is called not identifiable there is none.
+Records of 120 s are made with SciPy alone, with pilot steps or a chirp. Gusts are as large as the
+stick's response, or absent; Ixx, If and kappa start off by a factor of 1.3. `frequency-response`
+(in windows of WINDOW, 20 s) and `frequency-error` fit the same records. The bound is for known gust
+spectrum and noise: the sensitivities of the response after the Kalman filter that whitens gusts and
+noise. Coverage counts only stated 95 % intervals; a parameter that is not identifiable has none.
 """
 
 import time
@@ -29,14 +28,14 @@ METHODS = ("frequency-response", "frequency-error")
 
 
 def chirp(rng: np.random.Generator) -> np.ndarray:
-    """From 0.1 to 5 Hz, an octave in the same time as any other, from a random phase."""
+    """Return a chirp from 0.1 to 5 Hz with equal time per octave and a random phase."""
     t = DT * np.arange(SAMPLES)
     hz = 0.1 * 50.0 ** (t / t[-1])
     return 1.7e-6 * np.sin(2.0 * np.pi * (np.cumsum(hz) * DT + rng.uniform()))
 
 
 def still(v, u: np.ndarray) -> np.ndarray:
-    """Roll (N,) without gusts."""
+    """Return roll (N,) without gusts."""
     A, B = matrices(v)
     M = np.zeros((5, 5))
     M[:4, :4], M[:4, 4] = A, B
@@ -46,7 +45,7 @@ def still(v, u: np.ndarray) -> np.ndarray:
 
 
 def bound(u: np.ndarray, sigma: float) -> np.ndarray:
-    """Relative Cramér-Rao standard deviations (3,) for gusts and noise that are known."""
+    """Return relative Cramér-Rao standard deviations (3,) for known gusts and noise."""
     rows, h = [], 1e-4
     for name in NAMES:
         value = float(getattr(VEHICLE, name))
@@ -59,7 +58,9 @@ def bound(u: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def whitened(s: np.ndarray, sigma: float) -> np.ndarray:
-    """Signals (N, q) by the filter that makes gusts and noise white, over its innovations' sd."""
+    """Return signals (N, q) after the filter that whitens gusts and noise, over the innovations'
+    sd.
+    """
     A = np.zeros((5, 5))
     A[:4, :4] = matrices(VEHICLE)[0]
     A[1, 4], A[4, 4] = 1.0, -1.0 / TAU
@@ -78,7 +79,7 @@ def whitened(s: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def record(rng: np.random.Generator, u: np.ndarray, sigma: float) -> Flight:
-    """Roll of a stick u in gusts of sigma [rad/s^2]."""
+    """Return the roll record for a stick u in gusts of sigma [rad/s^2]."""
     roll = response(VEHICLE, u, DT, sigma, TAU, rng)[:, 0]
     roll = roll + NOISE * rng.standard_normal(SAMPLES)
     return Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll": roll})
@@ -87,8 +88,9 @@ def record(rng: np.random.Generator, u: np.ndarray, sigma: float) -> Flight:
 def one_fit(
     flight: Flight, method: str, window: float | None
 ) -> tuple[Fit, np.ndarray, np.ndarray]:
-    """A fit from 1.3 times the truth, relative errors, and whether the stated 95 % intervals hold
-    the truth (NaN where none is stated)."""
+    """Return a fit from 1.3 times the truth, relative errors, and whether the 95 % intervals
+    contain the truth (NaN if not stated).
+    """
     truth = np.array([float(getattr(VEHICLE, n)) for n in NAMES])
     free = {n: Free(1.3 * t) for n, t in zip(NAMES, truth, strict=True)}
     options = ResponseOptions(window=window)
@@ -108,8 +110,9 @@ def one_fit(
 def one_run(
     seed: int, move: Callable, sigma: float, window: float
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, float, float]]:
-    """By method relative errors, which intervals hold the truth, the bound, the time, and whether
-    chi-squared lies in the interval that is expected of it (NaN where there is none)."""
+    """Return for each method: relative errors, intervals with the truth, the bound, the time, and
+    whether chi-squared is in its expected interval (NaN if there is none).
+    """
     rng = np.random.default_rng(seed)
     u = move(rng)
     flight = record(rng, u, sigma)

@@ -1,9 +1,9 @@
-"""Where output error ends from starts far off, by itself and after a fit in frequency.
+"""Convergence of output error from distant starts, alone and after a fit in frequency.
 
     .venv/bin/python experiments/frequency_start.py [RUNS]
 
-A lightly damped stand (60 swings in a record of 60 s, by SciPy); Ixx, If and kappa start up to
-FACTOR times off, log-uniformly. Counted are the fits that end within 2 % of the truth.
+The stand is lightly damped (60 swings in a record of 60 s, by SciPy). Ixx, If and kappa start up to
+FACTOR times off, log-uniformly. The table counts the fits that end within 2 % of the truth.
 """
 
 import sys
@@ -25,7 +25,7 @@ NAMES = ("Ixx", "If", "kappa")
 
 
 def arrives(problem: Problem) -> tuple[bool, int, float]:
-    """Whether output error ends at the truth, its steps, and its time [s]."""
+    """Return whether output error converges to the truth, its steps, and its time [s]."""
     began = time.perf_counter()
     found = fit(problem)
     near = all(abs(found.estimates[n].value / STAND[n] - 1.0) < 0.02 for n in NAMES)

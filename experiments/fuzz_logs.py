@@ -1,12 +1,12 @@
-"""Damaged logs: each file truncated and with flipped bytes, many times over.
+"""Robustness against damaged logs: files are truncated, and bytes are flipped, many times.
 
-Every attempt has to end in a flight or in one sentence, within ten seconds. Run it on any logs:
+Every attempt must end in a flight or in one sentence, within ten seconds. Run it on any logs:
 
     .venv/bin/python experiments/fuzz_logs.py LOG --count 500
 
-It prints how many ended how, the slowest, and the process's largest memory; exit code 1 where one
-ended in a traceback or hung, or the memory went beyond 1 GB. A long run is made of pieces by
-`--seed` and `--seconds`.
+It prints the outcomes, the slowest attempt, and the process's largest memory. The exit code is 1
+after a traceback or a hang, or if the memory exceeded 1 GB. `--seed` and `--seconds` split a long
+run.
 """
 
 import argparse
@@ -29,11 +29,11 @@ from heli_jax.flights.convert import Selection, convert_log
 from heli_jax.flights.describe import describe_flights
 
 LONGEST = 10
-"""s of processor time, for one attempt"""
+"""Longest processor time of one attempt [s]."""
 CONVERTED = 25
-"""one attempt of so many is converted too"""
+"""One of this many attempts is also converted."""
 MOST = 1000
-"""MB, for all of them"""
+"""Largest memory for all attempts [MB]."""
 
 
 class Hung(Exception):
@@ -41,15 +41,15 @@ class Hung(Exception):
 
 
 def damaged(data: bytes, count: int, seed: int = 0) -> Iterator[tuple[str, bytes]]:
-    """What was done to the bytes, and the result: `count` truncations and as many flips."""
+    """Yield descriptions of damage and the damaged bytes: `count` truncations and as many flips."""
     rng = np.random.default_rng(seed)
-    # In turns, so that a run that is ended early has had both.
+    # In turn, so that a run that ends early has both.
     for size in rng.integers(0, len(data), count).tolist():
         yield f"cut at {size}", data[:size]
-        # A few bytes at a time: a single one mostly hits samples, which nobody can tell.
+        # A few bytes at a time, since a single one mostly hits samples, which is undetectable.
         flipped = bytearray(data)
         places = rng.integers(0, len(data), int(rng.integers(1, 9))).tolist()
-        # Half of them near the beginning, where headers and formats are.
+        # Half of them near the start, in headers and formats.
         if rng.random() < 0.5:
             places = [place % min(2000, len(data)) for place in places]
         for place in places:
@@ -58,14 +58,14 @@ def damaged(data: bytes, count: int, seed: int = 0) -> Iterator[tuple[str, bytes
 
 
 def outcome(path: Path, converts: bool = True) -> str:
-    """`flight`, `noted` (a flight with a stated loss) or `refused`.
+    """Return `flight`, `noted` (a flight with a stated loss) or `refused`.
 
     Args:
         path: the file.
-        converts: whether the flight is put on one clock, too, which takes the most time.
+        converts: True to convert the flight to one clock too, the slowest part.
 
     Raises:
-        AssertionError: the error is none of one sentence, or the text is none for a terminal.
+        AssertionError: the error is not one sentence, or the text is unsafe for a terminal.
         Hung: it took too long.
     """
 
@@ -73,7 +73,7 @@ def outcome(path: Path, converts: bool = True) -> str:
         raise Hung
 
     before = signal.signal(signal.SIGPROF, alarm)
-    # Of this process, so that others on the machine do not count.
+    # Time of this process, without other load.
     signal.setitimer(signal.ITIMER_PROF, LONGEST)
     try:
         flights = list(describe_flights(path))
@@ -115,7 +115,7 @@ def main() -> int:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / log.name
             path.write_bytes(log.read_bytes())
-            outcome(path)  # whole, so that what is imported meanwhile is no attempt's time
+            outcome(path)  # undamaged first, so that imports do not count
             attempts = damaged(log.read_bytes(), count, options.seed)
             for number, (words, data) in enumerate(attempts):
                 if time.monotonic() - began_all > options.seconds:
@@ -123,7 +123,7 @@ def main() -> int:
                 path.write_bytes(data)
                 began = time.process_time()
                 try:
-                    # Two after another are of both kinds of damage.
+                    # Two consecutive attempts have both kinds of damage.
                     counts[outcome(path, number % (2 * CONVERTED) >= 2 * CONVERTED - 2)] += 1
                 except (Exception, Hung) as e:
                     failed = True

@@ -1,12 +1,12 @@
-"""Gusts on four axes: do the intervals cover, and does the model table find the one left out?
+"""Gusts on four axes: coverage of the intervals, and detection of a disturbance left out.
 
     .venv/bin/python experiments/gusts_on_axes.py [RUNS] [SAMPLES] [--out FOLDER]
 
-A hovering machine's rates and heave (p, q, r, w) with coupled damping, each disturbed by an
-Ornstein-Uhlenbeck push with a size and a time constant of its own, simulated with SciPy alone.
-Every record is fitted with all four disturbances, and with each of them left out in turn; the table
-finds the one left out where AIC prefers all four to the model that lacks it. FOLDER
-(runs/gusts-on-axes) keeps one line a run, so that a run that was stopped goes on where it was.
+A hovering vehicle's rates and heave (p, q, r, w) have coupled damping. Each is disturbed by an
+Ornstein-Uhlenbeck process with its own size and time constant, simulated with SciPy alone. Every
+record is fitted with all four disturbances, and with each left out in turn. The missing one is
+found if AIC prefers all four. FOLDER (runs/gusts-on-axes) stores a line for each run, so that an
+interrupted study can continue.
 """
 
 import json
@@ -70,7 +70,7 @@ MODEL = Model(
 
 
 def record(seed: int, n: int) -> Flight:
-    """A flight in gusts, exact from sample to sample (Van Loan, 1978)."""
+    """Return a flight in gusts, exact from sample to sample (Van Loan, 1978)."""
     rng = np.random.default_rng(seed)
     t = TRUTH
     machine = np.array(
@@ -84,7 +84,8 @@ def record(seed: int, n: int) -> Flight:
     drive = np.diag(np.concatenate([np.zeros(4), 2.0 * sigma**2 / tau]))
     loan = scipy.linalg.expm(np.block([[-A, drive], [np.zeros((8, 8)), A.T]]) * DT)
     Q = loan[8:, 8:].T @ loan[:8, 8:]
-    # Q is all but singular: the gust's effect on a rate within one sample is nearly the gust's own.
+    # Q is almost singular: within one sample a gust's effect on a rate almost equals the gust
+    # itself.
     values, vectors = np.linalg.eigh(0.5 * (Q + Q.T))
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     u = np.stack([0.2 * random_steps(n, DT, rng, (0.3, 2.0)) for _ in ON])
@@ -97,7 +98,7 @@ def record(seed: int, n: int) -> Flight:
 
 
 def problem(flight: Flight) -> Problem:
-    """All four disturbed, every derivative away from the truth by a factor."""
+    """Return the problem with all four disturbances, and every derivative off by a factor."""
     free = {name: Free(0.6 * value) for name, value in TRUTH.items()}
     model = with_disturbance(MODEL, ON)
     start = model.Params(**{n: jnp.asarray(v) for n, v in TRUTH.items()})
@@ -106,7 +107,7 @@ def problem(flight: Flight) -> Problem:
 
 
 def one_run(seed: int, n: int) -> dict[str, Any]:
-    """Which intervals cover, and by how much AIC and whiteness speak against each one left out."""
+    """Return which intervals cover, and the AIC and whiteness against each disturbance left out."""
     flight = record(seed, n)
     sets = disturbed_sets(problem(flight), MODEL, ON).problems
     whole = fit(sets[f"all: {', '.join(ON)}"])

@@ -1,13 +1,13 @@
-"""What separates the lift slope a from the inertias: thrust carries a known mass.
+"""Separation of the lift slope a from the inertias through the thrust, which carries a known mass.
 
     .venv/bin/python experiments/heave_separates_a.py [CASES | --quick] [--out FOLDER]
 
 Six two-second records of the X-Cell 60 about hover, all sticks moving, with position, attitude and
 rotor speed measured to 2 mm, 2 mrad and 0.5 rad/s. The roll angle alone determines none of the
-parameters: nothing shows the rotor's speed, the climb and where the rest of the machine began.
-Position shows the thrust, which knows a beside the mass, and a balance gives that. Moving the
-throttle by 3 % tells the rotor's inertia from the motor's gain as well; with 0.2 % only their
-product is known. In gusts that roll it, the extended Kalman filter finds five from one record.
+parameters, since it does not show the rotor speed, the climb and the other initial states. Position
+shows the thrust, which depends on a and the mass, and a balance gives the mass. Moving the throttle
+by 3 % also separates the rotor's inertia from the motor's gain; with 0.2 % only their product is
+known. In rolling gusts, the extended Kalman filter estimates five parameters from one record.
 FOLDER (runs/heave) gets results.json and page.md.
 """
 
@@ -32,11 +32,11 @@ NOISE = {
 }  # fmt: skip
 FREE = ("a", "Ixx", "Iyy", "Izz", "If", "Ir", "K_theta0", "K_throttle", "K_theta0T")
 STICKS = {"x_roll": (1e-3, 10), "x_pitch": (1e-3, 10), "x_yaw": (0.2, 15)}
-"""size of the steps, and samples between two of them"""
+"""Size of the steps, and samples between two of them."""
 MODEL = models.helicopter("consistent")
 DISTURBED = with_disturbance(MODEL, "roll")
 GUSTS = {"sigma_w": 0.5, "tau_w": 0.5}
-"""rolling gusts [rad/s^2, s]"""
+"""Rolling gusts [rad/s^2, s]."""
 IN_GUSTS = ("a", "Ixx", "If", "Ir", "K_theta0")
 
 
@@ -45,7 +45,7 @@ def vehicle() -> Any:
 
 
 def in_gusts() -> Any:
-    """The vehicle's constants with those of the gusts."""
+    """Return the vehicle's constants with those of the gusts."""
     gusts = {n: jnp.asarray(v) for n, v in GUSTS.items()}
     return DISTURBED.Params(**asdict(vehicle()), **gusts)
 
@@ -53,7 +53,7 @@ def in_gusts() -> Any:
 def sticks(
     hover: Trim, rng: np.random.Generator, throttle: float, moved: tuple[str, ...] = tuple(STICKS)
 ) -> dict[str, np.ndarray]:
-    """Steps about hover, the throttle by up to `throttle` to both sides."""
+    """Return steps about hover, with the throttle by up to `throttle` in both directions."""
     inputs = {}
     for name, about in hover.inputs._asdict().items():
         size, hold = (throttle, 15) if name == "x_throttle" else STICKS[name]
@@ -70,7 +70,7 @@ def records(
     moved: tuple[str, ...] = tuple(STICKS),
     count: int = 6,
 ) -> list[Flight]:
-    """Records about hover, the throttle moved by up to `throttle` to both sides."""
+    """Return records about hover, with the throttle by up to `throttle` in both directions."""
     params = vehicle()
     hover = trim(MODEL, params)
     flights = []
@@ -94,7 +94,7 @@ def records(
 
 
 def gusty() -> Flight:
-    """A record in gusts, all sticks and the throttle moved."""
+    """Return a record in gusts, with all sticks and the throttle moving."""
     hover = trim(MODEL, vehicle())
     inputs = sticks(hover, np.random.default_rng(0), 0.03)
     start = DISTURBED.State(**asdict(hover.state), w1_roll=jnp.asarray(0.3))
@@ -109,7 +109,7 @@ def gusty() -> Flight:
 
 
 def identify(flights: list[Flight], names: tuple[str, ...] = FREE) -> Fit:
-    """Fitted from values that are off by 15 % in the mean."""
+    """Fit from values that are off by 15 % on average."""
     params = vehicle()
     rng = np.random.default_rng(0)
     free = {
@@ -122,7 +122,7 @@ def identify(flights: list[Flight], names: tuple[str, ...] = FREE) -> Fit:
 
 
 def identify_in_gusts() -> Fit:
-    """Fitted by filter error from values that are off by 10 %."""
+    """Fit by filter error from values that are off by 10 %."""
     params = in_gusts()
     free = {n: Free(1.1 * float(getattr(params, n))) for n in IN_GUSTS}
     options = {"method": "filter-error", "substeps": 1}

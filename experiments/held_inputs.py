@@ -1,14 +1,13 @@
-"""What a held input costs that is brought to another rate: the bias of If by how that is done.
+"""Bias of If from resampling a held input in different ways.
 
     .venv/bin/python experiments/held_inputs.py [RUNS]
 
-The roll stand (eqs 21-22, by hand) is simulated by SciPy in steps of 1 ms with a stick that steps
-at any of them, and logged at 100 Hz with a jitter of a fifth of a step. Each log is fitted by
-output error at 50 and 100 Hz: with the stick's value at the grid's instants, with its mean over
-the grid's steps (what the reader makes of it), and with the mean and a free time shift. A second
-stick steps with the log's stamps, and so is logged when it acts; the first is seen 5 ms late on
-average, whatever is done with the log. The table has the mean error of If in percent, how far that
-may be from zero by chance, and the mean shift.
+SciPy simulates the roll stand (eqs 21-22, by hand) in steps of 1 ms, with a stick that steps at any
+of them. It is logged at 100 Hz with a jitter of a fifth of a step. Each log is fitted by output
+error at 50 and 100 Hz: with the stick's value at the grid's times, with its mean over the grid's
+steps (as the reader does), and with the mean and a free time shift. A second stick steps at the
+log's stamps, so it is logged when it acts. The first is 5 ms late on average in any log. The table
+has the mean error of If in percent, its chance deviation from zero, and the mean shift.
 """
 
 import dataclasses
@@ -36,7 +35,7 @@ LENGTH, STEP, RATE, JITTER, NOISE = 20.0, 1e-3, 100.0, 0.2, 2e-3
 
 
 def dynamics() -> tuple[np.ndarray, np.ndarray]:
-    """A (4, 4) and B (4, 1) of phi, dphi, beta, dbeta on the stand."""
+    """Return A (4, 4) and B (4, 1) of phi, dphi, beta, dbeta on the stand."""
     k = KNOWN
     paddle = k["rho"] * k["a"] * k["c"] * (k["R2"] ** 4 - k["R1"] ** 4) / (8 * TRUTH["If"])
     k1 = paddle * k["Omega"] ** 2
@@ -54,11 +53,11 @@ def dynamics() -> tuple[np.ndarray, np.ndarray]:
 
 
 def record(rng: np.random.Generator, with_stamps: bool) -> tuple[np.ndarray, ...]:
-    """Stamps [s], stick [m] and roll [rad] of a log, each (N,).
+    """Return stamps [s], stick [m] and roll [rad] of a log, each (N,).
 
     Args:
-        rng: of steps, jitter and noise.
-        with_stamps: whether the stick steps at the log's own stamps.
+        rng: generator for steps, jitter and noise.
+        with_stamps: True if the stick steps at the log's own stamps.
     """
     n = round(LENGTH / STEP)
     count = int(LENGTH * RATE) - 1
@@ -69,7 +68,7 @@ def record(rng: np.random.Generator, with_stamps: bool) -> tuple[np.ndarray, ...
         edges = np.unique(rows[np.clip(np.searchsorted(rows, edges), 0, count - 1)])
     levels = 2e-6 * rng.uniform(-1, 1, edges.size + 1)
     stick = levels[np.searchsorted(edges, np.arange(n), side="right")]
-    # Any: the stubs know these functions for transfer functions alone.
+    # Any: the stubs support only transfer functions here.
     signal: Any = scipy.signal
     A, B, *_ = signal.cont2discrete((*dynamics(), np.eye(4), np.zeros((4, 1))), STEP)
     states = signal.dlsim((A, B, np.eye(4), np.zeros((4, 1)), STEP), stick)[2]
@@ -78,12 +77,12 @@ def record(rng: np.random.Generator, with_stamps: bool) -> tuple[np.ndarray, ...
 
 
 def flights(rows: np.ndarray, rate: float, folder: Path) -> dict[str, Flight]:
-    """A log's flight as read, and with the stick's value at the grid's instants by hand.
+    """Return a log's flight as read, and with the stick's value at the grid's times.
 
     Args:
         rows: stamps, stick, roll (N, 3).
-        rate: of the fit [Hz].
-        folder: for the log.
+        rate: rate of the fit [Hz].
+        folder: folder for the log.
     """
     path = folder / "log.csv"
     np.savetxt(path, rows, delimiter=",", header="t,stick,phi", comments="", fmt="%.9g")
@@ -97,7 +96,7 @@ def flights(rows: np.ndarray, rate: float, folder: Path) -> dict[str, Flight]:
 
 
 def estimate(flight: Flight, shift: bool) -> tuple[float, float]:
-    """Error of If [%] and shift [ms]."""
+    """Return the error of If [%] and the shift [ms]."""
     free = {"Ixx": Free(0.03), "If": Free(2.5e-4)}
     params = Helicopter(**KNOWN, **TRUTH)
     nuisance = Nuisance(time_shift=shift)

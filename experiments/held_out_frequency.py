@@ -1,11 +1,11 @@
-"""Flights held out of fits in frequency: how often they are believed, and what they find.
+"""Flights held out of fits in frequency: how often they agree, and which faults they reveal.
 
     .venv/bin/python experiments/held_out_frequency.py [RUNS] [METHOD]
 
-The disturbed bench of frequency_error.py: a record of 120 s is fitted, and four of 60 s are held
-out, made with SciPy alone: the same machine in gusts as strong, twice as strong and without any,
-and one whose inertia is a tenth larger. Printed: how often each gives other estimates (1 % by
-chance), and the share of what follows the excitation that the model explains.
+The disturbed bench of frequency_error.py: a record of 120 s is fitted, and four of 60 s, made with
+SciPy alone, are held out. They have the same vehicle in equal gusts, double gusts and no gusts, and
+one with a tenth more inertia. The table shows how often each gives other estimates (1 % by chance),
+and the share of the response to the excitation that the model explains.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ CASES = {
 
 
 def flight(seed: int, case: str, samples: int) -> Flight:
-    """A record of one case."""
+    """Return a record of one case."""
     rng = np.random.default_rng(seed)
     u = steps(rng)[:samples]
     vehicle, sigma = CASES[case]

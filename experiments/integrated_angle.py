@@ -1,13 +1,13 @@
-"""An autopilot's attitude beside its gyro: what filter error makes of the two.
+"""Filter error with an autopilot's attitude and the gyro from which it was integrated.
 
     .venv/bin/python experiments/integrated_angle.py [RUNS]
 
 A flybarless roll in gusts is simulated in steps of 1 ms; a pilot holds it level, slowly. The gyro
-is read at 1 kHz with white noise and logged at 100 Hz. The angle is logged twice: as a sensor of
-its own would give it, with white noise, and as an autopilot does, which integrates the gyro and
-leans on an accelerometer within five seconds. The table has, by what the fit was given, how many
-95 % intervals hold the truth, the mean error by the standard deviation that the fits state, and
-the estimates' mean and scatter.
+is read at 1 kHz with white noise and logged at 100 Hz. The angle is logged twice: from a separate
+sensor with white noise, and from an autopilot. The autopilot integrates the gyro and follows an
+accelerometer within five seconds. For each set of signals, the table has the number of 95 %
+intervals with the truth, the mean error in units of the stated sd, and the estimates' mean and
+scatter.
 """
 
 from typing import Any
@@ -25,14 +25,14 @@ jax.config.update("jax_enable_x64", True)
 TRUTH = {"Lb": 90.0, "tau_f": 0.06, "Blat": 0.2}
 STARTS = {"Lb": 166.0, "tau_f": 0.046, "Blat": 0.14}
 GUST, GUST_TIME = 1.5, 0.3
-"""standard deviation [rad/s^2] and correlation time [s]"""
+"""Standard deviation [rad/s^2] and correlation time [s]."""
 STEP, EVERY, DURATION = 1e-3, 10, 60.0
 GYRO, SENSOR, ACCELEROMETER, LEANS = 0.03, 0.004, 0.05, 0.2
-"""noises [rad/s, rad, rad], and how the estimator follows the accelerometer [1/s]"""
+"""Noises [rad/s, rad, rad], and the rate at which the estimator follows the accelerometer [1/s]."""
 
 
 def logged(seed: int) -> dict[str, np.ndarray]:
-    """One flight at 100 Hz: stick, gyro, angle of a sensor, angle of an estimator."""
+    """Return one flight at 100 Hz: stick, gyro, angle of a sensor, angle of an estimator."""
     rng, n = np.random.default_rng(seed), int(DURATION / STEP)
     wanted, k = np.zeros(n), 0
     while k < n:
@@ -69,7 +69,7 @@ def logged(seed: int) -> dict[str, np.ndarray]:
 
 
 def fitted(record: dict[str, np.ndarray], angle: str | None) -> Any:
-    """Filter error with a gust on roll; the angle by its name in the record, or none."""
+    """Fit by filter error with a gust on roll; the angle by its name in the record, or none."""
     roll = linear_model("roll-flybarless")
     model = with_disturbance(roll.model, "roll")
     gust = {"sigma_w": jnp.asarray(1.0), "tau_w": jnp.asarray(0.2)}

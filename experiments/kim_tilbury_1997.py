@@ -1,11 +1,12 @@
-"""Section 3 of Kim & Tilbury (1997) in kind, as a page to lay beside the paper.
+"""Section 3 of Kim & Tilbury (1997), repeated as a page to compare with the paper.
 
     .venv/bin/python experiments/kim_tilbury_1997.py [--out FOLDER]
 
-A stand run with a disturbance, made with the numbers of eq. 36, so that its truth is known; RLS of
-order 4 (eqs 25-33) with Figures 5 and 6; eqs 34 and 35 into each other, both ways; and what such a
-run determines of eq. 36, by output error and by filter error. FOLDER (runs/kim-tilbury-1997) gets
-page.md, results.json, and the figures as SVG and PNG. Takes about three minutes on two cores.
+It simulates a stand run with a disturbance from the numbers of eq. 36, so the truth is known. It
+then runs RLS of order 4 (eqs 25-33) with Figures 5 and 6, and converts eqs 34 and 35 both ways.
+Output error and filter error show which parameters of eq. 36 such a run determines. FOLDER
+(runs/kim-tilbury-1997) gets page.md, results.json, and the figures as SVG and PNG. Takes about
+three minutes on two cores.
 """
 
 import os
@@ -48,9 +49,9 @@ EQ_35 = (
     ("1", "44.83", "5648", "209600", "1012000"),
 )
 RPM = (1300, 1900)
-"""rotor speeds of section 2.3"""
+"""Rotor speeds of section 2.3 [rpm]."""
 A_PRIOR = Prior(5.5, 0.75)
-"""'between 4 and 7' as a 95 % interval"""
+"""'between 4 and 7' as a 95 % interval."""
 INERTIAS = {"Ixx": Free(0.03), "If": Free(2.5e-4), "kappa": Free(3.0)}
 FITS: dict[str, tuple[Any, dict[str, Free]]] = {
     "output error, a free": ("output-error", INERTIAS | {"a": Free(5.5)}),
@@ -63,7 +64,7 @@ FITS: dict[str, tuple[Any, dict[str, Free]]] = {
 
 @dataclass(frozen=True)
 class Run:
-    """What the page tells of."""
+    """Data of the page."""
 
     bench: Any
     flights: dict[str, Flight]
@@ -71,7 +72,7 @@ class Run:
     problems: dict[str, Problem]
     fits: dict[str, Fit]
     tripled: float
-    """largest change of the simulated roll angle with three times the Ixx, If and a [rad]"""
+    """Largest change of the simulated roll angle with three times Ixx, If and a [rad]."""
 
 
 @jax.jit
@@ -86,7 +87,7 @@ def disturbed(bench: Any, sigma_w: float, tau_w: float) -> Any:
 def record(
     name: str, bench: Any, seed: int, *, stick: float = STICK, noise: float, sigma_w: float
 ) -> Flight:
-    """A run on the stand; the same seed has the same steps, noise and disturbance."""
+    """Simulate a run on the stand; equal seeds have equal steps, noise and disturbance."""
     rng = np.random.default_rng(seed)
     u = stick * random_steps(N, DT, rng, (0.2, 1.5))
     roll = response(disturbed(bench, sigma_w, TAU_W), jnp.asarray(u), jax.random.key(seed))
@@ -123,12 +124,12 @@ def run() -> Run:
 
 
 def inertias(bench: Any, rls: Baseline) -> dict[str, float]:
-    """Ixx and If by RLS where a is known."""
+    """Return Ixx and If from RLS with known a."""
     return {n: float(bench.a) / rls.combinations[f"a/{n}"] for n in ("Ixx", "If")}
 
 
 def agreements(r: Run) -> dict[str, Metrics]:
-    """How simulations from the stick agree with the stand run."""
+    """Return the agreement of simulations from the stick with the stand run."""
     agreement = {"RLS": r.rls[STAND_RUN].metrics}
     agreement |= {n: r.fits[n].metrics["roll"] for n in FITS if n.endswith("a known")}
     y, truth = (r.flights[n].outputs["roll"] for n in (STAND_RUN, ALONE))
@@ -136,7 +137,7 @@ def agreements(r: Run) -> dict[str, Metrics]:
 
 
 def digits() -> list[dict[str, Any]]:
-    """Eq. 35 as printed and as the real part of the logarithm makes it of eq. 34."""
+    """Return eq. 35 as printed, and as the real part of the logarithm of eq. 34."""
     rows = []
     for side, printed, values in zip(
         ("num", "den"), EQ_35, d2c(*EQ_34, DT, "real-log"), strict=True
@@ -149,13 +150,13 @@ def digits() -> list[dict[str, Any]]:
 
 
 def last_digit(printed: str) -> float:
-    """What one unit of the last digit is worth; the zeros at the end of an integer fill up."""
+    """Return the value of one unit of the last digit; trailing zeros of an integer do not count."""
     whole, _, decimals = printed.partition(".")
     return 10.0 ** (-len(decimals) if decimals else len(whole) - len(whole.rstrip("0")))
 
 
 def refusal() -> str:
-    """Why eq. 34 has no inverse of the zero-order hold, in the program's words."""
+    """Return the message why eq. 34 has no inverse of the zero-order hold."""
     try:
         d2c(*EQ_34, DT, "zoh")
     except ValueError as e:
@@ -164,25 +165,27 @@ def refusal() -> str:
 
 
 def sampled_35() -> tuple[np.ndarray, np.ndarray]:
-    """Eq. 35 sampled with a zero-order hold."""
+    """Return eq. 35 sampled with a zero-order hold."""
     num, den = ([float(text) for text in side] for side in EQ_35)
     return c2d(num, den, DT)
 
 
 def fastest_rotor() -> float:
-    """The largest Omega [rpm] that eq. 23, on any stand, allows with the s^2 of eq. 35: that
-    coefficient is Omega^2 + zeta c1 + kappa there, and nothing in it is negative."""
+    """Return the largest Omega [rpm] that eq. 23, on any stand, allows with the s^2 of eq. 35.
+
+    That coefficient is Omega^2 + zeta c1 + kappa, and no term is negative.
+    """
     return float(np.sqrt(float(EQ_35[1][2])) * 30.0 / np.pi)
 
 
 def roll_damping(p: Any) -> float:
-    """What damps a roll that the flybar follows, zeta + c3/c2 [1/s]: eq. 23 on the stand."""
+    """Return the roll damping with a following flybar, zeta + c3/c2 [1/s]: eq. 23 on the stand."""
     p1, p3 = roll_transfer_function(p, stand=True).den[1::2]
     return float((p3 - p.kappa * (p1 - p.zeta)) / p.Omega**2)
 
 
 def figure5(r: Run) -> Figure:
-    """Measured against simulated: by RLS, as the paper has it, and by filter error."""
+    """Draw measured and simulated roll: by RLS, as in the paper, and by filter error."""
     made, y = style.figure(5.2, constrained=True), r.flights[STAND_RUN].outputs["roll"]
     known = r.fits["filter error, a known"].signals[0].simulated["roll"]
     shown = {"RLS of order 4": r.rls[STAND_RUN].simulated, "Filter error, a known": known}
@@ -197,7 +200,7 @@ def figure5(r: Run) -> Figure:
 
 
 def figure6(r: Run) -> Figure:
-    """The stick at neutral, on the scale of Figure 5."""
+    """Draw the run with the stick at neutral, on the scale of Figure 5."""
     made, roll = style.figure(2.8, constrained=True), r.flights[NEUTRAL].outputs["roll"]
     ax = made.subplots()
     ax.plot(roll, color=style.BLUE, lw=0.8)
@@ -414,7 +417,7 @@ So an Ixx or If found with these equations is a number of that model, not of the
 
 
 def results(r: Run) -> dict[str, Any]:
-    """Every number of the page, as plain data."""
+    """Return every number of the page as plain data."""
     sizes = {"N": N, "dt": DT, "stick": STICK, "noise": NOISE, "sigma_w": SIGMA_W, "tau_w": TAU_W}
     roll = {n: f.outputs["roll"] for n, f in r.flights.items()}
     return {
@@ -449,7 +452,7 @@ def results(r: Run) -> dict[str, Any]:
 def main(folder: Path) -> None:
     done = run()
     folder.mkdir(parents=True, exist_ok=True)
-    # Written aside and moved at the end, so that nothing half-written lies there.
+    # Written to a temporary folder and moved at the end, so that no partial files remain.
     with tempfile.TemporaryDirectory(prefix=".new-", dir=folder) as aside:
         new = Path(aside)
         style.save(lambda: figure5(done), new / "figure5")

@@ -1,15 +1,15 @@
-"""Sixty records with a known fault and forty without: what a fit says of each.
+"""Results of fits to sixty records with a known fault and forty without.
 
     .venv/bin/python experiments/misfits.py [--quick] [--only WORDS] [--size N]
 
-A fit of a faulty record must not end with exit code 0 beside an estimate that lies more than three
-standard deviations outside its 95 % interval. At most one of the forty sound records may end with
-another code than 0. The records are integrated here, at 1 ms, by NumPy. Exit code 1 where a fit
+A fit of a faulty record must not end with exit code 0 if an estimate's 95 % interval misses the
+truth by more than three standard deviations. At most one of the forty sound records may end with a
+code other than 0. The records are integrated here, at 1 ms, by NumPy. The exit code is 1 if a fit
 fails.
 
-With --size N (20: 200 records) `check` and `fit` get N sound records of each kind, and a table says
-how often each code is a false doubt. At most 2 % of the records may have one, and none may end with
-another exit code.
+With --size N (20: 200 records) `check` and `fit` get N sound records of each kind, and a table
+shows how often each code is a false doubt. At most 2 % of the records may have one, and none may
+end with another exit code.
 """
 
 import argparse
@@ -29,13 +29,13 @@ from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.naming import Scalar
 
 H, EVERY, SECONDS = 1e-3, 20, 40.0
-"""step of the integration [s], steps in a sample, length of a record [s]"""
+"""Step of the integration [s], steps in a sample, length of a record [s]."""
 DT = H * EVERY
 LP, LD = -4.0, 30.0
 NOISE = 0.05
-"""sd of the measurement noise of p [rad/s]; of phi [rad]"""
+"""Standard deviation of the measurement noise of p [rad/s] and of phi [rad]."""
 FAR = 3.0
-"""standard deviations outside of an interval that no fit with exit code 0 may have"""
+"""Largest distance of the truth from an interval in a fit with exit code 0 [sd]."""
 
 
 class Params(NamedTuple):
@@ -65,29 +65,29 @@ ROLL = Model(
 
 
 class Roll(NamedTuple):
-    """A vehicle in roll, p' = Lp p + Ld f(d(t - delay)) + gust, and how it is flown and logged."""
+    """A vehicle in roll, p' = Lp p + Ld f(d(t - delay)) + gust, with its flight and log."""
 
     Lp: Callable[[float], float] = lambda t: LP
     Ld: Callable[[float], float] = lambda t: LD
     actuator: Callable[[np.ndarray], np.ndarray] = lambda d: d
     lag: float = 0.0
-    """time constant of a servo [s]"""
+    """Time constant of a servo [s]."""
     drag: float = 0.0
-    """of -drag p |p| [1/rad]"""
+    """Factor of -drag p |p| [1/rad]."""
     gust: float = 0.0
-    """sd of the gusts [rad/s^2], with a correlation time of 0.5 s"""
+    """Standard deviation of the gusts [rad/s^2], with a correlation time of 0.5 s."""
     feedback: float = 0.0
-    """of the loop d = command - feedback p [s/rad]"""
+    """Gain of the loop d = command - feedback p [s/rad]."""
     late: float = 0.0
-    """by which the log has the input later than it acted [s]"""
+    """Delay of the logged input relative to the acting one [s]."""
     smooth: bool = False
-    """whether the stick moves between samples"""
+    """True if the stick moves between samples."""
     mode: float = 0.0
-    """frequency of a lightly damped mode in the answer [rad/s]"""
+    """Frequency of a lightly damped mode in the response [rad/s]."""
     sensor: float = 0.0
-    """corner of a filter of the rate gyro [Hz]"""
+    """Corner frequency of the rate gyro's filter [Hz]."""
     input_noise: float = 0.0
-    """sd of the noise with which the input is measured"""
+    """Standard deviation of the input's measurement noise."""
 
 
 class Record(NamedTuple):
@@ -99,7 +99,7 @@ class Record(NamedTuple):
 
 
 def command(n: int, rng: np.random.Generator, smooth: bool) -> np.ndarray:
-    """A stick (n,) at the integration's rate: random steps, or a sum of sines up to 1 Hz."""
+    """Return a stick (n,) at the integration's rate: random steps, or a sum of sines up to 1 Hz."""
     t = H * np.arange(n)
     if smooth:
         hz = rng.uniform(0.1, 1.0, 12)
@@ -114,11 +114,11 @@ def command(n: int, rng: np.random.Generator, smooth: bool) -> np.ndarray:
 
 
 def flown(roll: Roll, rng: np.random.Generator, seconds: float = SECONDS) -> Record:
-    """The record of a vehicle."""
+    """Return the record of a vehicle."""
     n = round(seconds / H)
     asked = command(n, rng, roll.smooth)
     white = rng.standard_normal(n)
-    # A digital controller: its command is held from sample to sample.
+    # A digital controller, which holds its command between samples.
     p = phi = servo = gust = held = seen = 0.0
     x, v = 0.0, 0.0
     d, P, PHI = np.zeros(n), np.zeros(n), np.zeros(n)
@@ -130,7 +130,7 @@ def flown(roll: Roll, rng: np.random.Generator, seconds: float = SECONDS) -> Rec
         if k % EVERY == 0 or (roll.smooth and not roll.feedback):
             held = asked[k] - roll.feedback * (p + NOISE * white[k] * (k % EVERY == 0))
         d[k], P[k], PHI[k] = held, seen, phi
-        # A stick that moves is in the middle of the step where the mean of its ends is.
+        # In the middle of a step, a moving stick is at the mean of its ends.
         moved = 0.5 * (asked[min(k + 1, n - 1)] - asked[k]) if roll.smooth else 0.0
         u = float(roll.actuator(np.asarray(held + moved)))
         servo += H / roll.lag * (u - servo) if roll.lag else u - servo
@@ -144,7 +144,7 @@ def flown(roll: Roll, rng: np.random.Generator, seconds: float = SECONDS) -> Rec
         def accel(p: float, t: float = t, push: float = drive, gust: float = gust) -> float:
             return roll.Lp(t) * p + roll.Ld(t) * push - roll.drag * p * abs(p) + gust
 
-        # The midpoint rule: Euler's would be off by more than the intervals.
+        # The midpoint rule, since Euler's error would exceed the intervals.
         middle = p + 0.5 * H * accel(p)
         p, phi = p + H * accel(middle), phi + H * middle
     shift = round(roll.late / H)
@@ -155,13 +155,13 @@ def flown(roll: Roll, rng: np.random.Generator, seconds: float = SECONDS) -> Rec
 
 
 def flight(r: Record, *outputs: str, hold: str = "zero-order", dt: float = DT) -> Flight:
-    """A record as a flight with these outputs."""
+    """Return a record as a flight with these outputs."""
     measured = {n: getattr(r, n) for n in outputs}
     return Flight(dt=dt, inputs={"d": r.d}, outputs=measured, hold={"d": hold})
 
 
 def problem(*flights: Flight, **more: Any) -> Problem:
-    """Lp and Ld free, from half of what they are."""
+    """Return a problem with Lp and Ld free, from half of their values."""
     params = Params(jnp.asarray(LP), jnp.asarray(LD))
     free = {"Lp": Free(LP / 2), "Ld": Free(LD / 2)}
     return Problem(
@@ -175,7 +175,7 @@ def problem(*flights: Flight, **more: Any) -> Problem:
 
 
 class Case(NamedTuple):
-    """One problem; of what changes the truth is a range."""
+    """One problem; for changing parameters the truth is a range."""
 
     problem: Problem
     truth: dict[str, tuple[float, float]]
@@ -186,7 +186,7 @@ Make = Callable[[np.random.Generator], Case]
 
 
 def one(roll: Roll, *outputs: str, **more: Any) -> Make:
-    """A single flight of a vehicle."""
+    """Return a function that makes a single flight of a vehicle."""
 
     def make(rng: np.random.Generator) -> Case:
         hold, dt = more.get("hold", "zero-order"), more.get("dt", DT)
@@ -220,7 +220,7 @@ def in_gusts(feedback: float) -> Make:
 
 
 def filtered(base: Problem) -> Problem:
-    """The problem by filter error, with gusts of one pole."""
+    """Return the problem by filter error, with gusts of one pole."""
     model = with_disturbance(ROLL, "p")
     gusts = {"sigma_w": jnp.asarray(4.0), "tau_w": jnp.asarray(0.3)}
     params = model.Params(**base.vehicle._asdict(), **gusts)
@@ -228,7 +228,7 @@ def filtered(base: Problem) -> Problem:
 
 
 def wandering(rng: np.random.Generator) -> Case:
-    """Filter error beside an attitude that an autopilot integrated from its gyro."""
+    """Return filter error with an attitude that an autopilot integrated from its gyro."""
     case = in_gusts(0.0)(rng)
     f = case.problem.flights[0]
     walk = np.cumsum(NOISE * DT**0.5 * rng.standard_normal(f.n_samples))
@@ -302,11 +302,11 @@ SOUND: dict[str, Make] = {
 RIGHT = {
     "closed loop in gusts, filter error": {"loop.feedback", "loop.feedback-filtered"},
 }
-"""doubts that are true of sound records"""
+"""Doubts that are correct for sound records."""
 
 
 def size(count: int, words: str) -> int:
-    """False doubts on sound records: prints the table; the exit code."""
+    """Print the false doubts on sound records; return the exit code."""
     codes = {"check": collections.Counter(), "fit": collections.Counter()}
     doubted, changed, records = 0, 0, 0
     for i, (name, make) in enumerate(SOUND.items()):
@@ -335,7 +335,7 @@ def size(count: int, words: str) -> int:
 
 
 def outside(case: Case, result: Fit) -> float:
-    """Standard deviations by which an estimate lies outside of its 95 % interval, at most."""
+    """Return the largest distance of the truth from a 95 % interval [sd]."""
     worst = 0.0
     for name, (low, high) in case.truth.items():
         e = result.estimates[name]

@@ -1,11 +1,11 @@
-"""Filter error, output error and RLS on many disturbed bench runs: which numbers can be believed?
+"""Comparison of filter error, output error and RLS on many disturbed bench runs.
 
     .venv/bin/python experiments/monte_carlo.py [RUNS] [--out FOLDER]
 
-The disturbed bench: the 30-class machine on its stand (kappa free, zeta known), 6000 samples at
+The disturbed bench is the 30-class vehicle on its stand (kappa free, zeta known), 6000 samples at
 50 Hz, 2 mrad of measurement noise, random steps, and a disturbance whose response is as large as
-the driven one. FOLDER (runs/monte-carlo) keeps one line a run, so that a run that was stopped
-goes on where it was; table.md and monte_carlo.svg are made of all of them.
+the driven one. FOLDER (runs/monte-carlo) stores a line for each run, so that an interrupted study
+can continue. table.md and monte_carlo.svg cover all runs.
 """
 
 import json
@@ -55,7 +55,7 @@ def record(params: Any, seed: int) -> Flight:
 
 
 def one_run(params: Any, seed: int) -> dict[str, Any]:
-    """What every method says of one record: value, sd and seconds; None where it has none."""
+    """Return every method's result for one record: value, sd and seconds; None if there is none."""
     flight = record(params, seed)
     start = replace(params, sigma_w=jnp.asarray(0.0), tau_w=jnp.asarray(0.3))
     out: dict[str, Any] = {"seed": seed}
@@ -91,13 +91,15 @@ def one_run(params: Any, seed: int) -> dict[str, Any]:
 
 
 def undisturbed(params: Any) -> Any:
-    """The parameters of the model without its disturbance."""
+    """Return the parameters of the model without its disturbance."""
     plain = models.roll_on_stand.Params
     return plain(**{n: getattr(params, n) for n in names(plain)})
 
 
 def fisher(params: Any, records: int = 5) -> dict[str, float]:
-    """The Cramer-Rao sd of filter error at the truth, relative: no unbiased method does better."""
+    """Return the relative Cramer-Rao sd of filter error at the truth, a bound for
+    unbiased methods.
+    """
     free = {n: Free(float(getattr(params, n))) for n in FREE}
     sds = []
     for seed in range(records):
@@ -125,10 +127,10 @@ def rows(runs: list[dict[str, Any]], params: Any, bound: dict[str, float]) -> li
                 continue
             true = float(getattr(params, name))
             sds = np.array([d["sd"][name] or np.nan for d in done if name in d["values"]])
-            # The intervals as reported; for white noise log-normal ones, as `fit` gives them then.
+            # Intervals as reported; for white noise log-normal ones, as in `fit`.
             inside = np.abs(np.log(np.maximum(values / true, 1e-300))) < 1.96 * sds / values
             if all(d.get("interval") for d in done):
-                # Of those that were not withdrawn: a fit that says so claims nothing.
+                # Only fits that did not withdraw their interval.
                 ends = [d["interval"][name] for d in done]
                 inside = np.array([low < true < high for low, high in ends if low is not None])
             spread = values.std(ddof=1)
@@ -189,7 +191,7 @@ def main(count: int, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     log = folder / "runs.jsonl"
     kept = log.read_text(encoding="utf-8").splitlines() if log.exists() else []
-    # Runs of earlier versions are kept too; they call autocorrelated residuals coloured.
+    # Runs of earlier versions are kept. They call autocorrelated residuals coloured.
     kept = [line.replace("output error, coloured", METHODS[2]) for line in kept]
     runs = {r["seed"]: r for r in (json.loads(line) for line in kept)}
     params = truth()

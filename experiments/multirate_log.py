@@ -1,15 +1,15 @@
-"""Multi-rate truth: a flight logged as an autopilot would, fitted by one configuration.
+"""Fits of a multi-rate log with known truth, made like an autopilot's log.
 
     .venv/bin/python experiments/multirate_log.py [RUNS]
 
 A helicopter's lateral motion in hover (flapping, roll, drift) is simulated in steps of 0.25 ms with
-SciPy, and logged as an autopilot does: the gyro at 400 Hz behind a digital low-pass of 90 Hz and
-3 ms late, attitude at 50 Hz, GPS velocity at 5 Hz and 120 ms late, the stick at 50 Hz; stamps are
-off by a fifth of a step, a fiftieth of the samples is lost. Each log is fitted twice: with the
-filter, read from the log's own parameters, and the delays in the measurement model, and without.
-The table has the mean error over the runs by the standard deviation that the fits state, how far
-that may be from zero by chance, the scatter of the estimates by the same, and how many 95 %
-intervals hold the truth.
+SciPy, and logged as an autopilot does. The gyro is at 400 Hz after a digital low-pass of 90 Hz and
+3 ms late, attitude at 50 Hz, GPS velocity at 5 Hz and 120 ms late, and the stick at 50 Hz. Stamps
+are off by a fifth of a step, and a fiftieth of the samples is lost. Each log is fitted twice: with
+the filter, read from the log's own parameters, and the delays in the measurement model, and
+without. The table has the mean error over the runs in units of the stated sd, its chance deviation
+from zero, the scatter of the estimates in the same unit, and the number of 95 % intervals with the
+truth.
 """
 
 import math
@@ -34,7 +34,7 @@ GYRO_HZ, CUTOFF, GYRO_LATE = 400.0, 90.0, 0.003
 ATTITUDE_HZ, GPS_HZ, GPS_LATE, STICK_HZ = 50.0, 5.0, 0.12, 50.0
 JITTER, LOST, RATE = 0.2, 0.02, 200.0
 SD = {"gyro": 0.2, "phi": 0.004, "v": 0.05}
-"""of the noise: gyro [rad/s] before its filter, where 4 kHz are white; angle [rad]; GPS [m/s]"""
+"""Noise sd: gyro [rad/s] before its filter, white at 4 kHz; angle [rad]; GPS [m/s]."""
 
 MODEL = f"""
 name: lateral
@@ -65,7 +65,7 @@ B:
 
 
 def stick(times: np.ndarray) -> np.ndarray:
-    """The pilot's lateral stick (N,), 0.1 to 2.5 Hz, at any times [s]."""
+    """Return the pilot's lateral stick (N,), 0.1 to 2.5 Hz, at any times [s]."""
     hz = np.array([0.15, 0.35, 0.6, 0.95, 1.4, 1.9, 2.5])
     phases = np.array([0.3, 2.1, 4.4, 1.2, 5.5, 3.3, 0.9])
     waves = np.sin(2 * np.pi * np.outer(np.asarray(times), hz) + phases)
@@ -73,7 +73,7 @@ def stick(times: np.ndarray) -> np.ndarray:
 
 
 def motion() -> tuple[np.ndarray, np.ndarray]:
-    """Times (N,) and v, phi, p (N, 3) of the true flight."""
+    """Return times (N,) and v, phi, p (N, 3) of the true flight."""
     Lb, tau, Blat, Yv = TRUTH.values()
     A = np.array([[Yv, G, 0, 0], [0, 0, 1, 0], [0, 0, 0, Lb], [0, 0, -1, -1 / tau]])
     B = np.array([[0], [0], [0], [Blat / tau]])
@@ -83,7 +83,7 @@ def motion() -> tuple[np.ndarray, np.ndarray]:
 
 
 def stamps(rate: float, rng: np.random.Generator) -> np.ndarray:
-    """When a sensor is logged [s]: with jitter, and some samples lost."""
+    """Return the log times of a sensor [s], with jitter and lost samples."""
     n = int((LENGTH - 0.5) * rate)
     times = 0.25 + (np.arange(n) + rng.uniform(-JITTER, JITTER, n)) / rate
     kept = rng.random(n) > LOST
@@ -92,12 +92,12 @@ def stamps(rate: float, rng: np.random.Generator) -> np.ndarray:
 
 
 def log_text(times: np.ndarray, truth: np.ndarray, rng: np.random.Generator) -> str:
-    """The flight as a DataFlash log in text.
+    """Return the flight as a DataFlash log in text.
 
     Args:
-        times: of the true flight (N,) [s].
+        times: times of the true flight (N,) [s].
         truth: v, phi, p (N, 3).
-        rng: of noise, jitter and losses.
+        rng: generator for noise, jitter and losses.
     """
     # Bilinear and prewarped, as in firmware.
     sos = scipy.signal.butter(2, CUTOFF, fs=1 / STEP, output="sos")
@@ -105,13 +105,13 @@ def log_text(times: np.ndarray, truth: np.ndarray, rng: np.random.Generator) -> 
     gyro = np.asarray(scipy.signal.sosfilt(sos, noisy))
 
     def taken(signal: np.ndarray, at: np.ndarray, late: float, sd: float = 0.0) -> np.ndarray:
-        """A signal's samples (M,) at stamps, late, with noise.
+        """Return a signal's samples (M,) at stamps, with delay and noise.
 
         Args:
-            signal: (N,).
+            signal: true values (N,).
             at: stamps (M,) [s].
-            late: [s].
-            sd: of the noise.
+            late: delay [s].
+            sd: standard deviation of the noise.
         """
         return np.interp(at - late, times, signal) + sd * rng.standard_normal(at.size)
 
@@ -137,7 +137,7 @@ RATES = (GYRO_HZ, ATTITUDE_HZ, GPS_HZ, STICK_HZ)
 
 
 def config(measured: bool) -> dict:
-    """The configuration of a fit, with filter and delays or without."""
+    """Return the configuration of a fit, with or without filter and delays."""
     gyro, gps = {"signal": "IMU.GyrX", "unit": "rad/s"}, {"signal": "GPS.VY", "unit": "m/s"}
     if measured:
         gyro |= {"filter": "from log", "delay": GYRO_LATE}
@@ -159,11 +159,11 @@ def config(measured: bool) -> dict:
 
 
 def estimates(folder: Path, measured: bool) -> dict[str, tuple[float, float]]:
-    """Each parameter's estimate and sd from the log in a folder."""
+    """Return each parameter's estimate and sd from the log in a folder."""
     path = folder / "config.yaml"
     path.write_text(yaml.safe_dump(config(measured)))
     found = fit(configuration.problem(load_config(path)))
-    # None where the data determine nothing, which shows as nan in the table.
+    # None if not identifiable, which becomes nan in the table.
     return {n: (e.value, math.nan if e.sd is None else e.sd) for n, e in found.estimates.items()}
 
 

@@ -2,12 +2,12 @@
 
     .venv/bin/python experiments/r50.py [FITS] [RECORDS] [SECONDS] [--out FOLDER]
 
-FITS (3) sets of RECORDS (1) flights of SECONDS (60) each are fitted from starts that are a factor
-of 0.6 to 1.6 off; the full size is `40 4`. 33 derivatives, six intensities and correlation times of
-the turbulence and the noise of eight outputs are unknown. FOLDER (runs/r50) keeps a line a fit, so
-that a run that was stopped goes on where it was; table.md is made of all of them. At the truth each
-set tells its score (a chi-squared of as many degrees as there are unknowns), and the first set what
-the identifiability analysis says with Kr free as well.
+FITS (3) sets of RECORDS (1) flights of SECONDS (60) each are fitted from starts off by a factor of
+0.6 to 1.6; the full size is `40 4`. 33 derivatives, six intensities and correlation times of the
+turbulence and the noise of eight outputs are unknown. FOLDER (runs/r50) stores a line for each fit,
+so that an interrupted study can continue; table.md covers all fits. Each set gives its score at the
+truth (chi-squared with one degree per unknown). The first set also gives the identifiability
+analysis with Kr free.
 """
 
 import json
@@ -29,28 +29,28 @@ from heli_jax.identification.unknowns.layout import Data, Layout, Noise, layout_
 
 jax.config.update("jax_enable_x64", True)
 STEPS = 30
-"""after which a search has not converged; the target is 15"""
+"""Most steps of a converged search; the target is 15."""
 Z95 = 1.959963984540054
 ROTOR = ("tau_f", "Ab", "Ac", "Alat", "Alon", "Ba", "Bd", "Blat", "Blon", "Lb", "Ma")
 BAR = ("tau_s", "Clon", "Dlat")
 
 
 class Prepared(NamedTuple):
-    """A problem with its numbers, and the noise to begin with."""
+    """A problem with its data, and the initial noise."""
 
     problem: Problem
     layout: Layout
     data: Data
     noise: Noise
     z: jax.Array
-    """at the problem's starts"""
+    """Unknowns at the problem's starts."""
 
 
 def prepared(flights: list[Flight], **more: Any) -> Prepared:
     of, flights_ = problem(flights, **more), tuple(flights)
     layout, data = layout_of(of, flights_), data_of(of, flights_)
-    # Only its ratios matter: they are unknowns with their starts here, and their scale is
-    # concentrated out of the likelihood.
+    # Only the ratios matter: they are unknowns with starts here, and the scale is concentrated out
+    # of the likelihood.
     sd = tuple({n: np.float64(NOISE[n]) for n in sorted(f.outputs)} for f in flights)
     z = jnp.asarray(start_vector(layout, data, of))
     noise = Noise(sd, np.zeros(()))
@@ -59,7 +59,7 @@ def prepared(flights: list[Flight], **more: Any) -> Prepared:
 
 
 def at(of: Prepared, z: jax.Array) -> tuple[np.ndarray, np.ndarray, float]:
-    """Values of the free parameters, their sds, and the score's chi-squared per degree."""
+    """Return the free parameters, their sds, and the score's chi-squared per degree."""
     e = evaluate(of.layout, of.data, of.noise, z)
     r, J, free = np.asarray(e.r), np.asarray(e.J), len(of.layout.free)
     sd = deviations(J)[:free] * np.abs(np.asarray(e.slopes)[:free])
@@ -68,7 +68,7 @@ def at(of: Prepared, z: jax.Array) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def one_fit(seed: int, records: int, seconds: float) -> dict[str, Any]:
-    """Errors in units of the Cramér-Rao bound and of the sd that the fit itself states."""
+    """Return errors in units of the Cramér-Rao bound and of the stated sd."""
     flights = [record(100 * seed + i, seconds) for i in range(records)]
     true = prepared(flights)
     truth, bound, score = at(true, true.z)
@@ -94,7 +94,7 @@ def one_fit(seed: int, records: int, seconds: float) -> dict[str, Any]:
 
 
 def at_cost(of: Prepared, z: jax.Array) -> float:
-    """The log-likelihood."""
+    """Return the log-likelihood."""
     e = evaluate(of.layout, of.data, of.noise, z)
     return of.layout.objective.log_likelihood(of.layout, of.data, of.noise, e)
 
@@ -119,7 +119,7 @@ def table(fits: list[dict[str, Any]]) -> str:
 
 
 def identifiability(records: int, seconds: float) -> str:
-    """What the analysis says at the truth where Kr is free as well."""
+    """Return the identifiability analysis at the truth with Kr free."""
     flights = [record(100 + i, seconds) for i in range(records)]
     of = prepared(flights, fixed=tuple(n for n in FIXED if n != "Kr"))
     verdict = verdict_of(of.problem, of.layout, evaluate(of.layout, of.data, of.noise, of.z))

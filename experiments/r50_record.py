@@ -1,8 +1,8 @@
-"""The R-50 in turbulence: the model with a disturbance on six axes, and records in closed loop.
+"""The R-50 in turbulence: a model with disturbances on six axes, and records in closed loop.
 
-An unstable helicopter is flown by somebody: a regulator holds the hover while the sticks are moved
-in steps. What the sticks do then depends on the gusts. The records are made with SciPy's matrix
-exponentials, not with the package's simulation.
+The helicopter is unstable, so a regulator holds the hover while the sticks move in steps. The
+sticks then depend on the gusts. The records are made with SciPy's matrix exponentials, not with the
+package's simulation.
 """
 
 import functools
@@ -19,20 +19,20 @@ from heli_jax.naming import Scalar
 DT = 0.02
 AXES = ("p", "q", "r", "u", "v", "w")
 SIGMA = {"p": 0.4, "q": 0.4, "r": 0.8, "u": 0.3, "v": 0.6, "w": 0.4}
-"""of the turbulent acceleration, rad/s^2 and m/s^2"""
+"""Standard deviation of the turbulent acceleration [rad/s^2, m/s^2]."""
 TAU = {"p": 0.4, "q": 0.5, "r": 0.7, "u": 2.0, "v": 2.0, "w": 1.0}
-"""its correlation time [s]"""
+"""Correlation time of the turbulence [s]."""
 NOISE = {"u": 0.05, "v": 0.05, "w": 0.05, "p": 0.02, "q": 0.02, "r": 0.02}
 NOISE |= {"phi": 0.01, "theta": 0.01}
-"""of the measurements, m/s, rad/s and rad"""
+"""Standard deviation of the measurement noise [m/s, rad/s, rad]."""
 FIXED = ("g", "Kr", "tau_ped")
-"""not estimated: only Kr Nrfb acts, and the pedal's delay is a study of its own"""
+"""Fixed parameters: only Kr Nrfb is identifiable, and the pedal's delay is a separate study."""
 STICK = 0.2
-"""how far the steps move each stick: the gusts' response is then 0.2 to 0.5 of the driven one"""
+"""Step size of each stick; the response to gusts is then 0.2 to 0.5 of the driven one."""
 
 
 def _sigma(axis: str) -> str:
-    # Filter error knows one disturbance by name; the others are parameters like any.
+    # Filter error has one disturbance by name; the others are ordinary parameters.
     return "sigma_w" if axis == "w" else f"sigma_{axis}"
 
 
@@ -62,7 +62,7 @@ class _Turbulent(NamedTuple):
     def noise_intensity(self, p: Any) -> Any:
         rates = dict.fromkeys(naming.names(self.State), 0.0 * p.sigma_w)
         for axis in AXES:
-            # So that the push has the standard deviation sigma.
+            # Scaled so that the disturbance has the standard deviation sigma.
             rates[f"gust_{axis}"] = getattr(p, _sigma(axis)) * (2.0 / getattr(p, _tau(axis))) ** 0.5
         return self.State(**rates)
 
@@ -72,7 +72,7 @@ class _Turbulent(NamedTuple):
 
 @functools.cache
 def turbulent() -> Model:
-    """The model, with sigma and tau of each axis among its parameters."""
+    """Return the model, with sigma and tau of each axis among its parameters."""
     model = linear_model("r50-hover").model
     number = Annotated[Scalar, "1", "of the turbulence"]
     parameters = {_sigma(a): (number, SIGMA[a]) for a in AXES}
@@ -98,7 +98,7 @@ def turbulent() -> Model:
 
 
 def truth() -> Any:
-    """The parameters that fly, SI."""
+    """Return the true parameters, SI."""
     values = naming.asdict(linear_model("r50-hover").vehicle().params)
     values |= {_sigma(a): SIGMA[a] for a in AXES} | {_tau(a): TAU[a] for a in AXES}
     return turbulent().Params(**{n: np.float64(v) for n, v in values.items()})
@@ -111,7 +111,7 @@ class _Step(NamedTuple):
     now: np.ndarray
     before: np.ndarray
     whole: int
-    """d of the pedal"""
+    """Delay d of the pedal [samples]."""
     L: np.ndarray
 
 
@@ -133,7 +133,7 @@ def _step() -> _Step:
     before[:, pedal], now[:, pedal] = late_A @ early[:, pedal], late[:, pedal]
     assert model.noise_intensity is not None
     g = np.array([float(v) for v in naming.asdict(model.noise_intensity(params)).values()])
-    # Van Loan (1978): the covariance that the noise adds in one sample.
+    # Van Loan (1978): covariance of the noise of one sample.
     E = scipy.linalg.expm(np.block([[-A, np.diag(g**2)], [np.zeros((n, n)), A.T]]) * DT)
     values, vectors = np.linalg.eigh(E[n:, n:].T @ E[:n, n:])
     return _Step(Ad, now, before, int(whole), vectors * np.sqrt(np.maximum(values, 0.0)))
@@ -141,7 +141,7 @@ def _step() -> _Step:
 
 @functools.cache
 def _regulator() -> np.ndarray:
-    """Gains (4, 13) of a quadratic regulator that leaves the pedal's delay a margin."""
+    """Return gains (4, 13) of a quadratic regulator with a margin for the pedal's delay."""
     step = _step()
     A, B = step.A[:13, :13], (step.now + step.before)[:13]
     weights = {"u": 0.01, "v": 0.01, "w": 0.01, "p": 0.05, "q": 0.05, "r": 0.01, "phi": 1.0}
@@ -153,11 +153,11 @@ def _regulator() -> np.ndarray:
 
 
 def record(seed: int, seconds: float = 60.0, turbulence: float = 1.0) -> Flight:
-    """A flight in closed loop, with sticks that move in steps of 0.2 to 1.5 s.
+    """Return a flight in closed loop, with sticks that move in steps of 0.2 to 1.5 s.
 
     Args:
-        seed: of everything that is random in it.
-        seconds: how long it is.
+        seed: seed of all random numbers.
+        seconds: duration [s].
         turbulence: factor of the gusts.
     """
     model, step, rng = turbulent(), _step(), np.random.default_rng(seed)
@@ -170,7 +170,7 @@ def record(seed: int, seconds: float = 60.0, turbulence: float = 1.0) -> Flight:
         states[k] = x
         sticks[k] = steps[k] - _regulator() @ x[:13]
         now, before = sticks[k].copy(), np.zeros(4)
-        # The first sample stays before the record begins, as the package has it.
+        # The first sample is held before the record, as in the package.
         now[pedal] = sticks[max(k - step.whole, 0), pedal]
         before[pedal] = sticks[max(k - step.whole - 1, 0), pedal]
         gust = turbulence * step.L @ rng.standard_normal(n)
@@ -192,18 +192,18 @@ def problem(
     taus: bool = True,
     fixed: tuple[str, ...] = FIXED,
 ) -> Problem:
-    """33 derivatives, the turbulence and the measurement noise from records.
+    """Return a problem with 33 derivatives, the turbulence and the measurement noise.
 
     Args:
         flights: the records.
-        factors: of the starts, by parameter; 1 begins at the truth.
-        taus: whether the correlation times are estimated too.
-        fixed: the parameters that are known.
+        factors: factors of the starts, by parameter; 1 starts at the truth.
+        taus: True to estimate the correlation times too.
+        fixed: known parameters.
     """
     values, factors = naming.asdict(truth()), factors or {}
     starts = {n: float(v) * factors.get(n, 1.0) for n, v in values.items()}
     known = {*fixed, "sigma_w", "tau_w"} | (set() if taus else {_tau(a) for a in AXES})
-    # sigma_w and tau_w are unknowns by themselves, which begin where the vehicle has them.
+    # sigma_w and tau_w are always unknowns; they start at the vehicle's values.
     own = {n: np.float64(starts[n]) for n in ("sigma_w", *(["tau_w"] if taus else []))}
     start = turbulent().Params(**values | own)
     free = {n: Free(v) for n, v in starts.items() if n not in known}

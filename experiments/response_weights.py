@@ -1,11 +1,11 @@
-"""What the estimate of the noise's spectrum costs fits of responses, over the Cramér-Rao bound.
+"""Effect of the noise-spectrum estimate on fits of responses, relative to the Cramér-Rao bound.
 
     .venv/bin/python experiments/response_weights.py [RUNS] [WINDOW] [FIRST]
 
-The records of experiments/frequency_response.py with gusts and pilot steps. `frequency-response` is
-told the spectrum, the mean of that of gusts and noise alone over 150 records in the same windows;
-estimates it; estimates it by a mean over lines alone, without what the machine makes of gusts; and
-by one over two lines of the window whatever the averages.
+The records of experiments/frequency_response.py with gusts and pilot steps. `frequency-response`
+uses four spectra. One is known: the mean over 150 records of gusts and noise in the same windows.
+One is estimated. One is a mean over lines without the vehicle's response to gusts. One is a mean
+over two lines of the window for any number of averages.
 """
 
 from unittest import mock
@@ -25,11 +25,11 @@ MODULES = (frequency_response, response_weights)
 
 
 def density(window: float) -> np.ndarray:
-    """(k, 1, 1) of gusts and noise in windows."""
+    """Return the density (k, 1, 1) of gusts and noise in windows."""
     rng, power = np.random.default_rng(12345), np.zeros((1, 1))
     for _ in range(RECORDS):
         still = record(rng, np.zeros(SAMPLES), SIGMA)
-        # Windows of a stick that moves: it moves nothing here.
+        # Windows need a moving stick; here it has no effect.
         moved = Flight(dt=DT, inputs={"x_roll": np.arange(SAMPLES) % 7.0}, outputs=still.outputs)
         Y = windowed([moved], ResponseOptions(window=window)).Y
         power = power + np.mean(np.abs(Y) ** 2, axis=0)
@@ -42,7 +42,7 @@ def main(runs: int, window: float, first: int) -> None:
     def told(w, at, E, described=None) -> np.ndarray:
         return known / at.power[:, None, None]
 
-    # No machine says what gusts look like.
+    # Without a vehicle model of the gusts' spectrum.
     alone = mock.patch.object(frequency_response, "gusts_through", return_value=None)
     cases = {
         "known": [mock.patch.object(m, "noise_density", told) for m in MODULES],

@@ -1,14 +1,14 @@
-"""Measured responses judged by bias as well as by coverage: in closed loop, and of three sticks.
+"""Bias and coverage of measured responses: in closed loop, and with three sticks.
 
     .venv/bin/python experiments/responses.py [RUNS]
 
-RUNS (40) of each. First the R-50 in closed loop in gusts x 2, four records of 90 s, windows of
-20 s: attitudes and rates to their sticks, direct and by the logged steps as instruments. Then three
-inputs with a cross-feed of 0.3 that move three outputs, 300 s, conditioned and one at a time.
-
-Inside: bins whose real and whose imaginary part lie within 1.96 of the stated error. Bias: of the
-mean over all runs, over the true response, the root mean square over a band's bins less what
-the scatter of the runs leaves of it; negative squares count as zero.
+RUNS (40) of each case. The first is the R-50 in closed loop in double gusts, with four records of
+90 s and windows of 20 s. Attitudes and rates to their sticks are computed directly, and with the
+logged steps as instruments. The second has three inputs with a cross-feed of 0.3 and three outputs,
+over 300 s, conditioned and one at a time. Inside: bins with real and imaginary part within 1.96 of
+the stated error. Bias: root mean square over a band's bins of the mean error over all runs,
+relative to the true response. The part from the runs' scatter is subtracted, and negative squares
+count as zero.
 """
 
 from typing import Any, NamedTuple
@@ -28,32 +28,32 @@ jax.config.update("jax_enable_x64", True)
 signal: Any = scipy.signal
 SECONDS, RECORDS, GUSTS = 90.0, 4, 2.0
 FEEDBACK = (0.12, 0.3)
-"""[Hz] where the loop bites"""
+"""Frequencies with strong feedback [Hz]."""
 BAND = (0.12, 3.0)
 SETTINGS = Settings(band=BAND, window=20.0, points=60)
 PAIRS = (("lat", "p"), ("lat", "phi"), ("lon", "q"), ("lon", "theta"))
 Z95 = 1.959963984540054
 STEP, CROSS, NOISE, N = 0.02, 0.3, 0.3, 15000
-"""of the system of three: sample time [s], cross-feed, noise over the response, samples"""
+"""System of three: sample time [s], cross-feed, noise over the response, samples."""
 
 
 class Judged(NamedTuple):
-    """Of one response, over all runs."""
+    """Result of one response, over all runs."""
 
     inside: float
     square: float
-    """of the bias over the true response, which chance may take below zero"""
+    """Squared bias over the true response, which may be negative by chance."""
     scatter: float
-    """of a run, over the true response"""
+    """Scatter of a run, over the true response."""
 
     @property
     def bias(self) -> float:
-        """Over the true response."""
+        """Bias over the true response."""
         return float(np.sqrt(max(self.square, 0.0)))
 
 
 def judged(H: np.ndarray, sd: np.ndarray, true: np.ndarray, chosen: np.ndarray) -> Judged:
-    """Of runs (r, k) at the chosen frequencies."""
+    """Judge runs (r, k) at the chosen frequencies."""
     H, sd, true = H[:, chosen], sd[:, chosen], true[chosen]
     error = (H - true) / np.abs(true)
     z = (H - true) / sd
@@ -64,7 +64,7 @@ def judged(H: np.ndarray, sd: np.ndarray, true: np.ndarray, chosen: np.ndarray) 
 
 
 def flown(seed: int) -> Flight:
-    """A record with the steps that were added to the regulator's sticks as instruments."""
+    """Return a record with the steps added to the regulator's sticks as instruments."""
     flight = r50_record.record(seed, SECONDS, GUSTS)
     rng, samples = np.random.default_rng(seed), flight.n_samples
     steps = [r50_record._random_steps(rng, samples) for _ in flight.inputs]
@@ -73,7 +73,7 @@ def flown(seed: int) -> Flight:
 
 
 def true_r50(omega: np.ndarray, input: str, output: str) -> np.ndarray:
-    """Of the samples, exactly: x+ = A x + now u[k-d] + before u[k-d-1]."""
+    """Return the exact response of the samples: x+ = A x + now u[k-d] + before u[k-d-1]."""
     step, model = r50_record._step(), r50_record.turbulent()
     states, j = naming.names(model.State), naming.names(model.Inputs).index(input)
     z = np.exp(1j * omega * DT)[:, None]

@@ -1,4 +1,4 @@
-"""The command line that the studies share: --help, --quick, --out, and what they will take."""
+"""Command line shared by the studies: --help, --quick, --out, and the expected time."""
 
 import argparse
 import sys
@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 
 class Size(NamedTuple):
-    """A number or a word that a study takes by its place, with the one of a quick look."""
+    """A positional number or word of a study, with its value for a quick run."""
 
     name: str
     default: int | float | str
@@ -16,13 +16,13 @@ class Size(NamedTuple):
 
 
 def asked(doc: str | None, takes: str, *sizes: Size, out: str | None = None) -> argparse.Namespace:
-    """What was asked of a study; it says on standard error what that will take.
+    """Return the options of a study; print the expected time on standard error.
 
     Args:
         doc: the study's docstring, for --help.
-        takes: at full size, on two cores, in words.
-        sizes: by their place on the command line.
-        out: the folder that the study writes to; None where it only prints.
+        takes: time at full size on two cores, in words.
+        sizes: positional arguments, in order.
+        out: output folder of the study; None if it only prints.
     """
     parser = argparse.ArgumentParser(
         description=doc,
@@ -33,7 +33,7 @@ def asked(doc: str | None, takes: str, *sizes: Size, out: str | None = None) -> 
         parser.add_argument(
             size.name, nargs="?", type=type(size.default), help=f"{size.help} ({size.default})"
         )
-    # What has no size has no small one either.
+    # Without sizes there is no quick run.
     if sizes:
         parser.add_argument("--quick", action="store_true", help="small, to see that it runs")
     if out is not None:

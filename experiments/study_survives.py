@@ -1,11 +1,11 @@
-"""Do kills change a study of fits? The bench's, of many starts and records, killed and resumed.
+"""Check that kills do not change a study of fits with many starts and records of the bench.
 
     .venv/bin/python experiments/study_survives.py [FITS] [KILLS]
 
-The same study is carried out twice by two processes: once through, once killed (SIGKILL) KILLS
-times at random moments and resumed by the same command. The two Datasets have to be identical, and
-no fit that was finished may be made again. Half of the fits begin at one start and half at another;
-every record has noise and sticks of its own.
+The same study runs twice on two processes: once undisturbed, and once killed (SIGKILL) KILLS times
+at random times and resumed by the same command. The two Datasets must be identical, and no finished
+fit may be repeated. Half of the fits have one start and half another. Every record has its own
+noise and sticks.
 """
 
 import os
@@ -26,7 +26,7 @@ STARTS = (0.02, 0.05)
 
 
 def configuration(folder: Path, fits: int) -> Path:
-    """A study of `fits` fits, two for each record; its records are written beside it."""
+    """Write a study of `fits` fits, two for each record, with its records; return its path."""
     config = {
         "model": "roll-on-stand",
         "vehicle": str(ROOT / "configs" / "vehicles" / "bench-30.yaml"),
@@ -79,12 +79,12 @@ def command(config: Path, out: Path) -> list[str]:
 
 
 def finished(out: Path) -> dict[str, int]:
-    """The fits that are there, and what changes when one is made again."""
+    """Return the finished fits, with marks that change if one is repeated."""
     return {p.parent.name: p.stat().st_ino for p in (out / "fits").glob("[0-9]*/fit.json")}
 
 
 def carry_out(config: Path, out: Path, until: int | None = None) -> float:
-    """Carry out a study, or kill it once so many fits are there; returns the seconds."""
+    """Run a study, or kill it after a number of fits; return the seconds."""
     begun = time.monotonic()
     nothing = subprocess.DEVNULL
     with subprocess.Popen(command(config, out), stdout=nothing, stderr=nothing) as run:
@@ -103,7 +103,7 @@ def opened(out: Path) -> xr.Dataset:
 
 
 def survives(folder: Path, fits: int, kills: int) -> bool:
-    """Whether the killed study ends in the same Dataset, without any fit made twice."""
+    """True if the killed study ends in the same Dataset, without a repeated fit."""
     random.seed(0)
     config = configuration(folder, fits)
     whole, killed = folder / "whole", folder / "killed"

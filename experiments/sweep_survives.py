@@ -1,9 +1,9 @@
-"""A sweep that is killed again and again ends with the numbers of one that never was.
+"""Check that a sweep killed many times ends with the same numbers as one without kills.
 
 `python experiments/sweep_survives.py 20` runs `heli-jax sweep` to its end, then the same sweep with
-20 `kill -9` at random moments, each followed by `--resume`; then on two dask workers, one of which
-is killed in the middle. It compares every bit of the stores, and looks whether a finished chunk was
-ever written again. Two minutes on two cores of their own.
+20 `kill -9` at random times, each followed by `--resume`. Then it runs on two dask workers, one of
+which is killed. It compares every bit of the stores, and checks that no finished chunk was written
+again. It takes two minutes on two free cores.
 """
 
 import os
@@ -44,17 +44,17 @@ VEHICLE = Path(__file__).parents[1] / "configs" / "vehicles" / "bench-30.yaml"
 
 
 class Survived(NamedTuple):
-    """What the kills did."""
+    """Effects of the kills."""
 
     kills: int
     hit: int
-    """of them, those that hit a sweep between its first and its last chunk"""
+    """Kills between the first and the last chunk of a sweep."""
     resumed: int
-    """times that the sweep had to be started after the first"""
+    """Restarts of the sweep."""
     rewritten: int
-    """finished chunks that were written again"""
+    """Finished chunks that were written again."""
     equal: bool
-    """whether every array equals that of the run without kills"""
+    """True if every array equals that of the run without kills."""
 
 
 def configuration(folder: Path, n: int = 81920, chunk: int = 512, duration: float = 60.0) -> Path:
@@ -69,7 +69,9 @@ def command(config: Path, out: Path, *more: str) -> list[str]:
 
 
 def finished(out: Path) -> dict[str, tuple[int, int]]:
-    """The files of the finished chunks' status, and what changes when one is written again."""
+    """Return the status files of finished chunks, with marks that change if one is
+    written again.
+    """
     marks = {}
     for path in (out / "sweep.zarr" / "status" / "c").glob("*"):
         if path.suffix != ".partial":
@@ -79,7 +81,7 @@ def finished(out: Path) -> dict[str, tuple[int, int]]:
 
 
 def same(a: Path, b: Path) -> bool:
-    """Whether two stores hold the same bits."""
+    """True if two stores have the same bits."""
     first, second = zarr.open_group(str(a), mode="r"), zarr.open_group(str(b), mode="r")
     left: dict[str, bytes] = {n: np.asarray(v[...]).tobytes() for n, v in first.arrays()}
     right: dict[str, bytes] = {n: np.asarray(v[...]).tobytes() for n, v in second.arrays()}
@@ -87,7 +89,7 @@ def same(a: Path, b: Path) -> bool:
 
 
 def run_through(config: Path, out: Path) -> float:
-    """Run the sweep without a kill; returns the seconds to its first finished chunk."""
+    """Run the sweep without a kill; return the time to its first finished chunk [s]."""
     begin = time.monotonic()
     with subprocess.Popen(command(config, out)) as run:
         while run.poll() is None and not finished(out):
@@ -101,8 +103,10 @@ def run_through(config: Path, out: Path) -> float:
 def kills(
     config: Path, whole: Path, out: Path, times: int, first: float, seed: int = 0
 ) -> Survived:
-    """Kill the sweep `times` times, half of them once some chunks more are done, half at any time
-    before its first chunk is, or a little later; then let it end. `first` is the time to there [s].
+    """Kill the sweep `times` times, then let it end.
+
+    Half of the kills come after some more chunks, the others at random times up to shortly after
+    the first chunk. `first` is the time to that [s].
     """
     rng, chunks = random.Random(seed), len(finished(whole))
     hit = rewritten = starts = 0
@@ -137,7 +141,7 @@ def kills(
 
 
 def worker_killed(config: Path, whole: Path, out: Path) -> bool:
-    """On two dask workers, one killed after some chunks: whether the bits are the same."""
+    """True if the bits are equal after one of two dask workers is killed."""
     with subprocess.Popen(command(config, out, "--workers", "2"), stderr=subprocess.DEVNULL) as run:
         while run.poll() is None and len(finished(out)) < 5:
             time.sleep(0.002)
@@ -148,7 +152,7 @@ def worker_killed(config: Path, whole: Path, out: Path) -> bool:
 
 
 def workers_of(pid: int) -> list[int]:
-    """The dask worker processes that a process started, by Linux's process table."""
+    """Return the dask worker processes of a process, from Linux's process table."""
     pids = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -166,7 +170,7 @@ def main(times: int) -> None:
     try:
         config = configuration(folder)
         run_through(config, folder / "whole")
-        # Again, with what JAX has compiled and kept, as the killed ones have it.
+        # Run again with JAX's compilation cache, as the killed sweeps do.
         first = run_through(config, folder / "again")
         outcome = kills(config, folder / "whole", folder / "killed", times, first)
         print(

@@ -1,13 +1,13 @@
-"""A flybarless helicopter's roll from a real log: does a model with servo, rate loop and delay
-follow it better than a first-order lag, and does it predict what it was not fitted to?
+"""Roll of a flybarless helicopter from a real log: servo, rate loop and delay against a first-order
+lag.
 
     .venv/bin/python experiments/trex550.py LOG [FURTHER ...]
 
-LOG is Pitchtest.csv of github.com/dronefreak/system-identification-helicopter (MIT): an Align
-T-Rex 550, 67 s near hover at 100 Hz, with columns t, lat, p and others. The models are fitted to
-the lateral doublets (18 to 32 s) and then fly the whole record, and each FURTHER log (Hovertest.csv
-of the same machine). Beside the whole of it stands what they predict where the lateral stick moves:
-where its sd over the 4 s about a sample (two periods of a doublet) is at least a share of its sd
+LOG is Pitchtest.csv of github.com/dronefreak/system-identification-helicopter (MIT): an Align T-Rex
+550, 67 s near hover at 100 Hz, with columns t, lat, p and others. The models are fitted to the
+lateral doublets (18 to 32 s). They then simulate the whole record, and each FURTHER log
+(Hovertest.csv of the same vehicle). The agreement is shown for all samples, and for those where the
+lateral stick moves. There its sd over 4 s (two periods of a doublet) is at least a share of its sd
 over the fitted doublets.
 """
 
@@ -38,9 +38,9 @@ from heli_jax.naming import Scalar
 jax.config.update("jax_enable_x64", True)
 WINDOW = (18.0, 32.0)
 AROUND = 4.0
-"""[s] about a sample over which the stick is asked whether it moves: two periods of a doublet"""
+"""Width of the window about a sample for the stick's sd [s]: two periods of a doublet."""
 SHARES = (0.2, 0.25, 0.3)
-"""of the stick's sd over the fitted doublets, from which on it moves"""
+"""Least sd of a moving stick [fraction of that over the fitted doublets]."""
 CONFIG = Path(__file__).parents[1] / "configs" / "trex550-roll.yaml"
 
 
@@ -66,7 +66,9 @@ def _rate(params: Any, x: Any, u: Any) -> Rate:
 
 
 def first_order() -> tuple[Model, Any, dict[str, Free]]:
-    """p = K/(tau s + 1) lat, with a delay that may be negative: the log has the stick late."""
+    """Return p = K/(tau s + 1) lat, with a delay that may be negative, since the log's stick is
+    late.
+    """
     bare = Model("first-order", _lag, _rate, Lag, Rate, Stick, Rate, linear=True)
     model = models.with_delays(bare, inputs=["lat"])
     start = model.Params(K=1.0, tau=0.1, delay_lat=0.0)
@@ -74,7 +76,9 @@ def first_order() -> tuple[Model, Any, dict[str, Free]]:
 
 
 def flybarless(path: str, *, feedforward: bool) -> tuple[Model, Any, dict[str, Free]]:
-    """Rotor, servo, rate loop, delay: the configuration; with a feed-forward where asked."""
+    """Return the configuration's rotor, servo, rate loop and delay; optionally with
+    feed-forward.
+    """
     changes: dict[str, Any] = {f"flights.{i}.log": str(Path(path).resolve()) for i in range(3)}
     if feedforward:
         changes["onboard.rate_loop.feedforward"] = True
@@ -84,7 +88,7 @@ def flybarless(path: str, *, feedforward: bool) -> tuple[Model, Any, dict[str, F
 
 
 def vaf(measured: np.ndarray, simulated: np.ndarray) -> float:
-    """Variance accounted for, without the bias."""
+    """Return the variance accounted for, without the bias."""
     return 1.0 - float(np.var(measured - simulated) / np.var(measured))
 
 
@@ -99,18 +103,18 @@ def read(path: str, **options: Any) -> Flight:
 
 
 def _flown(model: Model, params: Any, log: Flight) -> tuple[np.ndarray, np.ndarray]:
-    """Roll rate measured and simulated (N,) [rad/s]."""
+    """Return the roll rate, measured and simulated (N,) [rad/s]."""
     return np.asarray(log.outputs["p"]), np.asarray(simulate(model, params, log).outputs.p)
 
 
 def _fitted(log: Flight) -> np.ndarray:
-    """Which samples (N,) lie in the fitted window."""
+    """Return a mask of samples (N,) in the fitted window."""
     t = np.arange(log.outputs["p"].size) * log.dt
     return (t >= WINDOW[0]) & (t <= WINDOW[1])
 
 
 def stick_sd(log: Flight) -> np.ndarray:
-    """Of the lateral stick over the `AROUND` seconds about each sample (N,)."""
+    """Return the sd of the lateral stick over `AROUND` seconds about each sample (N,)."""
     lat, n = np.asarray(log.inputs["lat"]), round(AROUND / log.dt)
 
     def mean(x: np.ndarray) -> np.ndarray:
@@ -120,7 +124,9 @@ def stick_sd(log: Flight) -> np.ndarray:
 
 
 def agreement(model: Model, params: Any, whole: Flight) -> dict[str, float]:
-    """VAF in the fitted window, of the whole record, and of the record without the window."""
+    """Return the VAF in the fitted window, of the whole record, and of the record without the
+    window.
+    """
     measured, simulated = _flown(model, params, whole)
     fitted = _fitted(whole)
     return {
@@ -133,14 +139,15 @@ def agreement(model: Model, params: Any, whole: Flight) -> dict[str, float]:
 def where_the_stick_moves(
     model: Model, params: Any, log: Flight, doublets: float, kept: np.ndarray
 ) -> dict[float, tuple[float, float]]:
-    """Of kept samples (N,), by the share from which on the stick moves: seconds, and their VAF.
+    """Return for each share of a moving stick the duration [s] and the VAF of the kept samples
+    (N,).
 
     Args:
-        model: flies the log in one piece.
+        model: simulated over the whole log.
         params: its parameters.
-        log: with the stick `lat` and the rate `p`.
+        log: log with the stick `lat` and the rate `p`.
         doublets: the stick's sd over the fitted doublets.
-        kept: which samples may count (N,).
+        kept: mask of samples that may count (N,).
     """
     measured, simulated = _flown(model, params, log)
     found = {}

@@ -1,10 +1,10 @@
-"""A disturbance with two lags: does the model table see it, and does If's interval cover again?
+"""A disturbance with two lags: its detection by model selection, and coverage of If.
 
     .venv/bin/python experiments/two_poles.py [RUNS] [--out FOLDER]
 
-The disturbed bench of monte_carlo.py, but the disturbance passes a second lag of the same time
-constant. Every record is fitted with one pole and with two. FOLDER (runs/two-poles) keeps one line
-a run, so that a run that was stopped goes on where it was; table.md is made of all of them.
+This is the disturbed bench of monte_carlo.py, with a second lag of the same time constant for the
+disturbance. Every record is fitted with one pole and with two. FOLDER (runs/two-poles) stores a
+line for each run, so that an interrupted study can continue; table.md covers all runs.
 """
 
 import json
@@ -40,7 +40,7 @@ def response(params: Any, u: jax.Array, key: jax.Array) -> jax.Array:
 
 
 def one_run(seed: int) -> dict[str, Any]:
-    """Values, sds, log-likelihood and whiteness of both fits of one record."""
+    """Return values, sds, log-likelihood and whiteness of both fits of one record."""
     rng = np.random.default_rng(seed)
     u = 3e-6 * random_steps(N, DT, rng, (0.2, 1.5))
     truth = parameters(2, **TRUTH)

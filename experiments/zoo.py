@@ -1,12 +1,12 @@
-"""A hundred identification problems with known answers: no silent success, no false alarm.
+"""A hundred identification problems with known answers, to find silent successes and false alarms.
 
     .venv/bin/python experiments/zoo.py [--quick] [--only WORDS]
 
-Half of them are sound: a fit must converge, give every parameter with an interval that holds the
-truth, and call the model adequate. The other half are not: terms that can be exchanged, a gain
-times an effectiveness, an input that never moves, a record that is too short, two inputs that move
-together, a record of something else. There the fit must not end in a silent success. Records come
-from SciPy and matrices written out here, not from our simulation. Exit code 1 where one fails.
+Half of them are sound: a fit must converge, give every parameter an interval with the truth, and
+find the model adequate. The others are not: exchangeable terms, a gain times an effectiveness, a
+constant input, a short record, two inputs that move together, an unrelated record. There the fit
+must not end in a silent success. Records come from SciPy and explicit matrices, not from our
+simulation. The exit code is 1 if one fails.
 """
 
 import argparse
@@ -32,7 +32,7 @@ NO_OFFSET = Nuisance(input_offset=False)
 
 
 class Params(NamedTuple):
-    """Of an aircraft in roll; each term twice, so that products and sums can be made of them."""
+    """Parameters of an aircraft in roll; each term appears twice, for products and sums."""
 
     Lp: Annotated[Scalar, "1/s", "roll damping"] = 0.0
     Lq: Annotated[Scalar, "1/s", "more of the same"] = 0.0
@@ -75,7 +75,7 @@ ROLL = Model(
 
 
 class PitchParams(NamedTuple):
-    """Of an aircraft's short period at a speed of V."""
+    """Parameters of an aircraft's short period at a speed of V."""
 
     Zw: Annotated[Scalar, "1/s", "heave damping"]
     Mw: Annotated[Scalar, "rad/s/m", "static stability"]
@@ -112,21 +112,23 @@ PITCH = Model(
 
 @dataclass(frozen=True)
 class Puzzle:
-    """One problem and its answer."""
+    """A problem and its answer."""
 
     name: str
     problem: Problem
     truth: dict[str, float]
-    """of the free parameters that the record determines"""
+    """True values of free parameters that the record determines."""
     not_identifiable: tuple[str, ...] = ()
-    """free parameters that it does not"""
+    """Free parameters that it does not determine."""
     hardly: dict[str, float] = field(default_factory=dict)
-    """of which it says next to nothing: not determined, or an interval with truth and zero in it"""
+    """Parameters with little information: not determined, or with truth and zero in
+    the interval.
+    """
     adequate: bool = True
 
 
 def stepped(A: Any, B: Any, u: np.ndarray, x0: Any) -> np.ndarray:
-    """States (N, n) for held inputs (N, m), by SciPy."""
+    """Return states (N, n) for held inputs (N, m), by SciPy."""
     A, B = np.atleast_2d(np.asarray(A, float)), np.asarray(B, float)
     system: Any = (A, B, np.eye(A.shape[0]), np.zeros(B.shape))
     held: Any = scipy.signal.cont2discrete(system, DT)
@@ -139,7 +141,7 @@ def stepped(A: Any, B: Any, u: np.ndarray, x0: Any) -> np.ndarray:
 
 
 class Rolled(NamedTuple):
-    """A record of the aircraft in roll and what made it."""
+    """A record of the aircraft in roll, and its source."""
 
     params: Params
     d: np.ndarray
@@ -172,7 +174,7 @@ def rolled(
 
 
 def near(value: float, rng: np.random.Generator, factor: float = 2.0) -> Free:
-    """A start off by up to a factor to either side."""
+    """Return a start that is off by up to a factor in either direction."""
     return Free(float(value * factor ** rng.uniform(-1, 1)))
 
 
@@ -193,7 +195,7 @@ def true(r: Rolled, *names: str) -> dict[str, float]:
 
 
 def other(d: np.ndarray, rng: Any) -> np.ndarray:
-    """A second input that moves on its own."""
+    """Return a second input that moves independently."""
     return random_steps(d.size, DT, rng, (0.2, 1.0))
 
 
@@ -210,7 +212,8 @@ def plain(seed: int) -> Puzzle:
 def wrong_sign(seed: int) -> Puzzle:
     r = rolled(seed)
     name = ("Lp", "Ld")[seed % 2]
-    # A damping of the wrong sign diverges over a long record: begin near zero, as a user would.
+    # With a wrong sign of damping a long record diverges, so the start is near zero, as a user
+    # would choose.
     start = Free(-float(getattr(r.params, name)) * (0.05 if name == "Lp" else 0.7))
     problem = of_roll(r, ("Lp", "Ld"), [r.flight("p")], starts={name: start})
     return Puzzle(f"start of {name} of the wrong sign", problem, true(r, "Lp", "Ld"))
@@ -287,7 +290,7 @@ def short_period(seed: int) -> Puzzle:
 
 
 def bench(seed: int, stand: bool = True) -> tuple[Any, Flight, np.random.Generator]:
-    """A record of the roll model, from eq. 23."""
+    """Return a record of the roll model, from eq. 23."""
     rng = np.random.default_rng(seed)
     machine = load_vehicle(Path(__file__).parents[1] / "configs" / "vehicles" / "bench-30.yaml")
     H = roll_transfer_function(machine, stand=stand)
@@ -318,7 +321,7 @@ def with_prior(seed: int) -> Puzzle:
 
 def exchangeable(seed: int) -> Puzzle:
     r = rolled(seed, L0=6.0)
-    # Without bounds a parameter has a scale alone; with two of different sign it has an interval.
+    # Without bounds a parameter only has a scale; bounds of different sign give it an interval.
     starts = {"L0": Free(1.0, -50.0, 50.0)} if seed % 2 else {}
     problem = of_roll(r, ("Lp", "Ld", "L0"), [r.flight("p")], starts=starts)
     return Puzzle("constant term, bias and initial state", problem, true(r, "Lp", "Ld"), ("L0",))
@@ -362,7 +365,7 @@ def nearly_same_inputs(seed: int) -> Puzzle:
 
 
 def too_short(seed: int) -> Puzzle:
-    """Twelve seconds of a machine that needs a thousand, in noise."""
+    """A vehicle with a time constant of a thousand seconds, in twelve seconds of noise."""
     r = rolled(seed, Lp=-0.001, Ld=0.5)
     problem = of_roll(r, ("Lp", "Ld"), [r.flight("p", noise=0.3)])
     return Puzzle("record too short for the damping", problem, {}, hardly=true(r, "Lp"))
@@ -376,7 +379,7 @@ def paper(seed: int) -> Puzzle:
 
 
 def no_excitation(seed: int) -> Puzzle:
-    """Nothing but noise after the input's only move, which no output shows."""
+    """Only noise, since no output shows the input's single move."""
     r = rolled(seed, Ld=1e-6)
     measured = {"p": 0.1 * r.rng.standard_normal(N)}
     flight = Flight(dt=DT, inputs={"d": r.d, "e": r.e}, outputs=measured)
@@ -385,7 +388,7 @@ def no_excitation(seed: int) -> Puzzle:
 
 
 def something_else(seed: int) -> Puzzle:
-    """An output that has nothing to do with the input."""
+    """An output that is unrelated to the input."""
     r = rolled(seed)
     drift = np.cumsum(r.rng.standard_normal(N))
     flight = Flight(dt=DT, inputs={"d": r.d, "e": r.e}, outputs={"p": drift})
@@ -393,7 +396,7 @@ def something_else(seed: int) -> Puzzle:
 
 
 def swapped_sign(seed: int) -> Puzzle:
-    """The output logged with the wrong sign, the parameters' signs held by their bounds."""
+    """The output has the wrong sign, and bounds fix the parameters' signs."""
     r = rolled(seed, Ld=40.0)
     flight = r.flight("p")
     flight = Flight(dt=DT, inputs=flight.inputs, outputs={"p": -flight.outputs["p"]})
@@ -415,14 +418,14 @@ UNSOUND: tuple[tuple[Callable[[int], Puzzle], int], ...] = (
 
 
 def zoo(small: bool = False) -> Iterator[Puzzle]:
-    """All hundred, or one of each kind."""
+    """Yield all hundred problems, or one of each kind."""
     for kind, count in (*SOUND, *UNSOUND):
         for seed in range(1 if small else count):
             yield kind(seed)
 
 
 def complaint(puzzle: Puzzle, result: Fit) -> str:
-    """What is wrong with a fit's answer; empty where it is right."""
+    """Return the error of a fit's answer; empty if it is right."""
     if not puzzle.adequate:
         if result.status == "converged" and result.adequate:
             return "silent success: converged and adequate"
@@ -450,7 +453,7 @@ def complaint(puzzle: Puzzle, result: Fit) -> str:
 
 
 def _off(puzzle: Puzzle, result: Fit) -> str:
-    """Which of the parameters that the record determines is wrong."""
+    """Return which determined parameter is wrong."""
     for name, value in puzzle.truth.items():
         e = result.estimates[name]
         if e.sd is None:

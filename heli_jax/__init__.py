@@ -1,13 +1,13 @@
 """heli_jax: physical parameters of small helicopters from logged runs, with honest uncertainties.
 
 Units are SI throughout. Switch to float64 first: `jax.config.update("jax_enable_x64", True)`.
-Importing the package changes no setting; names are loaded when they are first used.
+Importing the package changes no setting; names are loaded on first use.
 """
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
-# For type checkers and editors, which know nothing of __getattr__; `as` marks a name as exported.
+# Type checkers and editors do not evaluate __getattr__; `as` marks a name as exported.
 if TYPE_CHECKING:
     from heli_jax import models as models
     from heli_jax.analysis.linear import linearize as linearize
@@ -48,8 +48,8 @@ if TYPE_CHECKING:
     from heli_jax.workflow import run_fit as run_fit
     from heli_jax.workflow import write_report as write_report
 
-# Which module each name is of, loaded when the name is first used: `import heli_jax` and
-# `heli-jax --help` would otherwise wait seconds for JAX, diffrax and xarray.
+# Modules of the names, loaded on first use. Otherwise `import heli_jax` and `heli-jax --help` would
+# wait seconds for JAX, diffrax and xarray.
 _HOMES = {
     name: home
     for home, names in {
@@ -84,19 +84,19 @@ _HOMES = {
 __all__ = [*_HOMES]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
-def __getattr__(name: str) -> Any:  # any of them
+def __getattr__(name: str) -> Any:  # Any: the names have different types.
     if name == "__version__":
         from heli_jax.versions import version
 
         return version()
     if name not in _HOMES:
         raise AttributeError(f"module 'heli_jax' has no attribute {name!r}")
-    # A module itself: `heli_jax.models` has no attribute `models` to ask for.
+    # `models` is itself a module.
     if name == "models":
         return importlib.import_module("heli_jax.models")
     return getattr(importlib.import_module(f"heli_jax.{_HOMES[name]}"), name)
 
 
 def __dir__() -> list[str]:
-    # For completion in a session: without it only the names used so far would be offered.
+    # Completion in a session needs all names, not only those already used.
     return sorted([*_HOMES, "__version__"])

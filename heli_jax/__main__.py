@@ -1,4 +1,4 @@
-"""The command heli-jax from its first moment, in which Ctrl-C finds nothing imported yet."""
+"""Entry point of heli-jax, which handles Ctrl-C before anything else is imported."""
 
 import atexit
 import gc
@@ -9,27 +9,27 @@ import threading
 from types import FrameType
 
 _COLLECT_AFTER = 500_000
-"""new objects between two searches for garbage"""
+"""New objects between two garbage collections."""
 _THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""what says how many threads NumPy's linear algebra has"""
+"""Environment variables for the number of threads in NumPy's linear algebra."""
 
 
 def main() -> int:
-    """Run one command as a program; returns the exit code (`heli_jax.cli`)."""
+    """Run one command as a program and return the exit code (`heli_jax.cli`)."""
     before = signal.getsignal(signal.SIGINT)
     ours = before is signal.default_int_handler
     if ours:
         signal.signal(signal.SIGINT, _end)
-    # Imports and what JAX traces make millions of objects that stay: to look through them for
-    # garbage as often as Python does by itself takes a tenth of a command.
+    # Imports and JAX's traces make millions of objects that stay. Python's default collections
+    # would take a tenth of a command's time.
     gc.set_threshold(_COLLECT_AFTER)
-    # Before NumPy is imported. Its matrices here are tall and a few columns wide: further threads
-    # wait for each other at full speed, and double what a fit takes. XLA has threads of its own.
+    # Set before NumPy is imported. Our matrices are tall and narrow: more threads wait for each
+    # other and double the time of a fit. XLA has its own threads.
     for name in _THREADS:
         os.environ.setdefault(name, "1")
     from heli_jax import cli
 
-    # From here on the command line listens itself.
+    # The command line now installs its own handlers.
     if ours:
         signal.signal(signal.SIGINT, before)
     code = cli.main()
@@ -38,28 +38,28 @@ def main() -> int:
 
 
 def _leave(code: int) -> None:
-    """End the process at once, where nothing is left to be done.
+    """End the process at once if no work is left.
 
-    To free all that JAX has traced and compiled one by one takes a tenth of a command.
+    Freeing all traces and programs of JAX one by one takes a tenth of a command's time.
     """
-    # A thread that Python would wait for still works at something.
+    # Python would wait for this thread, which is still working.
     if any(not t.daemon for t in threading.enumerate() if t is not threading.main_thread()):
         return
-    # Temporary files, processes of a cluster: what libraries tidy up at the end of Python.
+    # Libraries clean up here: temporary files, processes of a cluster.
     atexit._run_exitfuncs()
     try:
         for stream in (sys.stdout, sys.stderr):
             if stream is not None:
                 stream.flush()
     except BrokenPipeError:
-        pass  # who reads has enough, which is no failure
+        pass  # a closed pipe is no failure
     except (OSError, ValueError):
-        return  # a disk that is full, which Python says as it ends
+        return  # a full disk, which Python reports at exit
     os._exit(code)
 
 
 def _end(number: int, frame: FrameType | None) -> None:
-    # Not `heli_jax.interrupts`, which would have to be imported first.
+    # `heli_jax.interrupts` would have to be imported first.
     os.write(2, b"heli-jax: interrupted; nothing was written\n")
     os._exit(130)
 

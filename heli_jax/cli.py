@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from heli_jax.config.study import Study
     from heli_jax.flights.convert import Selection
 
-# 2 is what argparse ends with.
+# argparse itself exits with 2.
 DONE, WRONG_INPUT, NOT_DETERMINED, NOT_CONVERGED = 0, 2, 3, 4
 INTERRUPTED = interrupts.INTERRUPTED
 _EXIT_CODES = (
@@ -37,9 +37,9 @@ _EXIT_CODES = (
     "adequate, or sensors are not compatible; 130 interrupted."
 )
 _LARGEST_FIT = 10**9
-"""bytes of a fit.json"""
+"""Largest fit.json that is read [bytes]."""
 _DEEPEST = 3
-"""folders below the one in which `runs` looks"""
+"""Depth to which `runs` searches below its folder [folders]."""
 
 
 def _count(text: str) -> int:
@@ -60,7 +60,7 @@ def _seconds(text: str) -> float:
 
 # Any: keywords of argparse.
 def _arg(*names: str, **keywords: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """An argument of a command; those with `either` exclude one another."""
+    """Return one argument of a command; arguments marked `either` exclude one another."""
     if names[0].startswith("--") and not keywords.keys() & {"action", "metavar"}:
         keywords["action"] = "store_true"
     return names, keywords
@@ -171,17 +171,17 @@ _COMMANDS = {
     )),
 }
 # fmt: on
-"""by name: its help and its arguments; the function of `new-model` is `_new_model`"""
+"""Help and arguments of each command. The function of `new-model` is `_new_model`."""
 
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        # One line as all other errors; argparse would print the usage of the command before it.
+        # Print one line, as for all other errors. argparse would print the usage before it.
         _refuse(self.prog, message)
 
 
 def _refuse(prog: str, message: str) -> NoReturn:
-    """End with one line, which names the help of the command (`heli-jax fit`) that was begun."""
+    """Exit with one line that names the help of the command in use (`heli-jax fit`)."""
     terminal.say(f"{message} (see {prog} --help)")
     raise SystemExit(WRONG_INPUT)
 
@@ -194,16 +194,16 @@ class _Version(argparse.Action):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit code.
+    """Run one command and return its exit code.
 
     0 done; 2 wrong input; 3 the data cannot determine what was asked; 4 the optimiser did not
-    converge, or the model is not adequate and explains less than the mean of what was measured;
-    130 interrupted.
+    converge, or the model is not adequate and explains less than the mean of the measurements; 130
+    interrupted.
     """
-    # With arguments of their own tests and programs call it, which an interrupt must not end.
+    # Tests and other programs pass arguments. An interrupt must not end their process.
     if arguments is None:
         import_path.pass_over_style_of_folder()
-        # Of numbers that a log or a configuration holds: the sentence says what is wrong.
+        # These warnings concern numbers of a log or a configuration, which the message explains.
         warnings.filterwarnings(
             "ignore", category=RuntimeWarning, module=r"(heli_jax|numpy|scipy)\b"
         )
@@ -213,7 +213,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 _refuse("heli-jax", f"expected arguments and names of files in UTF-8, got {text!r}")
         options, unknown = _parser().parse_known_args(arguments)
         if unknown:
-            # Of which command, argparse has forgotten by then.
+            # argparse no longer knows the command here.
             message = f"unrecognized arguments: {' '.join(unknown)}"
             _refuse(f"heli-jax {options.command}", message)
         options.interrupts, code = seen, DONE
@@ -221,7 +221,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             options.say = terminal.say_notes if options.quiet else terminal.say
             with terminal.progress_shown(options.quiet):
                 code = globals()[f"_{options.command.replace('-', '_')}"](options)
-            # Now, where a full disk is told in words.
+            # Flush here, so that a full disk ends in a message.
             if sys.stdout is not None:
                 sys.stdout.flush()
             return code
@@ -229,20 +229,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
             terminal.say(seen.words())
             return 128 + seen.seen[0] if seen.seen else INTERRUPTED
         except BrokenPipeError:
-            # `heli-jax simulate ... | head` is no failure, and a verdict stays what it was. Python
-            # would flush its standard output once more at the end, and complain.
+            # `heli-jax simulate ... | head` is no failure and keeps its exit code. Python would
+            # flush standard output again at exit and complain.
             _discard_output()
             return code
         except Exception as e:
-            # Whatever it says: an interrupt of which a library has made an error of its own.
+            # A library may have turned an interrupt into an error of its own.
             if seen.seen:
                 terminal.say("interrupted")
                 return INTERRUPTED
-            # Everything else is a fault of ours, and its traceback is what a report of it needs.
+            # Any other error is a bug, and a report of it needs the traceback.
             if not isinstance(e, InputError | OSError):
                 raise
             if isinstance(e, OSError):
-                # What was to be printed is still there, and would be tried again at the end.
+                # Unprinted output is still buffered and would be flushed again at exit.
                 with contextlib.suppress(OSError, AttributeError, ValueError):
                     _discard_output()
                 e = InputError(f"{e.filename or 'standard output'}: {e.strerror or e}")
@@ -274,28 +274,28 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _prepare_jax(cpu_devices: int | None = None) -> None:
-    """float64, and a compilation cache that takes everything. Only entry points do this.
+    """Set float64 and a compilation cache for all programs. Only entry points call this.
 
     Args:
-        cpu_devices: so many processors are devices; JAX decides unless given.
+        cpu_devices: number of processors that are devices; default: JAX decides.
     """
-    # Imports of JAX and of what uses it stand within the commands: they take seconds, and a wrong
-    # option, --help and `info` need none of them.
+    # Commands import JAX and its users themselves. That takes seconds, which a wrong option, --help
+    # and `info` do not need.
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    # Where in the source each operation was traced: that is for who looks into what JAX compiles,
-    # and takes a twentieth of `check`.
+    # Source locations of traced operations serve only for debugging compiled programs, and take 5 %
+    # of the time of `check`.
     jax.config.update("jax_include_full_tracebacks_in_locations", False)
     jax.config.update("jax_traceback_in_locations_limit", 0)
-    # JAX keeps only programs that took a second to compile. A fit has dozens of small ones, which
-    # add up to seconds.
+    # JAX caches only programs that took over a second to compile. A fit has dozens of small ones,
+    # which add up to seconds.
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         jax.config.update("jax_compilation_cache_dir", _private_cache())
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     if cpu_devices is not None:
-        # Once JAX is in use their number stays as it is.
+        # The number of devices is fixed once JAX is in use.
         with contextlib.suppress(RuntimeError):
             jax.config.update("jax_num_cpu_devices", cpu_devices)
     platforms = os.environ.get("JAX_PLATFORMS", "")
@@ -303,7 +303,7 @@ def _prepare_jax(cpu_devices: int | None = None) -> None:
         return
     try:
         jax.devices()
-    # An assertion, where the part of JAX that knows the device is there and the device is not.
+    # JAX raises AssertionError if its plugin for the device is installed but the device is missing.
     except (RuntimeError, AssertionError) as e:
         raise InputError(
             f"JAX_PLATFORMS={platforms}: JAX finds no such device here, expected one that there is "
@@ -313,11 +313,13 @@ def _prepare_jax(cpu_devices: int | None = None) -> None:
 
 
 def _private_cache() -> str | None:
-    """The cache folder, of this user alone; None where it is not: what was compiled is code."""
+    """Return the cache folder, or None if it does not belong to this user alone. Cached programs
+    are executable code.
+    """
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "heli_jax"
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        folder.chmod(0o700)  # refused where it is another user's, unless this one is root
+        folder.chmod(0o700)  # fails for another user's folder, unless run as root
         owner = folder.stat().st_uid
     except OSError:
         return None
@@ -325,10 +327,10 @@ def _private_cache() -> str | None:
 
 
 def _new_directory(options: argparse.Namespace) -> Path:
-    """Return the directory of a run's files, which does not exist yet."""
+    """Return the directory for a run's files, which does not exist yet."""
     out = _directory(options)
     resume = ", or --resume" if hasattr(options, "resume") else ""
-    run_directory.require_free(out, resume)  # at once, before the seconds of the imports
+    run_directory.require_free(out, resume)  # check before the imports, which take seconds
     return out
 
 
@@ -338,7 +340,7 @@ def _directory(options: argparse.Namespace) -> Path:
 
 
 def _fit(options: argparse.Namespace) -> int:
-    began = time.perf_counter()  # before JAX is imported, which the user waits for too
+    began = time.perf_counter()  # before the import of JAX, whose seconds count
     if not options.resume:
         _new_directory(options)
     _prepare_jax()
@@ -361,7 +363,7 @@ def _fit(options: argparse.Namespace) -> int:
     try:
         run = workflow.run_fit(experiment, out, progress=options.say, began=began)
     except workflow.NotWritten as e:
-        # A fit of hours is shown at least.
+        # Print at least the fit, which may have taken hours.
         run, failure = e.run, e
     if options.json and run.directory is not None:
         print((run.directory / "fit.json").read_text(encoding="utf-8"), end="")
@@ -373,7 +375,7 @@ def _fit(options: argparse.Namespace) -> int:
 
 
 def _fit_study(options: argparse.Namespace, study: "Study") -> int:
-    """Carry out a study and print it; returns the exit code of the worst fit."""
+    """Run a study, print it, and return the exit code of the worst fit."""
     from heli_jax import simulation_output
     from heli_jax.studies import directory
     from heli_jax.studies import run as studies
@@ -383,9 +385,9 @@ def _fit_study(options: argparse.Namespace, study: "Study") -> int:
     _require_out(options)
     out = _directory(options)
     options.interrupts.words = lambda: resumable(out, directory.FINISHED)
-    # Workers of dask have to be told; our own processes end with this one.
+    # Workers of dask must be stopped. Our own processes end with this one.
     options.interrupts.unwinds = bool(options.scheduler)
-    # Without a scheduler --workers are processes of our own, for which dask is not needed.
+    # Without a scheduler, --workers starts our own processes, which do not need dask.
     with _dask_client(options) if options.scheduler else contextlib.nullcontext() as client:
         how = {"workers": options.workers, "client": client, "reports": options.reports}
         result = studies.run(study, out, studies.Options(options.resume, **how, say=options.say))
@@ -401,7 +403,7 @@ def _require_out(options: argparse.Namespace) -> None:
 
 # Any: dask.distributed is an extra, and only `sweeps.cluster` names its classes.
 def _dask_client(options: argparse.Namespace) -> contextlib.AbstractContextManager[Any]:
-    """A dask client where --scheduler or --workers asks for one."""
+    """Return a dask client if --scheduler or --workers asks for one."""
     if options.scheduler is None and options.workers is None:
         return contextlib.nullcontext()
     try:
@@ -416,7 +418,7 @@ def _dask_client(options: argparse.Namespace) -> contextlib.AbstractContextManag
 
 
 def _discard_output() -> None:
-    """Send what is still to be printed nowhere."""
+    """Discard output that is not yet printed."""
     if sys.stdout is not None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
@@ -467,8 +469,8 @@ def _frf(options: argparse.Namespace) -> int:
 
     experiment = workflow.load_config(options.config, options.set)
     statuses = log_responses.run_responses(experiment, out, options.log, options.say)
-    # The responses are written whatever comes of a transfer function; a script that looks at the
-    # code alone must not take numbers that are not there.
+    # Responses are written even if a transfer function fails. The exit code shows scripts that its
+    # numbers are missing.
     codes = {"converged": DONE, "not-identifiable": NOT_DETERMINED}
     return max((codes.get(status, NOT_CONVERGED) for status in statuses), default=DONE)
 
@@ -483,7 +485,7 @@ def _simulate(options: argparse.Namespace) -> int:
         view = Path(options.view) if options.view else beside
         if view.suffix.lower() not in (".html", ".htm"):
             raise InputError(f"--view {view}: expected a name ending in .html")
-    # Both places before the simulation: what cannot be written is known now.
+    # Check both places before the simulation.
     for option, place in (("--out", out), ("--view", view)):
         if place is not None:
             run_directory.require_place(place, f"{option} {place}")
@@ -513,7 +515,7 @@ def _sweep(options: argparse.Namespace) -> int:
     out = _directory(options) if options.resume else _new_directory(options)
     from heli_jax.numerics.cores import cores
 
-    # Each core a device of its own; where there are GPUs they are the devices.
+    # Each core is a device, unless there are GPUs.
     _prepare_jax(options.devices or cores())
     import jax
 
@@ -523,7 +525,7 @@ def _sweep(options: argparse.Namespace) -> int:
 
     experiment = configuration.load(options.config, options.set)
     options.interrupts.words = lambda: resumable(out, FINISHED)
-    # Processes of a cluster have to be told.
+    # Processes of a cluster must be stopped.
     options.interrupts.unwinds = bool(options.workers or options.scheduler)
     with _dask_client(options) as client:
         sweep_workflow.run_sweep(
@@ -531,7 +533,7 @@ def _sweep(options: argparse.Namespace) -> int:
             out,
             figures=not options.no_figures,
             resume=options.resume,
-            # Of GPUs there are as many as there are, so --devices takes the first of them.
+            # The number of GPUs is fixed, so --devices takes the first of them.
             devices=jax.local_devices()[: options.devices],
             client=client,
             say=options.say,
@@ -578,7 +580,7 @@ def _convert(options: argparse.Namespace) -> int:
 
 
 def _selection(options: argparse.Namespace) -> "Selection":
-    """Return the part of a log that `convert` takes."""
+    """Return the part of a log that `convert` writes."""
     from heli_jax.flights import convert
     from heli_jax.flights.preset import by_preset as named_by
 
@@ -626,12 +628,12 @@ def _found(folder: Path) -> Iterator[dict[str, Any]]:
     for path in _files(folder, _DEEPEST):
         try:
             content = json.loads(read_regular(path, "the fit.json of a run", _LARGEST_FIT))
-            # Without its reasons, for which a table has no room.
+            # The table has no room for the reasons.
             adequate = ADEQUATE[content["adequate"]]
             row = {k: content[k] for k in ("model", "method", "status")}
             untrusted = ", ".join(map(str, content.get("untrusted") or ()))
             date = time.strftime("%Y-%m-%d %H:%M", time.localtime(path.stat().st_mtime))
-        # Any file may be called so: what no fit wrote is no run.
+        # Another program may have written a fit.json, which is no run.
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
             continue
         name = str(path.parent.relative_to(folder))
@@ -639,7 +641,7 @@ def _found(folder: Path) -> Iterator[dict[str, Any]]:
 
 
 def _files(folder: Path, deepest: int) -> Iterator[Path]:
-    # Also one that may be listed and not entered says of nothing in it what it is.
+    # A folder may be listed but not entered. Its entries then have no type.
     try:
         inside = sorted(os.scandir(folder), key=lambda entry: entry.name)
         files = [e.path for e in inside if e.name == "fit.json" and e.is_file()]
@@ -659,13 +661,13 @@ def _compare(options: argparse.Namespace) -> int:
     if place is not None and place.suffix.lower() not in endings:
         raise InputError(f"--out {place}: expected a name ending in {', '.join(endings)}")
     compared = compare_runs(options.runs)
-    # Numbers for names: several directories' names are wider than a terminal.
+    # Directory names may be wider than a terminal, so runs have numbers.
     numbered = compared._replace(labels=tuple(str(i + 1) for i in range(len(compared.runs))))
     for number, row in zip(numbered.labels, compared.verdicts.rows, strict=True):
         label, model, method, status, verdict, adequate = row
         tell(f"{number}: {label}: {model} by {method}, {status}. {verdict} adequate: {adequate}")
     tell_table(numbered.estimates)
-    # Output, flights and metric are a row's name, where a narrow terminal parts the table too.
+    # Output, flights and metric name a row, also where a narrow terminal splits the table.
     tell_table(numbered.agreement, keys=3)
     for found in numbered.notes:
         tell(f"! {found.sentence}")
@@ -725,7 +727,7 @@ def _keys(options: argparse.Namespace) -> int:
     for key in found:
         default = getattr(key, "default", "")
         default = "has to be there" if default is None else default and f"default {default}"
-        # A default of null says that the key may be left out, and no more.
+        # A default of null means only that the key may be left out.
         default = "optional" if default == "default null" else default
         head = "; ".join(filter(None, (f"{key.path}: {key.kind}", default)))
         for text, first in ((head, ""), (key.meaning, indent)):

@@ -1,7 +1,7 @@
-"""Do the sensors of a log agree? Rates against angles, accelerations against velocities.
+"""Compatibility of a log's sensors: rates against angles, accelerations against velocities.
 
-A layer over `run_fit` with the models of `heli_jax.dynamics.kinematics`: the same estimator,
-intervals and report, then a word on each error, and a file of corrections.
+A layer over `run_fit` with the models of `heli_jax.dynamics.kinematics`. It uses the same
+estimator, intervals and report, and adds a result for each sensor error and a file of corrections.
 """
 
 import dataclasses
@@ -29,21 +29,22 @@ from heli_jax.yaml_file import as_yaml
 FILE = "compatibility.yaml"
 
 AGREES = 0.9
-"""R^2 of a channel from which on its sensors agree (the acceptance card's gate)"""
+"""Least R^2 of a channel whose sensors agree (the gate of the acceptance card)."""
 _AS_SHOWN = 1.5
-"""times the noise that the sensors themselves show, up to which the noise that lets a channel drift
-is theirs: of a wrong unit or sign it is many times as much"""
+"""Largest ratio of estimated drift noise to the sensors' own noise that still counts as sensor
+noise. A wrong unit or sign gives a far larger ratio.
+"""
 _RESTS = 0.5
-"""share of the priors in the variance of an error from which on the record does not determine it"""
+"""Share of the priors in the variance of an error above which the record does not determine it."""
 _NO_NOISE = 1e-9
-"""part of a signal below which noise is none: no log has so many digits"""
+"""Noise that counts as zero [fraction of the signal]. No log has that resolution."""
 _LARGEST_SCALE = 0.1
-"""scale error beyond which it is hardly the sensor's own: a cheap one is good to some percent"""
+"""Largest plausible scale error of a sensor. Cheap sensors are accurate to some percent."""
 
 
 @dataclass(frozen=True)
 class SensorError:
-    """One error: what was found of it."""
+    """One sensor error and its estimate."""
 
     name: str
     meaning: str
@@ -52,13 +53,13 @@ class SensorError:
 
     @property
     def shows(self) -> bool:
-        """True if the record determines it and it is not zero."""
+        """True if the record determines the error and its interval excludes zero."""
         low, high = self.estimate.lower95, self.estimate.upper95
         return self.determined and low is not None and high is not None and low * high > 0
 
     @property
     def words(self) -> str:
-        """Text of its row in the table."""
+        """Text of the error's row in the table."""
         if not self.determined:
             return "unknown"
         return "yes" if self.shows else "no"
@@ -71,13 +72,13 @@ class Compatibility:
     run: FitRun
     errors: tuple[SensorError, ...]
     r_squared: dict[str, float]
-    """by output, of what the corrected rates and specific forces reconstruct"""
+    """R^2 of each output, reconstructed from the corrected rates and specific forces."""
     compatible: bool
     verdict: str
     doubts: tuple[Finding, ...]
-    """sentences on what speaks against the estimates"""
+    """Findings that question the estimates."""
     corrections: dict[str, Any]
-    """what `compatibility.yaml` holds"""
+    """Content of `compatibility.yaml`."""
 
 
 def run_compatibility(
@@ -91,13 +92,13 @@ def run_compatibility(
 
     Args:
         config: a configuration with `model: kinematics`.
-        out: directory for the report and compatibility.yaml, a numbered sibling where it exists;
-            none is written unless given.
-        overrides: values in place of the file's, as of `load_config`.
-        progress: called with what is going on, in words.
+        out: directory for the report and compatibility.yaml, a numbered sibling if it exists;
+            default: nothing is written.
+        overrides: replacements for values of the file (see `load_config`).
+        progress: called with progress messages.
 
     Raises:
-        InputError: a log or something of the configuration is wrong, or `out` cannot be written.
+        InputError: a log or the configuration is wrong, or `out` cannot be written.
     """
     if out is not None:
         out = run_directory.free_directory(Path(out))
@@ -131,9 +132,11 @@ def run_compatibility(
 
 
 def _agreement(compatibility: Compatibility) -> SensorAgreement:
-    """Return the sentences above the fit's own page, whose statements know nothing of sensors."""
+    """Return the sensor results for the top of the fit's page, whose own statements do not cover
+    sensors.
+    """
     head, rows = table(compatibility)
-    # The fit's findings stand on its page already.
+    # The fit's page already shows the fit's findings.
     doubts = tuple(d for d in compatibility.doubts if d not in compatibility.run.fit.findings)
     return SensorAgreement(
         compatibility.compatible, compatibility.verdict, doubts, head, tuple(rows)
@@ -152,7 +155,7 @@ _BEYOND_NOISE = (
 
 
 def _without_noise(run: FitRun) -> bool:
-    """True if filter error looked for measurement noise and found none."""
+    """True if filter error estimated measurement noise as zero."""
     searched = {*NOISES} & {*run.problem.free}
     return (
         run.problem.noise_model == "disturbance"
@@ -162,20 +165,20 @@ def _without_noise(run: FitRun) -> bool:
 
 
 def _smooth(run: FitRun) -> bool:
-    """True if the noise of an output went to zero, beside that of the gyros."""
+    """True if the estimated noise of an output is zero."""
     sizes = [np.nanstd(y) for s in run.fit.signals for y in s.measured.values()]
     return min(run.fit.noise.values(), default=1.0) < _NO_NOISE * max(sizes, default=0.0)
 
 
 def _by_output_error(experiment: Experiment) -> Experiment:
     config = experiment.config
-    assert config.fit is not None  # it has been fitted
+    assert config.fit is not None  # the experiment has been fitted
     fit = config.fit.model_copy(update={"method": "output-error"})
     return experiment._replace(config=config.model_copy(update={"fit": fit}))
 
 
 def judged(run: FitRun) -> Compatibility:
-    """Judge the sensors by the fit of a kinematic model."""
+    """Return the sensor compatibility from the fit of a kinematic model."""
     errors = tuple(_error(run, n, e) for n, e in run.fit.estimates.items() if n in SIZES)
     r_squared = r_squared_of(run)
     converged = run.fit.status != "not-converged"
@@ -186,7 +189,7 @@ def judged(run: FitRun) -> Compatibility:
     verdict = _verdict(errors, r_squared, bad, drifting, converged)
     if compatible:
         verdict = f"{verdict}{_untold(run, errors)}"
-    # Of signals that do not fit together the errors are those of a wrong model: none to take off.
+    # If the signals are incompatible, the model is wrong and its errors are no corrections.
     known = {e.name: e.estimate.value for e in errors if e.determined and compatible}
     corrections = _corrections(run, known, errors)
     corrections["verdict"] = verdict
@@ -202,8 +205,10 @@ def _error(run: FitRun, name: str, estimate: Estimate) -> SensorError:
 
 
 def r_squared_of(run: FitRun) -> dict[str, float]:
-    """By output, 1 - the squared residual over the squared deviation from the mean, over all fitted
-    flights; NaN where an output never moves."""
+    """Return the R^2 of each output over all fitted flights; NaN where an output never moves.
+
+    R^2 is 1 - the squared residual over the squared deviation from the mean.
+    """
     shares = {}
     flights = [s for s in run.fit.signals if not s.hold_out]
     for n in sorted({n for s in flights for n in s.measured}):
@@ -218,13 +223,12 @@ def r_squared_of(run: FitRun) -> dict[str, float]:
 
 
 def _drifting(run: FitRun) -> set[str]:
-    """Return the outputs whose reconstruction drifts as far as the sensors' noise explains, by
-    one-step predictions."""
+    """Return the outputs whose one-step predictions attribute the drift to the sensors' noise."""
     fit = run.fit
     if run.problem.noise_model != "disturbance":
         return set()
     for n in {*NOISES} & {*fit.estimates}:
-        # The search begins at what third differences show of the noise.
+        # The start value is the noise estimated from third differences.
         if not fit.estimates[n].value <= _AS_SHOWN * run.problem.free[n].start:
             return set()
     ratios = {
@@ -260,12 +264,13 @@ def _verdict(
 
 
 def _untold(run: FitRun, errors: Sequence[SensorError]) -> str:
-    """Return what these channels cannot show where the verdict is good; empty where they show
-    all."""
+    """Return what these channels cannot determine if the verdict is good; empty if they determine
+    all.
+    """
     untold = [e for e in errors if not e.determined]
     if not untold:
         return ""
-    # An error that nothing bounds makes up for what does not fit, however large it has to be.
+    # An error without bounds can hide any misfit, if it is large enough.
     priors = {e.name: run.problem.free[e.name].prior for e in untold}
     far = [
         f"{e.name} of {e.estimate.value:+.2g} {e.estimate.unit}".removesuffix(" 1").rstrip()
@@ -281,8 +286,9 @@ def _untold(run: FitRun, errors: Sequence[SensorError]) -> str:
 
 
 def _doubts(run: FitRun, errors: Sequence[SensorError]) -> tuple[Finding, ...]:
-    """Return the fit's own doubts, and the errors that no real sensor has."""
-    # That a simulation misses a channel is in the verdict, and its remedies are those of a vehicle.
+    """Return the fit's own doubts, and implausible sensor errors."""
+    # The verdict covers channels that the simulation misses. The remedies of these findings are for
+    # vehicles.
     of_model = ("adequacy.", "dynamics.", "excitation.")
     notes = once(
         f for f in run.fit.findings if f.severity != "ok" and not f.code.startswith(of_model)
@@ -309,10 +315,10 @@ def _doubts(run: FitRun, errors: Sequence[SensorError]) -> tuple[Finding, ...]:
 def _corrections(
     run: FitRun, values: dict[str, float], errors: Sequence[SensorError]
 ) -> dict[str, Any]:
-    """The content of a file of corrections: what was determined, by the log's own names."""
+    """Return the content of a file of corrections: the determined errors, by the log's names."""
     experiment = run.config
     model = experiment.model
-    # The sensor that is logged first needs no correction; what is late is late against it.
+    # The earliest sensor needs no correction. Delays are relative to it.
     by_sensor = {"delay_gyro": RATES, "delay_accel": FORCES}
     early = {n: values.get(p, 0.0) for p, names in by_sensor.items() for n in names}
     latest = max(0.0, *early.values())
@@ -321,7 +327,7 @@ def _corrections(
     for each in (each for flight in run.problem.flights for each in logged_signals(flight)):
         n, signal = each.name, each.signal
         if signals.get(signal.name, {"of": n})["of"] != n:
-            # A file of corrections knows a signal by its name alone.
+            # A file of corrections identifies a signal by its name alone.
             raise InputError(
                 f"{experiment.path}: {signal.name} is {signals[signal.name]['of']} in one log and "
                 f"{n} in another, expected one name for one sensor"
@@ -334,7 +340,7 @@ def _corrections(
         }
         if any(correction.values()):
             conversion = conversion_of(signal)
-            # Left out where the numbers were read as they are.
+            # Left out if the numbers need no conversion.
             read = {} if conversion == Conversion() else {"conversion": conversion.model_dump()}
             signals[signal.name] = {"of": n, "unit": signal.unit, **correction, **read}
     arm = {n: _short(values[n]) for n in ("x_imu", "y_imu", "z_imu") if n in values}
@@ -347,12 +353,12 @@ def _corrections(
 
 
 def _short(value: float) -> float:
-    # Five digits: for people to read, and more than any record gives.
+    # Five digits are readable, and more than any record determines.
     return float(f"{value:.5g}")
 
 
 def table(compatibility: Compatibility) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Head and rows of the table of errors."""
+    """Return the head and rows of the table of errors."""
     head = ("error", "estimate, 95 %", "unit", "shows", "what it is")
     rows = []
     for e in compatibility.errors:

@@ -1,7 +1,6 @@
-"""Results as the objects of other libraries: pandas, xarray, arviz; each imported where it is
-used.
+"""Results as objects of other libraries: pandas, xarray, arviz; each is imported on use.
 
-The classes whose methods call this import it, so that it imports none of them: their objects are
+The classes whose methods call this module import it. It imports none of them, so their objects are
 `Any` here.
 """
 
@@ -19,9 +18,10 @@ if TYPE_CHECKING:
 
 
 def estimates_frame(estimates: Mapping[str, Any]) -> "pd.DataFrame":
-    """Estimates as a data frame: a row each, with value, sd, lower95, upper95, unit, prior_share.
+    """Return estimates as a data frame: a row each, with value, sd, lower95, upper95, unit,
+    prior_share.
 
-    sd and interval are NaN where the data do not determine a parameter.
+    sd and interval are NaN if a parameter is not identifiable.
     """
     import pandas as pd
 
@@ -29,16 +29,16 @@ def estimates_frame(estimates: Mapping[str, Any]) -> "pd.DataFrame":
     rows = {name: [getattr(e, c) for c in columns] for name, e in estimates.items()}
     frame = pd.DataFrame.from_dict(rows, orient="index", columns=list(columns))
     numeric = [c for c in columns if c != "unit"]
-    # None, where the data do not determine a parameter, becomes NaN: a column with None is of
-    # objects, which pandas neither sums nor plots.
+    # None (not identifiable) becomes NaN. A column with None has dtype object, which pandas neither
+    # sums nor plots.
     frame = frame.astype(dict.fromkeys(numeric, float))
     return frame.rename_axis("parameter")
 
 
 def runs_frame(runs: Mapping[str, Mapping[str, Any]]) -> "pd.DataFrame":
-    """The estimates of several runs as a long data frame: a row for each run and parameter.
+    """Return the estimates of several runs as a long data frame: a row for each run and parameter.
 
-    What the data do not determine has no number.
+    Parameters that are not identifiable have no number.
     """
     import pandas as pd
 
@@ -49,23 +49,23 @@ def runs_frame(runs: Mapping[str, Mapping[str, Any]]) -> "pd.DataFrame":
 
 
 def trajectory_dataset(run: Any) -> "xr.Dataset":
-    """A run as a Dataset over `time` [s], each signal with its unit and its role (state, output or
-    input) in the attributes.
+    """Return a run as a Dataset over `time` [s], with unit and role of each signal in the
+    attributes.
 
-    An output of the same name as a state or input, whose values it would repeat or replace, is
-    `NAME_output`; an input likewise `NAME_input`. Of a batch of runs each signal has further
-    dimensions `run_0`, `run_1` ... before time. The attribute `precision` is the type that the run
-    was computed in; where that is below float64, `precision_note` says what it costs.
+    The role is state, output or input. An output that shares its name with a state or input becomes
+    `NAME_output`; an input becomes `NAME_input`. In a batch, each signal has the dimensions
+    `run_0`, `run_1` ... before time. The attribute `precision` is the floating-point type of the
+    run; below float64, `precision_note` states the loss.
 
     Raises:
         ValueError: the runs of a batch differ in their times.
     """
     import xarray as xr
 
-    # vmap puts batch dimensions in front, so time is the last of every signal.
+    # vmap adds batch dimensions in front, so time is the last of every signal.
     times = np.asarray(run.times)
     batch = [f"run_{i}" for i in range(times.ndim - 1)]
-    # One coordinate for all runs: a Dataset has no `time` that differs from run to run.
+    # A Dataset has one `time` coordinate for all runs.
     first = times.reshape(-1, times.shape[-1])[0]
     if not (times == first).all():
         raise ValueError("to_xarray: expected the same times in every run of the batch")
@@ -78,8 +78,7 @@ def trajectory_dataset(run: Any) -> "xr.Dataset":
             variables[unique] = ([*batch, "time"], np.asarray(values), attributes)
     status = (batch, np.asarray(run.status), {"meaning": "index into trajectory.STATUS"})
     coordinates = {"time": ("time", first, {"units": "s"}), "status": status}
-    # A file of it does not say in which precision its numbers were computed: single ones may have
-    # been widened since.
+    # The types in a file do not show the precision of the run, since float32 may have been widened.
     precision, cost = precision_of(run)
     attributes = {"precision": precision} | ({"precision_note": cost} if cost else {})
     return xr.Dataset(variables, coordinates, attributes)
@@ -89,11 +88,11 @@ def trajectory_dataset(run: Any) -> "xr.Dataset":
 def posterior_tree(
     draws: Mapping[str, np.ndarray], statistics: Mapping[str, np.ndarray] | None = None
 ) -> Any:
-    """Posterior draws, each (chains, draws), as arviz' inference data.
+    """Return posterior draws, each (chains, draws), as arviz inference data.
 
     Args:
-        draws: of the group `posterior`.
-        statistics: of the group `sample_stats`; none unless given.
+        draws: variables of the group `posterior`.
+        statistics: variables of the group `sample_stats`; default: none.
 
     Raises:
         ValueError: arviz is not installed.

@@ -1,7 +1,7 @@
-"""Findings about a record, a model or a fit, and the one rule that concludes from them.
+"""Findings about a record, a model or a fit, and the rule that derives a result from them.
 
-A finding is data: a stable code, a severity, its number and limit, and what it does to the
-estimates. `messages.yaml` has the words for each code; no code reads them.
+A finding is data: a stable code, a severity, a value with its limit, and its effect on the
+estimates. `messages.yaml` has the text for each code; no code depends on that text.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -11,41 +11,45 @@ from typing import Any, Literal, NamedTuple
 from heli_jax.messages import messages, sentence, written
 
 Severity = Literal["ok", "note", "doubt", "refuse"]
-"""ok: tested, nothing found; note: for information; doubt: something may be wrong; refuse: a fit of
-this record says nothing of what is asked"""
+"""Severity of a finding.
+
+ok: tested, nothing found; note: for information; doubt: a possible fault; refuse: a fit of this
+record cannot give the requested estimates.
+"""
 
 LEFT_OUT = "channels.left-out"
-"""code of what of a log is not read"""
+"""Code of the finding on parts of a log that are not read."""
 _FARTHEST = 10.0
-"""times an estimate that one step of a test moves it; farther it tells no size"""
+"""Largest step of a score test that still gives a size [multiples of the estimate]."""
 HALF_INTERVAL = 1.96
-"""standard deviations from an estimate to the end of its 95 % interval; a misfit that moves it
-further leaves an interval without the truth in it"""
+"""Half-width of a 95 % interval [standard deviations]. A misfit that shifts the estimate further
+leaves the true value outside the interval.
+"""
 
 
 class Finding(NamedTuple):
-    """One finding. The names of the fields are keys of fit.json."""
+    """A finding; its field names are keys of fit.json."""
 
     code: str
-    """stable, as `timing.input-late`: the topic, then what was found"""
+    """Stable code, such as `timing.input-late`: the topic, then the finding."""
     severity: Severity
     sentence: str
     value: float | None = None
     criterion: str = ""
-    """what `value` is, and the limit that it is held against"""
+    """Meaning of `value`, and its limit."""
     subjects: tuple[str, ...] = ()
-    """signals, parameters or flights that it is about"""
+    """Signals, parameters or flights that it concerns."""
     shifts: Mapping[str, float] = MappingProxyType({})
-    """by parameter: how far this misfit moves its estimate [SI], by one step of the score test"""
+    """Shift of each estimate by this misfit [SI], from one step of the score test."""
     brief: str = ""
-    """the finding in a few words, for the statements of a report"""
+    """Short form for the statements of a report."""
     denies: bool = False
-    """whether it shows that the model does not explain the record"""
+    """True if the finding shows that the model does not explain the record."""
     distrusts: tuple[str, ...] = ()
-    """parameters whose intervals it makes unusable by an amount that is not known"""
+    """Parameters whose intervals become unusable by an unknown amount."""
 
     def of(self, whose: str) -> "Finding":
-        """The same, whose sentence says first of which log, flight or signal it is."""
+        """Return the finding with its log, flight or signal at the start of the sentence."""
         return self._replace(sentence=f"{whose}: {self.sentence}")
 
     @property
@@ -56,22 +60,21 @@ class Finding(NamedTuple):
 
     @property
     def bad(self) -> bool:
-        """True for a doubt, or worse."""
+        """True for a doubt or a refusal."""
         return self.severity in ("doubt", "refuse")
 
 
 class Distrust(NamedTuple):
-    """Reason why the interval of one estimate may not be used. The names of the fields are keys
-    of fit.json."""
+    """Reason why the interval of an estimate is unusable; its field names are keys of fit.json."""
 
     code: str
-    """of the finding"""
+    """Code of the finding."""
     shift: float | None
-    """how far the misfit moves the estimate [SI]; None where that is not known"""
+    """Shift of the estimate by the misfit [SI]; None if unknown."""
     brief: str
 
 
-# Any: numbers, names and lists of these, which the sentence shows.
+# Any: numbers, names and lists of these, for the sentence.
 def found(
     code: str,
     severity: Severity = "doubt",
@@ -82,13 +85,13 @@ def found(
     distrusts: Iterable[str] = (),
     **numbers: Any,
 ) -> Finding:
-    """A finding with the words that `messages.yaml` has for its code.
+    """Return a finding with the text of `messages.yaml` for its code.
 
     Args:
-        subjects: signals, parameters or flights that it is about.
-        shifts: by parameter how far the misfit moves its estimate [SI].
-        denies: whether it shows that the model does not explain the record.
-        numbers: what the sentence shows, by the names of its fields; `flight` stands before it.
+        subjects: signals, parameters or flights that it concerns.
+        shifts: shift of each estimate by the misfit [SI].
+        denies: True if it shows that the model does not explain the record.
+        numbers: values for the fields of the sentence; `flight` comes before the sentence.
     """
     message = messages()[code]
     shown = {"value": value, "subjects": subjects, **numbers}
@@ -108,17 +111,17 @@ def found(
 
 
 def note(code: str, sentence: str, *subjects: str, value: float | None = None) -> Finding:
-    """A finding for information alone."""
+    """Return a finding that is for information only."""
     return Finding(code, "note", sentence, value, subjects=subjects)
 
 
 def as_data(finding: Finding) -> dict[str, Any]:
-    """A finding as plain data."""
+    """Return a finding as plain data."""
     return {**finding._asdict(), "shifts": dict(finding.shifts)}
 
 
 def once(findings: Iterable[Finding]) -> list[Finding]:
-    """The findings, each sentence once."""
+    """Return the findings without repeated sentences."""
     by_sentence: dict[str, Finding] = {}
     for finding in findings:
         by_sentence.setdefault(finding.sentence, finding)
@@ -126,27 +129,28 @@ def once(findings: Iterable[Finding]) -> list[Finding]:
 
 
 def sentences(findings: Iterable[Finding]) -> list[str]:
-    """The sentences of findings, each once."""
+    """Return the sentences of findings without repetition."""
     return [f.sentence for f in once(findings)]
 
 
 def distrusted(findings: Sequence[Finding], estimates: Mapping[str, Any]) -> dict[str, Distrust]:
-    """By parameter the finding that takes its interval away, the largest shift first.
+    """Return the finding that makes each parameter's interval unusable, the largest shift first.
 
     Args:
-        estimates: by parameter, with `value` and `sd` [SI]; None where it is not identifiable.
+        estimates: estimates by parameter, with `value` and `sd` [SI]; sd is None if not
+            identifiable.
     """
     known = {name: e for name, e in estimates.items() if e.sd is not None}
 
     def parts(f: Finding) -> dict[str, float]:
-        """Shifts over half an interval."""
+        """Return the shifts over half an interval."""
         return {
             n: abs(f.shifts.get(n, 0.0)) / max(HALF_INTERVAL * e.sd, 1e-300)
             for n, e in known.items()
         }
 
-    # One step is a size to first order: a misfit that takes one interval away takes those that it
-    # may move as far, by an amount that is not known.
+    # One step gives the size to first order only. If a misfit invalidates one interval, it also
+    # invalidates those that it shifts at least half as far.
     takes = [
         (f, by, 0.5 if max(by.values(), default=0.0) > 1.0 else 1.0)
         for f, by in ((f, parts(f)) for f in findings)
@@ -166,10 +170,10 @@ def distrusted(findings: Sequence[Finding], estimates: Mapping[str, Any]) -> dic
 
 
 def weighed(findings: Iterable[Finding], estimates: Mapping[str, Any]) -> list[Finding]:
-    """The findings, a doubt of those that take an interval away and a note of misfits that do not.
+    """Return the findings, with severity doubt if a misfit makes an interval unusable, else note.
 
     Args:
-        estimates: by parameter, with `sd` [SI].
+        estimates: estimates by parameter, with `sd` [SI].
     """
     out = []
     for f in findings:
@@ -181,13 +185,13 @@ def weighed(findings: Iterable[Finding], estimates: Mapping[str, Any]) -> list[F
 
 
 def exit_code(status: str, adequate: bool, distrusts: Mapping[str, Distrust]) -> int:
-    """The exit code of a fit, which the statements and the page's light follow.
+    """Return the exit code of a fit, which also sets the statements and the light of the page.
 
-    0: the intervals may be used as they stand. 3: something in the record contradicts the numbers
-    (not identifiable, or not trusted). 4: not converged, or the model does not explain the record.
+    0: the intervals are usable. 3: the record contradicts the numbers (not identifiable, or not
+    trusted). 4: not converged, or the model does not explain the record.
 
     Args:
-        distrusts: of `distrusted`.
+        distrusts: result of `distrusted`.
     """
     if status == "not-converged" or not adequate:
         return 4

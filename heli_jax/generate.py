@@ -1,4 +1,4 @@
-"""Runs that a configuration describes and the project makes itself."""
+"""Simulated runs of a configuration."""
 
 import warnings
 from typing import Any, NamedTuple
@@ -34,20 +34,20 @@ from heli_jax.simulation.trajectory import Trajectory
 from heli_jax.sweeps.spec import Trimmed
 
 _MIDDLE = 1e-14
-"""of a stick's travel: a trimmed stick nearer to its middle (trim leaves 1e-79) is written as 0"""
+"""Stick position that counts as zero [fraction of travel]. Trim leaves values near 1e-79."""
 
 
 class Simulated(NamedTuple):
     """Columns of simulated runs under the names and in the units of a log."""
 
     columns: dict[str, np.ndarray]
-    """inputs as they were commanded: they act later where the model has delays"""
+    """Commanded inputs. With delays in the model they act later."""
     model: Model
-    """what was simulated, with wind where there is some, and without the disturbance"""
+    """Simulated model, with wind if there is any, and without the disturbance."""
     runs: dict[str, Trajectory]
-    """the runs by name, without noise, in SI, as NumPy arrays"""
+    """Noise-free runs by name, in SI, as NumPy arrays."""
     notes: tuple[Finding, ...]
-    """what is to be said of them"""
+    """Notes on the runs."""
 
     @property
     def whole(self) -> bool:
@@ -58,7 +58,7 @@ class Simulated(NamedTuple):
 def _stick_inputs(
     experiment: Experiment, settings: SimulateConfig, n: int, rng: np.random.Generator, where: str
 ) -> dict[str, np.ndarray]:
-    """Every input of the model in SI; one that is not named stays at neutral.
+    """Return every input of the model in SI; inputs without a name stay at neutral.
 
     Args:
         settings: the configuration's `simulate`.
@@ -67,7 +67,7 @@ def _stick_inputs(
     words = f"model {experiment.model.name} has no input"
     require_known(settings.inputs, naming.names(record), f"{where}.inputs", words)
     out = {}
-    # In the model's order, not the configuration's: the draws must not depend on how it is written.
+    # Draws follow the model's order, so that they do not depend on the order in the configuration.
     for name in naming.names(record):
         stick = settings.inputs.get(name)
         if stick is None:
@@ -85,7 +85,7 @@ def _stick(config: StickConfig, n: int, dt: float, rng: np.random.Generator) -> 
     if config.kind == "3-2-1-1":
         return sticks.multistep_3211(n, dt, rng, config.step, config.pause)
     if config.kind == "sweep":
-        # Now the word for a parameter sweep alconfig.
+        # `sweep` now means a parameter sweep.
         warnings.warn("kind: sweep is deprecated, expected chirp", DeprecationWarning, stacklevel=2)
     if config.kind in ("chirp", "sweep"):
         return sticks.chirp(n, dt, *config.band)
@@ -93,41 +93,41 @@ def _stick(config: StickConfig, n: int, dt: float, rng: np.random.Generator) -> 
 
 
 def _factor_to_si(unit: str, si: str, where: str) -> float:
-    """Return `units.factor`; an error names the place.
+    """Return `units.factor`; errors name the place.
 
     Args:
-        si: the SI unit of what it is for.
+        si: the SI unit of the quantity.
     """
     with located(where):
         return units.factor(unit, si)
 
 
 def generate(experiment: Experiment) -> Simulated:
-    """The run of the configuration's `simulate`, with noise and disturbance.
+    """Simulate the run of the configuration's `simulate`, with noise and disturbance.
 
-    Its columns have the names and units of the first flight's `signals`, so that the same
-    configuration reads it back; without flights, the model's names in SI. Its inputs are those that
-    were commanded: where the model has delays, they act later than the log shows them, as in a log
-    of a vehicle. A whole helicopter begins in a trimmed flight, and its sticks are those of the
-    trim and what is added to them, by the configuration and by the pilot who holds the attitude.
+    Columns have the names and units of the first flight's `signals`, so that the same configuration
+    reads them back. Without flights they have the model's names in SI. Inputs are logged as
+    commanded: with delays in the model they act later, as in a real log. A whole helicopter starts
+    in trim. Its sticks are the trim plus the inputs of the configuration and of the pilot who holds
+    the attitude.
 
     Raises:
         InputError: an input or output that the model lacks, a unit of the wrong kind, a vehicle
-            that lacks something, or no trim of that flight.
+            that lacks something, or a flight without a trim.
     """
     settings = experiment.config.simulate
     assert settings is not None
     where = f"{experiment.path}: simulate"
-    # One generator for all: inputs are drawn before the noise, so that another noise leaves the
-    # manoeuvre as it is.
+    # One generator draws inputs first, then noise. Other noise settings leave the manoeuvre
+    # unchanged.
     rng = np.random.default_rng(settings.seed)
     n = round(settings.duration * settings.rate)
     drawn = experiment.config.disturbance
-    disturbed(experiment)  # names before numbers: of a state that is none no sigma_w is needed
+    disturbed(experiment)  # checks names before numbers: an unknown state needs no sigma_w
     if drawn is not None and None in drawn.parameters.values():
         needed = " and ".join(drawn.parameters)
         raise InputError(f"{experiment.path}: disturbance: simulate needs its {needed}")
-    # What can be refused is refused before the run, which takes longest.
+    # All checks come before the run, which takes longest.
     known, words = (
         naming.names(experiment.model.Outputs),
         f"model {experiment.model.name} has no output",
@@ -139,7 +139,7 @@ def generate(experiment: Experiment) -> Simulated:
     run, commanded = _run(flown, settings, n, driven, where)
     if not bool(run.finite):
         raise InputError(f"{where}: {_diverged(experiment, run)}")
-    # A log ends where the vehicle is on the ground; the frozen state after it is no flight.
+    # A log ends when the vehicle touches the ground. The frozen state after that is no flight.
     notes = _notes(experiment, run)
     if np.isfinite(run.ended):
         run = run.first(int(np.searchsorted(run.times, run.ended, side="right")))
@@ -147,11 +147,11 @@ def generate(experiment: Experiment) -> Simulated:
     for name, noise in settings.noise.items():
         si = naming.unit(experiment.model.Outputs, name) or "1"
         scale = _factor_to_si(noise.unit or si, si, f"{where}.noise.{name}.unit")
-        # Drawn for the whole record, so that a ground does not change the noise of what is left.
+        # Noise is drawn for the whole record, so that an early end does not change it.
         draws = noise.sd * scale * rng.standard_normal(n)
         outputs[name] = outputs[name] + draws[: outputs[name].size]
-    # As commanded, not as they acted: a delay in the log as well as in the model would be fitted as
-    # none. Wind is an input of `flown`, and in no log.
+    # Log inputs as commanded. If log and model both had the delay, a fit would find none. Wind is
+    # an input of `flown`, but no log has it.
     logged = {k: np.asarray(commanded[k])[: run.times.size] for k in driven}
     columns = _as_logged(experiment, np.asarray(run.times), logged, outputs)
     notes = (*notes, *_held_notes(experiment, logged))
@@ -159,39 +159,39 @@ def generate(experiment: Experiment) -> Simulated:
 
 
 class Made(NamedTuple):
-    """Drive of a sweep whose inputs `simulate` makes."""
+    """Inputs and pilot of a sweep that `simulate` generates."""
 
     experiment: Experiment
-    """with wind in its model where there is some"""
+    """Experiment, with wind in its model if there is any."""
     flight: Flight
     trimmed: Trimmed | None
-    """each whole helicopter begins in a trim of its own, with its sticks"""
+    """Trim condition. Each whole helicopter computes its own trim and sticks."""
     pilot: Pilot | None
-    """who holds the attitude, as for the vehicle of the file"""
+    """Pilot who holds the attitude, with gains for the vehicle of the file."""
 
 
 def drive(experiment: Experiment) -> Made:
-    """The inputs of the configuration's `simulate` for a sweep.
+    """Return the inputs of the configuration's `simulate` for a sweep.
 
     Raises:
-        InputError: as `generate`, or a ground, which a sweep has not.
+        InputError: as for `generate`, or a ground is given.
     """
     settings = experiment.config.simulate
     assert settings is not None
     where = f"{experiment.path}: simulate"
     _check_full_nonlinear(experiment, settings, where)
-    # A sweep reduces while it flies, and its results are of runs of one length.
+    # A sweep reduces results during the run, so all runs have the same length.
     if settings.ground is not None:
         raise InputError(f"{where}.ground: a sweep has none, expected a configuration without it")
     n, rng = round(settings.duration * settings.rate), np.random.default_rng(settings.seed)
     flown = in_wind(experiment) if settings.wind is not None else experiment
-    # The same draws as `generate` makes: element by element the sweep flies that manoeuvre.
+    # The draws equal those of `generate`, so each element flies the same manoeuvre.
     inputs = _stick_inputs(flown, settings, n, rng, where)
     flight = Flight(dt=1.0 / settings.rate, inputs=inputs, outputs={}, name="simulate")
     if not is_full_nonlinear(flown.model):
         return Made(flown, flight, None, None)
-    # Each element trims itself, so only the condition goes along; the pilot's gains are those for
-    # the vehicle of the file, as a pilot's would be.
+    # Each element computes its own trim, so only the condition is passed on. The pilot's gains are
+    # those for the vehicle of the file.
     begin = Condition(**settings.start.model_dump()) if settings.start else Condition()
     trimmed = Trimmed(begin, settings.wind or (0.0, 0.0, 0.0), of=flown.model)
     pilot = None
@@ -207,9 +207,10 @@ def _run(
     driven: dict[str, np.ndarray],
     where: str,
 ) -> tuple[Trajectory, dict[str, Any]]:
-    """The run as NumPy arrays, without measurement noise; and its inputs as they were commanded, in
-    arrays of as many samples."""
-    # Said by name: what is missing is NaN, and the run would only be called not finite.
+    """Return the run as NumPy arrays without measurement noise, and its commanded inputs. All have
+    the same number of samples.
+    """
+    # Missing constants are NaN. Without this check the message would only be "not finite".
     with experiment.located(""):
         require_constants(experiment.model, experiment.vehicle.params)
         require_linear(experiment.model, experiment.vehicle.params)
@@ -220,7 +221,8 @@ def _run(
         changed = {n: jnp.asarray(v) for n, v in experiment.config.initial_state.items()}
         start = _extended(model, naming.replace(begin.state, **changed))
         trimmed = {k: float(v) for k, v in naming.asdict(begin.inputs).items()}
-        # The configuration's inputs are what a pilot adds: sticks at zero would let it fall.
+        # The configuration's inputs are added to the trim. With sticks at zero the vehicle would
+        # fall.
         trimmed = {k: v if abs(v) > _MIDDLE else 0.0 for k, v in trimmed.items()}
         driven = {k: v + driven.get(k, np.zeros(n)) for k, v in trimmed.items()}
         if settings.hold_attitude:
@@ -242,13 +244,13 @@ def _run(
         )
 
     inputs = model.Inputs(**{k: jnp.asarray(v) for k, v in driven.items()})
-    # jit around the whole: without it simulate would run its outputs and limits operation by
-    # operation. The key and the rate are constants of that one program.
+    # jit covers the whole run. Otherwise `simulate` would execute outputs and limits operation by
+    # operation. Key and rate are constants of this program.
     run = jax.device_get(jax.jit(fly)(params, inputs, start, pilot))
-    # In float64 whatever the run was in: k/rate to the last digit, as a log has it.
+    # Times are float64 in any precision of the run, so that they equal k/rate, as in a log.
     run = run._replace(times=np.arange(n) / settings.rate)
-    # What a pilot adds depends on the states, so it is known from the run alone; `simulate` takes
-    # no feedback where an input is late.
+    # The pilot's inputs depend on the states, so only the run has them. `simulate` does not allow
+    # feedback with delayed inputs.
     return run, driven if pilot is None else naming.asdict(run.inputs)
 
 
@@ -275,7 +277,7 @@ def _check_full_nonlinear(experiment: Experiment, settings: SimulateConfig, wher
 
 
 def _begin(experiment: Experiment, settings: SimulateConfig, where: str) -> Trim:
-    """The trimmed flight that a run begins in."""
+    """Return the trim in which a run starts."""
     condition = Condition(**settings.start.model_dump()) if settings.start else Condition()
     wind = settings.wind or (0.0, 0.0, 0.0)
     with located(f"{where}.start"):
@@ -288,13 +290,13 @@ def _pilot(experiment: Experiment, begin: Trim, where: str) -> Pilot:
 
 
 def _extended(model: Model, state: Record) -> Record:
-    """A state of the model without disturbance as one of the model with it, at zero there."""
+    """Return an undisturbed model's state as a state of the disturbed model, with zeros added."""
     undisturbed = {k: jnp.asarray(v) for k, v in naming.asdict(state).items()}
     return naming.replace(zeros(model.State), **undisturbed)
 
 
 def _diverged(experiment: Experiment, run: Trajectory) -> str:
-    # Two causes look alike: a model that cannot begin where it begins, and one that runs away.
+    # Two causes give the same result: a model that cannot start in this state, and an unstable one.
     if not is_full_nonlinear(experiment.model):
         first = {k: float(np.asarray(v)[0]) for k, v in naming.asdict(run.inputs).items()}
         reason = cannot_start(experiment.model, experiment.vehicle.params, first)
@@ -306,14 +308,14 @@ def _diverged(experiment: Experiment, run: Trajectory) -> str:
 
 
 def _diverged_at(run: Trajectory) -> float:
-    """Return the time at which a run ceases to be finite [s]."""
-    # argmin of booleans: the first sample at which any state is not finite.
+    """Return the first time at which a run is not finite [s]."""
+    # argmin of booleans gives the first sample with a state that is not finite.
     good = np.all([np.isfinite(v) for v in jax.tree.leaves(run.states)], axis=0)
     return float(run.times[np.argmin(good)])
 
 
 def _notes(experiment: Experiment, run: Trajectory) -> tuple[Finding, ...]:
-    """Return the notes on a run: how it ended, and where it left the range of model and sticks."""
+    """Return notes on how a run ended and where it left the range of the model or the sticks."""
     notes = []
     if np.isfinite(run.ended):
         settings = experiment.config.simulate
@@ -324,7 +326,7 @@ def _notes(experiment: Experiment, run: Trajectory) -> tuple[Finding, ...]:
             "is written after that"
         )
         notes.append(note("simulation.ends-on-ground", words, value=ended))
-    # After an event the state stands still; what it does there says nothing of the flight.
+    # The state is frozen after an event and does not belong to the flight.
     flown = np.asarray(run.times <= float(run.ended))
     for name, out in run.outside.items():
         left = np.asarray(out) & flown
@@ -339,8 +341,8 @@ def _notes(experiment: Experiment, run: Trajectory) -> tuple[Finding, ...]:
 
 
 def _stick_notes(experiment: Experiment, run: Trajectory, flown: np.ndarray) -> list[Finding]:
-    """Return the notes on sticks beyond their ends, in the samples that were flown."""
-    # Other models' inputs are lengths or anyone's own, without known ends.
+    """Return notes on sticks beyond their limits, in the samples before the end of the flight."""
+    # Inputs of other models have no known limits.
     if not is_full_nonlinear(experiment.model):
         return []
     notes = []
@@ -357,9 +359,9 @@ def _stick_notes(experiment: Experiment, run: Trajectory, flown: np.ndarray) -> 
 
 
 def _held_notes(experiment: Experiment, logged: dict[str, np.ndarray]) -> list[Finding]:
-    """Sticks are held here whatever they do; what to say where a reader of the log would not know.
+    """Return a note if a log's reader would not recognise inputs as held, as they are here.
 
-    A chirp and a pilot's feedback move at every sample, as sampled sticks do.
+    Chirps and the pilot's feedback move at every sample, as sampled sticks do.
     """
     if not experiment.config.flights:
         return []
@@ -376,7 +378,7 @@ def _held_notes(experiment: Experiment, logged: dict[str, np.ndarray]) -> list[F
 
 
 def follow(experiment: Experiment) -> Simulated:
-    """The model driven by the inputs of the configuration's flights, in SI.
+    """Simulate the model with the inputs of the configuration's flights, in SI.
 
     Raises:
         InputError: no flights, or one that cannot be read.
@@ -393,7 +395,7 @@ def follow(experiment: Experiment) -> Simulated:
         label = np.array([flight.name] * flight.n_samples)
         parts.append({"flight": label, "time": flight.times, **flight.inputs, **outputs})
         run = jax.device_get(run)._replace(times=flight.times)
-        # Numbered, since two flights may have the same name.
+        # Two flights may have the same name, so they are numbered.
         runs[f"{len(runs) + 1}: {flight.name}"] = run
         notes += [n.of(flight.name) for n in _notes(experiment, run)]
         if not run.finite:
@@ -413,15 +415,15 @@ def _as_logged(
     outputs: dict[str, np.ndarray],
 ) -> dict[str, np.ndarray]:
     if not experiment.config.flights:
-        # Without flights nobody has named a column or a unit.
+        # Without flights no column names or units are defined.
         return {"time": times, **driven, **outputs}
     logged, where = experiment.config.flights[0].signals, f"{experiment.path}: flights[0].signals"
     model, named = experiment.model, first_signals(experiment)
-    # An autopilot's log needs no name for the time; the table that is written here has one.
+    # An autopilot's log needs no name for the time, but the table written here does.
     time = logged.time
     name, unit = ("time", "s") if time is None else (time.signal or "time", time.unit)
     seconds = _factor_to_si(unit, "s", f"{where}.time.unit")
-    # A column that counts samples; where rows are the clock, times do no harm beside them.
+    # The column counts samples. If the rows are the clock, extra times do no harm.
     if time is not None and time.rate is not None and time.signal is not None:
         seconds = 1.0 / time.rate
     columns = {name: times / seconds}
@@ -430,6 +432,6 @@ def _as_logged(
         (signals(model, "outputs", named.outputs, where), outputs),
     ):
         for name, signal in by_name.items():
-            if signal.constant is None:  # a constant is in no log
+            if signal.constant is None:  # a log has no column for a constant
                 columns[signal.name] = signal.from_si(values[name])
     return columns

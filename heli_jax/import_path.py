@@ -1,4 +1,4 @@
-"""Anyone's own objects by import path, as a configuration names them."""
+"""Users' own objects by import path, as a configuration names them."""
 
 import contextlib
 import importlib
@@ -15,9 +15,9 @@ from heli_jax.errors import InputError
 from heli_jax.regular_file import require_regular
 
 _LARGEST = 10**7
-"""bytes of a module's source"""
+"""Largest source of a module [bytes]."""
 _looked_in: list[str] = []
-"""folders of configurations that named a module"""
+"""Folders of configurations that named a module."""
 _PATH = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 
@@ -27,19 +27,19 @@ def is_path(text: str) -> bool:
 
 
 def by_path(path: str, where: str, folder: str | Path | None = None) -> Any:
-    """The object at 'package.module:name', or None where the module has nothing of that name.
+    """Return the object at 'package.module:name', or None if the module has no such name.
 
     Args:
-        where: what errors begin with, such as the file and the key.
+        where: start of error messages, such as the file and the key.
 
     Raises:
-        InputError: it is no such path, or the module cannot be imported, whatever goes wrong in
-            it; `where` begins the sentence.
+        InputError: the path is malformed, or the module cannot be imported; `where` begins the
+            message.
     """
     if not is_path(path):
         raise InputError(f"{where}: got {path!r:.60}, expected package.module:name")
     module_name, attribute = path.split(":")
-    # Left there: the module's own imports, also later ones, find its folder.
+    # The folder stays in the path for the module's own imports, also later ones.
     if folder is not None:
         search((str(folder),))
     try:
@@ -49,52 +49,50 @@ def by_path(path: str, where: str, folder: str | Path | None = None) -> Any:
         raise InputError(f"{where}: cannot import {module_name!r} for {path!r} ({e})") from e
     except InputError:
         raise
-    # SystemExit too: a script that ends in sys.exit() would end the command without a word.
-    except (Exception, SystemExit) as e:  # whatever the module does while it is imported
+    # SystemExit too: sys.exit() in a script would end the command without a message.
+    except (Exception, SystemExit) as e:  # importing a module can raise anything
         raise InputError(f"{where}: cannot import {module_name!r} for {path!r}: {_words(e)}") from e
     return getattr(module, attribute, None)
 
 
 def search(folders: Iterable[str]) -> None:
-    """Look for modules in these folders as well, from now on.
+    """Add folders to Python's module search path.
 
-    They come last in the path: a file beside a configuration must not stand for an installed
-    package.
+    They come last: a file beside a configuration must not replace an installed package.
     """
     _looked_in.extend(f for f in folders if f not in _looked_in)
     sys.path.extend(f for f in folders if f not in sys.path)
 
 
 def searched() -> tuple[str, ...]:
-    """Folders in which modules of configurations were looked for; none where none was named."""
+    """Return the folders of configurations that named a module."""
     return tuple(_looked_in)
 
 
 def pass_over_style_of_folder() -> None:
-    """Import Matplotlib now where the working folder holds a file that it would read as its
-    settings, whatever is in it."""
+    """Import Matplotlib elsewhere if the working folder has a matplotlibrc, which it would read."""
     if os.path.lexists("matplotlibrc"):
         with contextlib.chdir(os.sep):
             importlib.import_module("matplotlib")
 
 
 def environment() -> dict[str, str]:
-    """The environment in which another Python finds the modules that this one does."""
+    """Return an environment in which another Python finds the same modules."""
     return {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
 
 
 def _check_size(module_name: str, where: str) -> None:
-    """Refuse a source larger than any program: Python would read it as a whole.
+    """Refuse a source larger than any program, since Python would read all of it.
 
-    Devices and pipes are no modules to Python, which looks at the kind of file itself.
+    Python itself refuses devices and pipes as modules.
     """
     parts = module_name.split(".")
     for i in range(1, len(parts) + 1):
         name = ".".join(parts[:i])
         if name in sys.modules:
             continue
-        spec = importlib.util.find_spec(name)  # of a part: it imports those before it
-        # Compiled modules and packages without a file have no source that Python would read.
+        spec = importlib.util.find_spec(name)  # imports the parts before it
+        # Compiled modules and packages without a file have no Python source.
         if spec is not None and spec.has_location and str(spec.origin).endswith(".py"):
             try:
                 require_regular(str(spec.origin), "a module in Python", _LARGEST)
@@ -103,8 +101,8 @@ def _check_size(module_name: str, where: str) -> None:
 
 
 def _words(e: BaseException) -> str:
-    """Return the error, with the line and file where it arose."""
-    # The last frame: the line in the user's module, or in what it called with wrong arguments.
+    """Return the error with its file and line."""
+    # The last frame is the line in the user's module, or in code that it calls.
     at = traceback.extract_tb(e.__traceback__)
     line = f"{at[-1].filename}, line {at[-1].lineno}: " if at else ""
     said = " ".join(str(e).split())[:200]

@@ -1,6 +1,6 @@
 """Output of `heli-jax info`, as text or as JSON.
 
-Apart from `output.py`, which imports JAX: a look at a log need not wait for it.
+Separate from `output.py`, which imports JAX and is slow to load.
 """
 
 import dataclasses
@@ -18,25 +18,26 @@ from heli_jax.numbers import terse
 from heli_jax.terminal import print_table, tell
 
 _WIDEST = 44
-"""characters of a name in a table"""
+"""Longest name in a table [characters]."""
 _MOST_CHANNELS = 150
-"""that are listed without being asked for: a PX4 log has a thousand"""
+"""Most channels that are listed without a pattern. A PX4 log has a thousand."""
 _MOST_LINES = 10
-"""of gaps, and of notes"""
+"""Most lines of gaps, and of notes."""
 _MOST_FILTERS = 40
 _MOST_OF_BURST, _BURST = 200, 0.02
-"""messages, and seconds within which they came, that are no signal with a rate"""
+"""Most messages, and longest time [s], of a burst. A burst has no rate."""
 
 
 def print_flights(
     flights: Sequence[LogInfo], pattern: str | None = None, chosen: bool = False
 ) -> None:
-    """The flights of one log on standard output.
+    """Print the flights of one log on standard output.
 
     Args:
-        flights: of one file, at least one.
-        pattern: of the channels' names, as a shell has them; all that are few enough without one.
-        chosen: whether they were asked for, and the file may hold others.
+        flights: the flights of one file, at least one.
+        pattern: pattern of channel names, with shell wildcards; default: all channels, if there are
+            few enough.
+        chosen: True if the user chose the flights, so that the file may hold others.
     """
     log = flights[0]
     rows = "" if log.topics else f", {log.n_rows} rows"
@@ -46,13 +47,13 @@ def print_flights(
 
 
 def _print_flight(flight: LogInfo, count: int, pattern: str | None) -> None:
-    # A table has one clock and no firmware, so most of the lines below would be empty.
+    # A table has one clock and no firmware, so most of these lines would be empty.
     for line in _flight_lines(flight, count) if flight.topics else _clock_lines(flight.time):
         tell(line)
-    # What was lost or assumed stands before the numbers, which are read with that in mind.
+    # Notes on losses and assumptions come before the numbers they affect.
     for found in flight.notes[:_MOST_LINES]:
         tell(f"! {found.sentence}")
-    # Who asks for channels of a name has not asked for the topics.
+    # With a pattern of channel names the topics are not shown.
     if flight.topics and pattern is None:
         _print_topics(flight.topics)
     _print_channels(flight.columns, pattern)
@@ -62,9 +63,9 @@ def _print_flight(flight: LogInfo, count: int, pattern: str | None) -> None:
 
 
 def as_json(flights: Sequence[LogInfo]) -> str:
-    """The flights of one log as JSON, without channels twice; what is no number is null."""
+    """Return the flights of one log as JSON, each channel once; NaN and infinity become null."""
     log = flights[0]
-    # What is of the file stands once; a file may hold many flights.
+    # A file may hold many flights, so its own data appear once.
     content = {
         "path": log.path,
         "format": log.format,
@@ -72,15 +73,15 @@ def as_json(flights: Sequence[LogInfo]) -> str:
         "sha256": log.sha256,
         "flights": [_flight_content(flight) for flight in flights],
     }
-    # NaN is no JSON, though Python writes it: other programs could not read the text.
+    # Python writes NaN, which is not valid JSON.
     return json.dumps(_finite(content), indent=1, allow_nan=False)
 
 
 def _flight_content(flight: LogInfo) -> dict[str, Any]:
-    """Any: text, numbers, lists and records, as JSON has them."""
+    """Return the content of one flight. Any: text, numbers, lists and records, as in JSON."""
     whole = {"number": flight.flight[0], "of": flight.flight[1], "firmware": flight.firmware}
     whole |= {"duration": flight.duration, "notes": [as_data(n) for n in flight.notes]}
-    # A table of rows is shown as a log of one topic, so that a script needs to know one shape.
+    # A table appears as a log of one topic, so that scripts need only one format.
     topics = flight.topics or (TopicInfo("", flight.n_rows, flight.time, flight.columns),)
     whole["topics"] = [_topic_content(topic) for topic in topics]
     return whole | {"filters": dict(flight.filters), "parameters": dict(flight.parameters)}
@@ -97,7 +98,7 @@ def _topic_content(topic: TopicInfo) -> dict[str, Any]:
 
 
 def _finite(value: Any) -> Any:
-    """The same with None for what JSON has no number for."""
+    """Return the value with None for numbers that JSON does not have."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
@@ -144,7 +145,7 @@ def _clock_lines(clock: TimeInfo | None) -> Iterator[str]:
         yield f"jitter {_percent(clock.jitter)} of a step, {_gap_words(clock)}"
     if clock.guessed and clock.counted is None:
         yield f"the unit {clock.unit} is guessed; --time-unit says which it is"
-    # The longest are those that a fit minds: a lost row is bridged.
+    # The longest gaps come first, since they affect a fit. A single lost row is bridged.
     for gap in sorted(clock.gaps, key=lambda gap: -gap.length)[:_MOST_LINES]:
         yield f"gap of {gap.length:.4g} s at {gap.start:.6g} s"
     if len(clock.gaps) > _MOST_LINES:
@@ -171,7 +172,7 @@ def _print_topics(topics: Sequence[TopicInfo]) -> None:
         elif topic.n_rows <= _MOST_OF_BURST and clock.duration < _BURST:
             cells = (f"all within {_short_time(clock.duration)}", "", "", "")
         else:
-            # The longest says whether a rate can bridge them; the number alone does not.
+            # Whether a rate can bridge the gaps depends on the longest, not on the count.
             longest = max((gap.length for gap in clock.gaps), default=0.0)
             gaps = (str(len(clock.gaps)), _short_time(longest) if longest else "")
             cells = (f"{clock.rate:.4g}", _percent(clock.jitter), *gaps)
@@ -180,7 +181,7 @@ def _print_topics(topics: Sequence[TopicInfo]) -> None:
 
 
 def _short_time(seconds: float) -> str:
-    """A length of time in at most eight columns."""
+    """Return a duration in at most eight characters."""
     for factor, unit in ((1.0, "s"), (1e3, "ms"), (1e6, "us")):
         if seconds * factor >= 0.1:
             return f"{seconds * factor:.3g} {unit}"
@@ -189,9 +190,9 @@ def _short_time(seconds: float) -> str:
 
 def _asked(columns: Sequence[ColumnInfo], pattern: str | None) -> list[ColumnInfo]:
     if pattern is None:
-        # None rather than the first hundred, which would look like all there are.
+        # Show none: the first hundred would look like all channels.
         return list(columns) if len(columns) <= _MOST_CHANNELS else []
-    # The brackets of gyroADC[0] are meant as they stand: of patterns only * and ? are known.
+    # Brackets are literal (gyroADC[0]); only * and ? are wildcards.
     literal = pattern.replace("[", "[[]")
     return [c for c in columns if fnmatch.fnmatchcase(c.name, literal)]
 
@@ -229,17 +230,17 @@ def _nan_share(channel: ColumnInfo) -> float:
 
 def _share(channel: ColumnInfo) -> str:
     share = 100 * _nan_share(channel)
-    # A single one of a million is not none.
+    # One NaN in a million must not show as zero.
     if not channel.n_nan:
         return "0"
-    # Of 99.5 and more two digits would be an exponent.
+    # From 99.5 on, two digits would give an exponent.
     return "<.01" if share < 0.01 else f"{share:.2g}" if share < 99.5 else f"{share:.3g}"
 
 
 def _percent(share: float) -> str:
     if math.isnan(share):
         return "-"
-    return "0 %" if share < 1e-7 else f"{100 * share:.2g} %"  # below is the rounding of float64
+    return "0 %" if share < 1e-7 else f"{100 * share:.2g} %"  # below: rounding errors
 
 
 def _cut(text: str) -> str:
@@ -247,6 +248,6 @@ def _cut(text: str) -> str:
 
 
 def _squeezed(text: str) -> str:
-    """A name that is cut in its middle: the ends tell the topic and the field."""
+    """Cut the middle of a name; its ends show the topic and the field."""
     half = (_WIDEST - 3) // 2
     return text if len(text) <= _WIDEST else f"{text[:half]}...{text[half + 3 - _WIDEST :]}"

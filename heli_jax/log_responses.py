@@ -37,14 +37,14 @@ def responses_of_log(
     log: str | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> FlightResponses:
-    """Frequency responses of all flights of a configuration together.
+    """Return the frequency responses of all flights of a configuration together.
 
     Args:
-        experiment: the configuration; its section `frequency` says band, window and transfer
-            functions, its model only how signals are called.
+        experiment: the configuration; its section `frequency` has band, window and transfer
+            functions. The model only names the signals.
 
     Raises:
-        InputError: the log or something of the configuration is wrong, or no response is to be had.
+        InputError: the log or the configuration is wrong, or there is no response.
     """
     experiment = experiment if log is None else with_log(experiment, log)
     config = experiment.config.frequency or FrequencyConfig()
@@ -77,7 +77,9 @@ def responses_of_log(
 
 
 def _held_out(flights: Sequence[Flight]) -> tuple[Finding, ...]:
-    """Note that flights held out of a fit count here, so that its report shows other responses."""
+    """Return a note if flights held out of a fit count here, so that its report shows other
+    responses.
+    """
     from heli_jax.flights.flight import labels
 
     named = zip(labels(tuple(flights)), flights, strict=True)
@@ -92,7 +94,7 @@ def _held_out(flights: Sequence[Flight]) -> tuple[Finding, ...]:
 
 
 def between_samples(flights: Sequence[Flight], inputs: Collection[str]) -> list[Finding]:
-    """Return how inputs move between samples where the log decided it, and what depends on it."""
+    """Return notes on holds of inputs that the reader decided, with their effect."""
     mixed: dict[tuple[str, str], list[str]] = {}
     guessed: dict[str, str] = {}
     for name in inputs:
@@ -101,8 +103,8 @@ def between_samples(flights: Sequence[Flight], inputs: Collection[str]) -> list[
             other = next(h for h in holds if h != holds[0])
             mixed.setdefault((holds[0], other), []).append(name)
         elif holds[0] == "linear" and (reason := flights[0].hold_reason.get(name)):
-            # The other way round nobody is misled: a stick that jumps is held. A low-passed one can
-            # be no other than linear.
+            # The opposite error does not occur: inputs that jump are recognised as held. Low-passed
+            # inputs are always linear.
             if is_low_passed(flights[0], name):
                 continue
             guessed[name] = reason
@@ -131,9 +133,10 @@ def between_samples(flights: Sequence[Flight], inputs: Collection[str]) -> list[
 
 
 def _read_in_degrees(experiment: Experiment, flights: Sequence[Flight]) -> tuple[Finding, ...]:
-    """Outputs that look like degrees read as radians: gains are off by 35 dB, and nothing in them
-    shows it."""
-    # Not before it is needed: it brings what fits are judged by.
+    """Return doubts about outputs that look like degrees read as radians. Gains are then off by 35
+    dB, which nothing else shows.
+    """
+    # Late import, since it loads the diagnostics of fits.
     from heli_jax.flights.flight import labels
     from heli_jax.identification.diagnostics.units import in_degrees
 
@@ -156,15 +159,15 @@ def _require_samples(flights: Sequence[Flight], path: str | Path) -> None:
 def run_responses(
     experiment: Experiment, out: Path, log: str | None, say: Callable[[str], None]
 ) -> list[str]:
-    """Write the responses into a new directory, and print them; returns the statuses of the
-    transfer functions, those of fits.
+    """Write the responses into a new directory, print them, and return the statuses of the transfer
+    functions.
     """
     from heli_jax.report.responses import transfer_status, write_responses
     from heli_jax.report.tables import handling as handling_table
     from heli_jax.report.tables import handling_sentences
 
     responses = responses_of_log(experiment, log, say)
-    # Of axes that did not move nobody asked by name, and nothing is to be said.
+    # Axes that did not move need no message unless they were requested by name.
     asked = asked_handling(experiment, responses.outputs)
     named = (experiment.config.frequency or FrequencyConfig()).handling is not None
     handling = [
@@ -192,7 +195,7 @@ def run_responses(
 
 
 def not_usable(responses: FlightResponses) -> tuple[Finding, ...]:
-    """Return a sentence if no response is coherent with its input."""
+    """Return a finding if no response is coherent with its input."""
     pairs = [pair for output in responses.outputs.values() for pair in output.pairs.values()]
     if any(np.max(octave_mean(responses.omega, p.coherence)) >= COHERENT for p in pairs):
         return ()
@@ -204,7 +207,7 @@ def not_usable(responses: FlightResponses) -> tuple[Finding, ...]:
 
 
 def print_responses(responses: FlightResponses) -> None:
-    """Print the use of each response, and the transfer functions, on standard output."""
+    """Print the usable band of each response, and the transfer functions, on standard output."""
     from heli_jax.report.responses import FIT_HEAD, fit_row, fit_sentences, useful_band
 
     rows = []

@@ -1,4 +1,4 @@
-"""`heli-jax windows`: which parts of a log say most of what a configuration has free."""
+"""`heli-jax windows`: the most informative parts of a log for the free parameters."""
 
 from collections.abc import Callable
 
@@ -21,7 +21,7 @@ from heli_jax.stages import Note
 from heli_jax.terminal import print_table, tell
 
 _MOST = 40
-"""windows in the table; those that were taken are always in it"""
+"""Most windows in the table; the selected ones are always shown."""
 
 
 def rank_log(
@@ -33,12 +33,12 @@ def rank_log(
     """Rank the windows of a configuration's logs by their information on its free parameters.
 
     Args:
-        experiment: the configuration; windows that it states for its flights are left out of
-            account, and what it holds out is not ranked.
-        length: of a window [s].
+        experiment: the configuration; windows of its flights are ignored, and flights held out are
+            not ranked.
+        length: length of a window [s].
 
     Raises:
-        InputError: the log or something of the configuration is wrong, or no window may be used.
+        InputError: the log or the configuration is wrong, or no window is usable.
     """
     config, path = experiment.config, experiment.path
     require_flights(experiment)
@@ -46,7 +46,7 @@ def rank_log(
         flights = list(with_log(experiment, log).config.flights)
     else:
         kept = [f.model_copy(update={"window": None}) for f in config.flights if not f.hold_out]
-        # Two flights of one log are, without their windows, the same.
+        # Without their windows, two flights of one log are the same.
         flights = list({(f.log, f.flight): f for f in reversed(kept)}.values())[::-1]
     experiment = experiment._replace(config=config.model_copy(update={"flights": flights}))
     problem = configuration.problem(experiment)
@@ -54,23 +54,23 @@ def rank_log(
         for found in flight.source.notes if flight.source else ():
             progress(Note(found.sentence))
     with located(f"{path}"):
-        # Before the work, and not after it: with many windows that takes a while.
+        # Report before the comparison, which may take long.
         seconds = window_samples(problem, length) * problem.training[0].dt
         progress(f"comparing windows of {seconds:.3g} s, side by side")
         return windows(problem, length)
 
 
 def print_ranking(ranking: Ranking) -> None:
-    """The windows, best first, and those that are enough together, on standard output."""
+    """Print the windows, best first, and the set that suffices, on standard output."""
 
     if cannot_be_fitted(ranking):
-        # What a window expects of a model that the samples cannot show is no recommendation.
+        # If the samples cannot show the model's modes, its predictions recommend no window.
         _print_doubts(ranking)
         tell(f"No window of {ranking.length:.3g} s is recommended.")
         return
     taken = [choice.window for choice in ranking.taken]
     rest = [w for w in ranking.windows if not w.excluded and w not in taken]
-    # By the geometric mean of the sds, as the D-criterion has it.
+    # Sort by the geometric mean of the sds, as the D-criterion does.
     rest.sort(key=lambda w: float(np.sum(np.log(np.minimum(w.sd, 1e3)))))
     rows = [
         (f"{i + 1}", *_of(choice.window), choice.reason) for i, choice in enumerate(ranking.taken)
@@ -102,18 +102,18 @@ def print_ranking(ranking: Ranking) -> None:
 
 
 def cannot_be_fitted(ranking: Ranking) -> bool:
-    """True if no part of the log has any information on what is asked."""
+    """True if no part of the log has information on the free parameters."""
     return any(f.severity == "refuse" for f in ranking.record)
 
 
 def not_determined(ranking: Ranking) -> tuple[str, ...]:
-    """The parameters that all windows together do not determine."""
+    """Return the parameters that all windows together do not determine."""
     pairs = zip(ranking.parameters, ranking.all_sd, strict=True)
     return tuple(n for n, sd in pairs if not sd < DETERMINES)
 
 
 def _print_doubts(ranking: Ranking) -> None:
-    """Print the assumptions of a ranking, and the doubts about the record."""
+    """Print the assumptions of a ranking, and doubts about the record."""
     for finding in ranking.record:
         tell(f"{'x' if finding.severity == 'refuse' else '!'} {finding.topic}: {finding.sentence}")
     for name in ranking.guessed:

@@ -1,11 +1,11 @@
-"""The words of findings: `messages.yaml` has a title, a sentence and a remedy for each code.
+"""Texts of findings: `messages.yaml` has a title, a sentence and a remedy for each code.
 
-A field of a sentence takes Python's format, and what a sentence about a record needs beside it:
+A field of a sentence takes Python's formats, and these:
 
 - `{p:p}` a probability, `{x:vaf}` a VAF, `{x:%}` a share in per cent
 - `{names}` a list as `a, b and c`, `{names:or}` as `a, b or c`; `{shares:.2g}` each of a list
-- `{names:follows/follow}` a word for one or for several
-- `{lead:? (* s earlier)}` the rest with `*` for the value, nothing where that is empty
+- `{names:follows/follow}` the singular or plural form of a word
+- `{lead:? (* s earlier)}` the rest with `*` replaced by the value; nothing if the value is empty
 """
 
 import functools
@@ -19,44 +19,44 @@ from heli_jax.yaml_file import read_mapping
 
 
 class Message(NamedTuple):
-    """The words for one code."""
+    """Texts of one code."""
 
     title: str
     text: str
-    """a sentence, with fields for the finding's numbers"""
+    """Sentence with fields for the finding's numbers."""
     remedy: str = ""
     brief: str = ""
-    """the finding in a few words, for the statements of a report"""
+    """Short form for the statements of a report."""
     measure: str = ""
-    """what the finding's value is, and the limit that it is held against"""
+    """Meaning of the finding's value, and its limit."""
     page: str = ""
-    """of the documentation, without `.md`"""
+    """Page of the documentation, without `.md`."""
 
 
 @functools.cache
 def messages() -> Mapping[str, Message]:
-    """By code its words."""
+    """Return the texts of each code."""
     content = read_mapping(Path(__file__).with_suffix(".yaml"))
     return {code: Message(**words) for code, words in content.items()}
 
 
 def written(template: str, numbers: Mapping[str, Any]) -> str:
-    """A sentence with its numbers.
+    """Return a sentence with its numbers.
 
     Args:
-        template: of `Message`.
+        template: text of a `Message`.
     """
     return _FORMATTER.vformat(template, (), numbers).strip()
 
 
 def sentence(code: str, **numbers: Any) -> str:
-    """The text and the remedy of a message."""
+    """Return the text and the remedy of a message."""
     message = messages()[code]
     return written(" ".join(filter(None, (message.text, message.remedy))), numbers)
 
 
 def listed(names: Sequence[str], joined: str = "and") -> str:
-    """`a, b and c`; nothing of no names."""
+    """Return names as `a, b and c`; empty for no names."""
     *first, last = names or ("",)
     return f"{', '.join(first)} {joined} {last}" if first else last
 

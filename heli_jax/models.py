@@ -1,4 +1,4 @@
-"""The models that ship, and how a configuration's name of a model becomes one."""
+"""The shipped models, and look-up of a model by its name in a configuration."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -38,8 +38,7 @@ __all__ = [
     "with_servos",
 ]
 
-# By the names that a configuration, fit.json and the report use; in Python the names are
-# attributes.
+# Names as used by the configuration, fit.json and the report; in Python the names are attributes.
 _SHIPPED = {
     model.name: model
     for model in (
@@ -62,26 +61,26 @@ def by_name(
     corrections: Mapping[str, bool] | None = None,
     wind: bool = False,
 ) -> Model:
-    """The shipped model of that name, or anyone's own at 'package.module:name'.
+    """Return the shipped model of that name, or a user's own at 'package.module:name'.
 
     Args:
         name: such as 'roll', 'helicopter-paper' or 'package.module:name'.
-        where: what errors begin with, such as the file and the key.
-        corrections: those of `helicopter`, for the whole helicopter only.
-        wind: as that of `helicopter`, likewise.
+        where: start of error messages, such as the file and the key.
+        corrections: corrections of `helicopter`, for the whole helicopter only.
+        wind: wind of `helicopter`, also for the whole helicopter only.
 
     Raises:
-        InputError: neither exists, or it takes no such correction or no wind; `where` begins the
-            sentence.
+        InputError: no such model exists, or it takes no such correction or no wind; `where` begins
+            the message.
     """
     if name in _HELICOPTERS:
         known = Corrections._fields
         require_known(corrections or {}, known, where, "the helicopter has no correction")
-        # Always called in this way: the cache then gives the same model for the same switches.
+        # A fixed order lets the cache return the same model for the same switches.
         switches = dict(sorted((corrections or {}).items()))
         return helicopter(_HELICOPTERS[name], wind=wind, **switches)
     model = _SHIPPED[name] if name in _SHIPPED else _imported(name, where, folder)
-    # Refused although an empty `corrections` would change nothing: who writes it expects an effect.
+    # An empty `corrections` is refused too, since the user expects an effect.
     if corrections is not None or wind:
         what = "wind" if wind else "corrections"
         raise InputError(
@@ -91,13 +90,13 @@ def by_name(
 
 
 def names() -> tuple[str, ...]:
-    """The names of the models that ship, those from files apart."""
+    """Return the names of the shipped models, without those from files."""
     return (*_SHIPPED, *_HELICOPTERS)
 
 
 def _imported(name: str, where: str, folder: str | Path | None) -> Model:
     if not is_path(name):
-        # As a configuration writes them: linear models are named by their file.
+        # Spelling of the configuration: linear models are named by their file.
         files = (name,) if name.endswith((".yaml", ".yml")) else linear_models.shipped()
         known = [*names(), *(f"{{linear: {n}}}" for n in files), "package.module:name"]
         raise InputError(f"{where}: unknown model {name!r}{nearest(name, known)}")
@@ -105,7 +104,7 @@ def _imported(name: str, where: str, folder: str | Path | None) -> Model:
     if not isinstance(model, Model):
         kind = "nothing" if model is None else what_instead(model)
         raise InputError(f"{where}: expected a heli_jax.Model at {name!r}, got {kind}")
-    # Here and not at the first run: the message can name the configuration's key.
+    # Check here, so that the message can name the configuration's key.
     with located(where):
         check_model(model)
     return model

@@ -1,4 +1,4 @@
-"""Printed and written output of the commands."""
+"""Terminal and file output of the commands."""
 
 import math
 from collections import Counter
@@ -34,7 +34,8 @@ from heli_jax.workflow import FitRun
 
 def print_fit(run: FitRun, *, verbose: bool = False) -> None:
     """Print the first screen of the report: three statements, estimates, the most severe findings;
-    with `verbose` the rest of it."""
+    `verbose` adds the rest.
+    """
     fit = run.fit
     for line in lines(fit):
         tell(f"{line.word}: {line.text}")
@@ -50,8 +51,9 @@ def print_fit(run: FitRun, *, verbose: bool = False) -> None:
 
 
 def _print_details(run: FitRun) -> None:
-    """Agreement by output, responses, acceptance card, and what the configuration asks for beside
-    the fit."""
+    """Print agreement by output, responses, acceptance card, and the requested supplementary
+    analyses.
+    """
     problem, fit, supplementary = run.problem, run.fit, run.supplementary
     if supplementary.intervals is not None:
         table = report_tables.intervals(supplementary.intervals, fit)
@@ -83,16 +85,17 @@ def _print_details(run: FitRun) -> None:
 
 
 def _shown_nuisances(nuisance: Mapping[str, Estimate]) -> dict[str, Estimate]:
-    """Return the nuisances that all flights share, and offsets of inputs that are not zero, most
-    significant first."""
-    # Others of a single flight ('flight/bias') are many and of interest to few: they stand in
-    # fit.json and the report. An offset says that a stick's zero is not the log's.
+    """Return the nuisances that all flights share, and the most significant nonzero offsets of
+    inputs.
+    """
+    # Others of a single flight ('flight/bias') appear only in fit.json and the report. An offset
+    # shows that the stick's zero differs from the log's.
     common = {n: e for n, e in nuisance.items() if "/" not in n}
     offsets = {
         n: abs(e.value) / e.sd
         for n, e in nuisance.items()
         if "/offset " in n and e.sd and e.lower95 is not None and e.upper95 is not None
-        # The interval is without zero.
+        # The interval excludes zero.
         if e.lower95 * e.upper95 > 0
     }
     most = sorted(offsets, key=lambda n: -offsets[n])[:_MOST_OFFSETS]
@@ -100,10 +103,10 @@ def _shown_nuisances(nuisance: Mapping[str, Estimate]) -> dict[str, Estimate]:
 
 
 def _print_handling(run: FitRun) -> None:
-    """Handling qualities of model and data, and of which axes there are none."""
+    """Print the handling qualities of model and data, and the axes without them."""
     if run.supplementary.responses is None:
         return
-    # Whoever states a band or a window asks for them.
+    # A stated band or window is a request for responses.
     if run.config.config.frequency is not None:
         for found in run.supplementary.responses.notes:
             if found.code == NO_RESPONSES:
@@ -135,9 +138,9 @@ def _print_first_guess(guess: EquationErrorStart | FrequencyErrorStart) -> None:
 
 
 _MOST_OFFSETS = 4
-"""offsets of inputs that the terminal shows"""
+"""Most offsets of inputs that the terminal shows."""
 _GATES = 5
-"""failed gates that the terminal names; the report has all"""
+"""Most failed gates that the terminal names; the report has all."""
 
 
 def _print_baseline(b: Baseline) -> None:
@@ -153,14 +156,14 @@ def _print_baseline(b: Baseline) -> None:
 
 
 def print_check(check: Check, *, verbose: bool = False) -> None:
-    """The identifiability at the initial guess, on standard output."""
+    """Print the identifiability at the initial guess on standard output."""
     verdict = check.verdict
-    # The fit judges at its estimates, and need not agree: sensitivities move with the parameters.
+    # The fit's result at its estimates may differ, since sensitivities depend on the parameters.
     tell("At the start values (the fit judges at its estimates, which may differ):")
     tell(verdict.text)
     rows = []
     for i, name in enumerate(verdict.names):
-        # The covariance is that of the logarithms: its root is the relative sd.
+        # The covariance is that of the logarithms, so its root is the relative sd.
         relative = math.sqrt(verdict.covariance[i, i])
         lacking = name in verdict.undetermined or name in verdict.without_effect
         expected = f"{terse(100 * relative, 2)} %"
@@ -174,7 +177,7 @@ def print_check(check: Check, *, verbose: bool = False) -> None:
         if verbose or name in check.guessed:
             guess = f" ({GUESSED})" if name in check.guessed else ""
             tell(f"noise of {name}: {terse(sd, 3)}{guess}")
-    # Of a value of zero an sd is no part.
+    # A relative sd of a zero value does not exist.
     kept = [i for i, name in enumerate(verdict.names) if name not in check.at_zero]
     sds = np.sqrt(np.diag(verdict.covariance))[kept]
     if check.guessed and (doubt := too_good(sds)):
@@ -186,12 +189,12 @@ def print_check(check: Check, *, verbose: bool = False) -> None:
 
 
 _IN_FULL = 3
-"""findings that the terminal shows in full"""
+"""Findings that the terminal shows in full."""
 
 
 def print_findings(findings: Sequence[Finding], *, verbose: bool) -> None:
-    """The most severe findings in full, and the others by their titles."""
-    # Flights or signals with the same finding: the first stands for all.
+    """Print the most severe findings in full, and the others by their titles."""
+    # The first finding represents all flights or signals with the same one.
     by_topic = {f.topic: f for f in reversed(findings) if f.severity != "ok"}
     first = [f for f in findings if f is by_topic.get(f.topic)]
     shown = findings if verbose else first[:_IN_FULL]

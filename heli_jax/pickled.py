@@ -1,7 +1,7 @@
-"""Objects of functions and classes that are made at run time, through pickle.
+"""Pickling of functions and classes that are made at run time.
 
-A model holds closures, its records are classes that no module has by name: pickle, which stores
-names, refuses both. `cloudpickle` stores what they are. Nothing here writes a file: it is for
+A model holds closures, and its records are classes that no module has by name. pickle stores names
+and refuses both; `cloudpickle` stores their content. Nothing here writes a file: it is for
 `multiprocessing`, `joblib` and `copy`.
 """
 
@@ -11,7 +11,7 @@ import cloudpickle
 
 
 def by_value(self: Any) -> tuple[Any, ...]:
-    """Return `__reduce__`'s answer: the class with the object, both by value.
+    """Return the result of `__reduce__`: the class and the object, both by value.
 
     Args:
         self: a named tuple, or an object whose fields are its `__dict__`.
@@ -25,7 +25,7 @@ def _restored(stored: bytes) -> Any:
     if isinstance(content, tuple):
         return made(*content)
     restored = object.__new__(made)
-    # Past the class, which may be frozen.
+    # Bypass the class, which may be frozen.
     for name, value in content.items():
         object.__setattr__(restored, name, value)
     return restored

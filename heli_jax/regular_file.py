@@ -1,8 +1,8 @@
-"""Reading what a user names: regular files of a stated size, and nothing that never ends.
+"""Reading of user files: regular files of limited size only.
 
 A device such as /dev/zero has no end, a named pipe waits for a writer, and a sparse file of 1 TB
-takes no room on a disk and all of a machine's memory. So the kind and the size are looked at
-before a byte is read, and again on the file that was opened: between the two a name can change.
+takes no disk space but all memory. Kind and size are therefore checked before opening, and again on
+the open file, since the name may then refer to another file.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ _KINDS = (
     (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
 )
-# Opening must not wait for the other end of a pipe, and must not make a terminal this process's.
+# Opening must not wait for the other end of a pipe, nor make a terminal this process's own.
 _FLAGS = (
     os.O_RDONLY
     | getattr(os, "O_NONBLOCK", 0)
@@ -34,8 +34,8 @@ _PIECE = 1 << 20
 
 
 def size_words(size: int) -> str:
-    """A size in bytes in words: `1 MB`, `16 GB`."""
-    # Powers of ten, as disks are sold; the limits are stated in them too.
+    """Return a size in bytes as text: `1 MB`, `16 GB`."""
+    # Powers of ten, as for disks and the stated limits.
     for unit, scale in (("TB", 10**12), ("GB", 10**9), ("MB", 10**6), ("kB", 10**3)):
         if size >= scale:
             return f"{size / scale:.3g} {unit}"
@@ -43,16 +43,16 @@ def size_words(size: int) -> str:
 
 
 def require_regular(path: str | Path, what: str, at_most: int) -> int:
-    """The size [bytes] of a regular file, which is not opened.
+    """Return the size of a regular file [bytes] without opening it.
 
     Args:
-        what: what it should be, with its article: `a log in CSV`.
-        at_most: the largest size that is read [bytes].
+        what: expected content, with its article: `a log in CSV`.
+        at_most: the largest allowed size [bytes].
 
     Raises:
-        InputError: there is none, it is no regular file, or it is larger.
+        InputError: the file does not exist, is no regular file, or is too large.
     """
-    # A ValueError is a path with a null character, which os refuses before the system sees it.
+    # os raises ValueError for a path with a null character.
     try:
         return _checked(os.stat(path), path, what, at_most)
     except (OSError, ValueError) as e:
@@ -61,9 +61,11 @@ def require_regular(path: str | Path, what: str, at_most: int) -> int:
 
 @contextlib.contextmanager
 def open_regular(path: str | Path, what: str, at_most: int) -> Iterator[BinaryIO]:
-    """A regular file opened for reading; arguments and errors as of `require_regular`, and that it
-    cannot be opened or read."""
-    # Before it is opened: to open some devices has an effect (a tape rewinds, a watchdog starts).
+    """Open a regular file for reading; arguments and errors as for `require_regular`.
+
+    It also raises InputError if the file cannot be opened or read.
+    """
+    # Check before opening, which has an effect on some devices (a tape rewinds, a watchdog starts).
     require_regular(path, what, at_most)
     try:
         descriptor = os.open(path, _FLAGS)
@@ -75,11 +77,11 @@ def open_regular(path: str | Path, what: str, at_most: int) -> Iterator[BinaryIO
 
 
 def read_regular(path: str | Path, what: str, at_most: int) -> bytes:
-    """All of a regular file; arguments and errors as of `open_regular`."""
-    # A file of /proc says that it is empty and gives without end: what is read is counted too.
+    """Return the whole content of a regular file; arguments and errors as for `open_regular`."""
+    # A file of /proc reports size zero but has content, so the bytes read are counted too.
     pieces, size = [], 0
     with open_regular(path, what, at_most) as file:
-        # In one piece where it is as long as it says: joining pieces takes the memory twice.
+        # Read the stated size in one piece, since joining pieces doubles the memory.
         stated = os.fstat(file.fileno()).st_size
         while piece := file.read(max(stated - size, 0) + _PIECE):
             size += len(piece)
@@ -90,12 +92,11 @@ def read_regular(path: str | Path, what: str, at_most: int) -> bytes:
 
 
 def in_the_way(path: str | Path) -> str | None:
-    """Return, in words, what prevents a file from being written at a place; None if nothing
-    does."""
+    """Return the reason why a file cannot be written at a path, in words; None if it can."""
     try:
         mode = os.stat(path).st_mode
     except (OSError, ValueError):
-        return None  # writing there says what is wrong
+        return None  # the attempt to write gives the error
     return None if stat.S_ISREG(mode) else kind_of(mode)
 
 
@@ -118,13 +119,13 @@ def _too_large(path: str | Path, what: str, at_most: int, size: int | None = Non
 
 
 def _refusal(e: OSError | ValueError, path: str | Path, what: str) -> InputError:
-    # An InputError is a ValueError: one that was raised on purpose keeps its words.
+    # InputError is a ValueError, so a deliberate one passes unchanged.
     if isinstance(e, InputError):
         return e
     if isinstance(e, FileNotFoundError):
         return InputError(f"{path}: no such file")
     if isinstance(e, OSError):
-        # A file of /proc that has nothing to give now would otherwise be waited for.
+        # A file of /proc without data would otherwise block.
         waits = e.errno in (errno.EAGAIN, errno.EWOULDBLOCK)
         why = "it gives nothing" if waits else e.strerror or type(e).__name__
         return InputError(f"{path}: cannot be read ({why}), expected {what}")

@@ -1,4 +1,4 @@
-"""Directories and files that appear whole or not at all."""
+"""Directories and files that appear complete or not at all."""
 
 import contextlib
 import itertools
@@ -14,20 +14,21 @@ from pathlib import Path
 from heli_jax.errors import InputError
 from heli_jax.regular_file import in_the_way
 
-# Noted before they are made, so that there is no moment at which an interrupt would leave one.
+# Paths are added before they are created, so that no interrupt can leave one behind.
 _unfinished: set[Path] = set()
 _finished: list[Path] = []
 
 
 def default_directory(config: Path) -> Path:
-    """runs/NAME-DATE-TIME for a configuration NAME.yaml."""
+    """Return runs/NAME-DATE-TIME for a configuration NAME.yaml."""
     return Path("runs") / f"{config.stem}-{datetime.now():%Y%m%d-%H%M%S}"
 
 
 def free_directory(path: Path) -> Path:
-    """`path`, or with a warning the first of path-2, path-3, ... that does not exist.
+    """Return `path`, or with a warning the first of path-2, path-3, ... that does not exist.
 
-    For functions: a notebook's cell runs twice. Commands refuse what exists (`require_free`).
+    For functions, since a notebook's cell may run twice. Commands refuse existing paths
+    (`require_free`).
 
     Raises:
         InputError: the parent cannot hold a new directory.
@@ -49,14 +50,14 @@ def require_free(path: Path, otherwise: str = "") -> None:
     Raises:
         InputError: it exists, or its parent cannot hold it.
     """
-    if os.path.lexists(path):  # a link to nothing is in the way too
+    if os.path.lexists(path):  # a dangling link is also refused
         raise InputError(f"--out {path}: exists already, expected a new directory{otherwise}")
-    # The nearest that exists: those between are made when the directory is.
+    # Find the nearest existing folder; those below it are made later.
     parent = path.absolute().parent
     while not parent.exists():
         parent = parent.parent
     try:
-        # By trying: permissions do not tell of file systems that hold nothing new.
+        # Try it, since permissions do not reveal file systems that are read-only or full.
         os.rmdir(tempfile.mkdtemp(prefix=f".{path.name}-", dir=parent))
     except OSError as e:
         raise InputError(
@@ -65,13 +66,13 @@ def require_free(path: Path, otherwise: str = "") -> None:
 
 
 def is_new(path: Path, resume: bool) -> bool:
-    """True if work in a directory that `--resume` goes on with begins with making it.
+    """True if the directory of work with `--resume` is still to be made.
 
     Raises:
-        InputError: it exists, and is not to be gone on with.
+        InputError: it exists, and `resume` is False.
     """
-    # An empty folder counts as none: a job on a cluster, killed before it began, is started and
-    # restarted by the same command.
+    # An empty folder counts as new: a cluster job killed at its start restarts with the same
+    # command.
     if resume and path.exists():
         return path.is_dir() and not any(path.iterdir())
     require_free(path, ", or --resume")
@@ -82,7 +83,7 @@ def require_writable(path: Path) -> None:
     """Refuse a directory in which no files can be made, before minutes of work.
 
     Raises:
-        InputError: it is none, or may not be written to.
+        InputError: it is no directory, or is not writable.
     """
     if not path.is_dir() or not os.access(path, os.W_OK | os.X_OK):
         raise InputError(f"--out {path}: expected a directory that can be written to")
@@ -90,47 +91,47 @@ def require_writable(path: Path) -> None:
 
 @contextlib.contextmanager
 def whole(path: Path, *, replaces: bool = False, or_beside: bool = False) -> Iterator[Path]:
-    """A temporary directory beside `path`, renamed to it at the end, removed where that fails.
+    """Yield a temporary directory beside `path`, renamed to it at the end, or removed on failure.
 
     Args:
-        or_beside: whether it becomes `path-2` and so on where another process has made `path`
-            meanwhile; `written` says which.
+        or_beside: True if it becomes `path-2` and so on when another process has made `path`
+            meanwhile; see `written`.
 
     Raises:
         InputError: it cannot be written.
     """
-    # Beside it and not in /tmp: a rename is atomic within one file system only.
+    # A rename is atomic only within one file system, so /tmp does not serve.
     temporary = path.absolute().parent / f".{path.name}-{secrets.token_hex(4)}"
     _unfinished.add(temporary)
     try:
         path.absolute().parent.mkdir(parents=True, exist_ok=True)
         temporary.mkdir(mode=0o700)
         yield temporary
-        temporary.chmod(0o755)  # until now for its owner alone
+        temporary.chmod(0o755)  # so far only its owner had access
         if replaces:
             _give_way(path)
         _finished.append(_renamed(temporary, path, or_beside))
     except OSError as e:
         raise InputError(f"--out {path}: cannot be written ({e.strerror or e})") from e
     finally:
-        # Where it failed, by an interrupt too.
+        # Clean up after failures and interrupts.
         shutil.rmtree(temporary, ignore_errors=True)
         _unfinished.discard(temporary)
 
 
 def _renamed(temporary: Path, path: Path, or_beside: bool) -> Path:
-    """Give the directory its name, or where another process has made it the next; returns it."""
+    """Rename the directory, to the next free name if `path` is taken; return the name."""
     beside = (path.with_name(f"{path.name}-{number}") for number in itertools.count(2))
     place = path
     while or_beside and os.path.lexists(place):
         place = next(beside)
-    # It takes the place of an empty directory, and of nothing else.
+    # rename replaces an empty directory, and nothing else.
     os.rename(temporary, place)
     return place
 
 
 def _give_way(path: Path) -> None:
-    """Take away a directory of this process."""
+    """Remove a directory of this process."""
     aside = path.absolute().parent / f".{path.name}-{secrets.token_hex(4)}"
     _unfinished.add(aside)
     os.rename(path, aside)
@@ -139,10 +140,10 @@ def _give_way(path: Path) -> None:
 
 
 def require_place(path: Path, where: str) -> None:
-    """Refuse a place in which no file can be put, before any work is done.
+    """Refuse a path that cannot hold a file, before any work is done.
 
     Raises:
-        InputError: a folder, a pipe or a device stands there.
+        InputError: the path is a folder, a pipe or a device.
     """
     obstacle = in_the_way(path)
     if obstacle is not None:
@@ -151,19 +152,19 @@ def require_place(path: Path, where: str) -> None:
 
 @contextlib.contextmanager
 def whole_file(path: Path, where: str) -> Iterator[Path]:
-    """A place beside `path` to write to, which becomes `path` at the end.
+    """Yield a temporary path beside `path`, which is renamed to `path` at the end.
 
     Raises:
         InputError: the place cannot be written to, or is a folder, a pipe or a device.
     """
     require_place(path, where)
-    # With the ending of the file itself, by which writers choose the format.
+    # Keep the suffix, by which writers choose the format.
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
     temporary = temporary.absolute()
     _unfinished.add(temporary)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # Made here, so that a pipe or a link that has the name already is not written to.
+        # Create the file here, so that an existing pipe or link of that name is not written to.
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         yield temporary
         temporary.replace(path)
@@ -177,7 +178,7 @@ def whole_file(path: Path, where: str) -> Iterator[Path]:
 
 
 def remove_unfinished() -> None:
-    """Remove what is being written, before the process ends without unwinding."""
+    """Remove unfinished files and directories before the process ends without unwinding."""
     for temporary in tuple(_unfinished):
         shutil.rmtree(temporary, ignore_errors=True)
         with contextlib.suppress(OSError):

@@ -1,4 +1,4 @@
-"""Output of `simulate`, `sweep` and studies, which need no estimation."""
+"""Output of `simulate`, `sweep` and studies, without estimation."""
 
 import json
 import math
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def write_table(out: Path | None, columns: dict[str, np.ndarray]) -> None:
-    """A table as CSV or Parquet at `out`, which appears whole or not at all, or as CSV on stdout.
+    """Write a table as CSV or Parquet at `out`, complete or not at all, or as CSV on stdout.
 
     Raises:
         InputError: the place cannot be written to.
@@ -43,17 +43,17 @@ def write_view(
     simulated: "Simulated",
     table: Path | None = None,
 ) -> None:
-    """The page of what was simulated at `out`, which appears whole or not at all.
+    """Write the page of simulated runs at `out`, complete or not at all.
 
     Raises:
         InputError: the place cannot be written to.
     """
-    # Imported here: no other command needs the page.
+    # No other command needs the page.
     from heli_jax.report.origin import origin
     from heli_jax.report.view import write_view as write
 
     title, params = experiment.path.stem, experiment.vehicle.params
-    # From the page's folder on, so that both can be moved together.
+    # Paths are relative to the page, so that both can be moved together.
     beside = (Path(os.path.relpath(p, out.parent)) for p in (experiment.path, table) if p)
     made = origin(as_yaml(configuration.resolved(experiment)), tuple(p.as_posix() for p in beside))
     notes = sentences(simulated.notes)
@@ -62,12 +62,12 @@ def write_view(
 
 
 def print_sweep(out: Path) -> None:
-    """The summary of a sweep on standard output."""
-    # From the file, not from memory: a resumed sweep prints what all its runs have computed.
+    """Print the summary of a sweep on standard output."""
+    # Read the file, since a resumed sweep prints the results of all its runs.
     totals = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     counts = {k: v for k, v in totals["status"].items() if v}
     words = ", ".join(f"{v} {k.replace('_', ' ')}" for k, v in counts.items())
-    # A store of an earlier version does not say: there was no other.
+    # Stores of earlier versions have no backend entry; it was always xla.
     backend = totals["split"].get("backend", "xla")
     tell(f"{totals['elements']} elements of {totals['model']}: {words}; backend {backend}")
     rows = []
@@ -94,14 +94,14 @@ def print_sweep(out: Path) -> None:
     for found in totals["notes"]:
         tell(f"! {found['sentence']}")
     for name, result in totals["results"].items():
-        # Quantiles are of the finite values alone: how many were not is part of the answer.
+        # Quantiles cover only finite values, so the number of others is printed.
         apart = {"infinite": result.get("infinite", 0), "not a number": result.get("nan", 0)}
         if sum(apart.values()):
             words = " and ".join(f"{k} {what}" for what, k in apart.items() if k)
             of = result["n"] + sum(apart.values())
             tell(f"! {name}: of {of} values {words}, which its line leaves out")
     timing = totals["timing"]
-    # A sweep that was resumed when all was there has computed nothing, and has no rate.
+    # A sweep resumed after its end computes nothing and has no rate.
     if timing["computed_elements"]:
         tell(
             f"{timing['computed_elements']} elements in {terse(timing['seconds'], 3)} s "
@@ -112,15 +112,15 @@ def print_sweep(out: Path) -> None:
         tell(f"report: {out / 'report.html'}")
 
 
-DONE, NOT_DETERMINED, NOT_CONVERGED = 0, 3, 4  # as of a single fit
+DONE, NOT_DETERMINED, NOT_CONVERGED = 0, 3, 4  # as for a single fit
 _MOST_ROWS = 40
 _WIDEST = 24
-"""characters of an axis's value"""
+"""Longest value of an axis [characters]."""
 _MOST_DOUBTS = 10
 
 
 def study_exit_code(result: "xr.Dataset") -> int:
-    """The exit code of the worst fit."""
+    """Return the exit code of the worst fit."""
     status, adequate, untrusted = (
         set(map(str, result[n].to_numpy().ravel())) for n in ("status", "adequate", "untrusted")
     )
@@ -130,13 +130,13 @@ def study_exit_code(result: "xr.Dataset") -> int:
 
 
 def print_study(result: "xr.Dataset") -> None:
-    """The fits of a study as a table, and how their estimates scatter, on standard output.
+    """Print the fits of a study as a table, with the scatter of their estimates.
 
     Args:
-        result: of `run_study`.
+        result: result of `run_study`.
     """
     axes, parameters = result.attrs["axes"], [str(p) for p in result["parameter"].to_numpy()]
-    # Where every fit failed there is neither a parameter nor an output, and nothing to lay flat.
+    # If every fit failed, there are no parameters or outputs to stack.
     empty = [d for d in ("parameter", "output") if not result.sizes[d]]
     flat = result.drop_dims(empty).stack(fit=axes, create_index=False)
     status = [str(s) for s in flat["status"].to_numpy()]
@@ -152,7 +152,7 @@ def print_study(result: "xr.Dataset") -> None:
         estimates = [_measured(one, p) for p in parameters]
         agreement = [f"{v:.1f}" for v in one["nrmse_fit_percent"].to_numpy()] if outputs else []
         rows.append((*at, status[i], *estimates, *agreement))
-    # One axis alone names no fit: rows of two would look alike in all tables but the first.
+    # All axes name a row. With one alone, rows would look alike where the table is split.
     print_table((*axes, "status", *parameters, *outputs), rows, keys=len(axes))
     if len(status) > _MOST_ROWS:
         tell(f"... and {len(status) - _MOST_ROWS} more")
@@ -185,7 +185,7 @@ def _measured(one: Any, parameter: str) -> str:
 
 
 def _print_scatter(flat: "xr.Dataset", parameters: list[str]) -> None:
-    """Print the scatter between the fits beside the sd that each of them claims."""
+    """Print the scatter between the fits beside the sd of each."""
     rows = []
     arrived = flat["status"].to_numpy() != "not-converged"
     for i, parameter in enumerate(parameters):

@@ -1,7 +1,7 @@
-"""The work that is under way, how far it is and how long it took, for whoever shows or keeps it.
+"""Stages of the work in progress, with their progress and times.
 
-Nothing is kept or shown unless somebody asks: `recorded` keeps the times of a run, `observed_by`
-tells an observer, as the command line does.
+By default nothing is kept or shown. `recorded` keeps the times of a run, and `observed_by` notifies
+an observer such as the command line.
 """
 
 import contextlib
@@ -16,36 +16,36 @@ _COMPILED = "/jax/core/compile/backend_compile_duration"
 
 
 class Note(str):
-    """A doubt or an assumption of a reader among the words of progress: --quiet shows it too."""
+    """A doubt or a reader's assumption among progress messages, which --quiet also shows."""
 
     __slots__ = ()
 
 
 @dataclass
 class Stage:
-    """A part of the work that is under way."""
+    """A part of the work in progress."""
 
     words: str
     total: int | None = None
-    """steps that it has; None where that is not known beforehand"""
+    """Number of steps; None if unknown."""
     done: int = 0
-    """steps that are done"""
+    """Number of completed steps."""
     detail: str = ""
-    """of the last step: a cost"""
+    """Detail of the last step, such as a cost."""
     began: float = field(default_factory=time.perf_counter)
     first: tuple[int, float] | None = None
-    """steps done, and when, as the first was reported, which may have been compiled before"""
+    """Completed steps and time at the first report. Compilation may precede it."""
 
 
 class Observer(Protocol):
-    """Hears of stages as they begin and end; it reads off them what is done meanwhile."""
+    """Receives the beginnings and ends of stages, and reads their progress from them."""
 
     def begin(self, stage: Stage) -> None:
-        """A stage begins, maybe within another."""
+        """Handle the beginning of a stage, possibly within another."""
         ...
 
     def end(self, stage: Stage) -> None:
-        """It has ended, well or not."""
+        """Handle the end of a stage, successful or not."""
         ...
 
 
@@ -56,13 +56,13 @@ class _Work:
     stack: list[Stage] = field(default_factory=list)
 
 
-# By context, so that fits in threads do not mix: a new thread has none and reports nothing.
+# A context variable keeps fits in threads apart. A new thread has none and reports nothing.
 _work: ContextVar[_Work | None] = ContextVar("heli_jax_work", default=None)
 
 
 @contextlib.contextmanager
 def observed_by(observer: Observer) -> Iterator[None]:
-    """Tell an observer of the stages meanwhile."""
+    """Notify an observer of stages within the context."""
     token = _work.set(_Work(observer))
     try:
         yield
@@ -72,19 +72,18 @@ def observed_by(observer: Observer) -> Iterator[None]:
 
 @contextlib.contextmanager
 def recorded() -> Iterator[dict[str, float]]:
-    """Keep how long the outermost stages take meanwhile.
+    """Record the times of the outermost stages within the context.
 
     Yields:
-        Seconds by the words of a stage, and under 'compilation (of these)' the part of them that
-        XLA took to compile.
+        Times by the words of a stage [s]; 'compilation (of these)' is XLA's share for compiling.
     """
-    # Here, since the command line's parser must not wait for JAX.
+    # Local import, since the command line's parser must not wait for JAX.
     from jax import monitoring
 
     outer = _work.get()
     seconds = {COMPILATION: 0.0}
 
-    # Any: whatever else JAX says of an event.
+    # Any: other data of JAX's event.
     def compiled(event: str, duration_secs: float, **_: Any) -> None:
         if event == _COMPILED:
             seconds[COMPILATION] += duration_secs
@@ -102,10 +101,10 @@ def recorded() -> Iterator[dict[str, float]]:
 def stage(
     words: str, *, total: int | None = None, name: str | None = None, shown: bool = True
 ) -> Iterator[None]:
-    """A part of the work goes on meanwhile.
+    """Mark the body of the context as a stage of the work.
 
     Args:
-        name: under which its time is kept; `words` unless given.
+        name: key for its time; default: `words`.
     """
     work = _work.get()
     if work is None:
@@ -128,7 +127,7 @@ def stage(
 
 
 def watched() -> bool:
-    """True if anybody looks: to compute how far a stage is can be saved otherwise."""
+    """True if there is an observer; otherwise progress need not be computed."""
     work = _work.get()
     return work is not None and work.observer is not None
 
@@ -139,19 +138,19 @@ def _innermost() -> Stage | None:
 
 
 def note(detail: str) -> None:
-    """Say in words where the innermost stage is between two of its steps."""
+    """Set the detail of the innermost stage between two of its steps."""
     if (inner := _innermost()) is not None:
         inner.detail = detail
 
 
 def advance(steps: int = 1, detail: str = "") -> None:
-    """Count further steps of the innermost stage as done; `detail` is of the last one."""
+    """Count further steps of the innermost stage as done; `detail` describes the last one."""
     if (inner := _innermost()) is not None:
         reach(inner.done + steps, detail)
 
 
 def reach(done: int, detail: str = "") -> None:
-    """Count so many steps in all of the innermost stage as done; `detail` is of the last one."""
+    """Set the total of completed steps of the innermost stage; `detail` describes the last one."""
     if (inner := _innermost()) is not None:
         inner.done, inner.detail = done, detail
         inner.first = inner.first or (done, time.perf_counter())

@@ -1,9 +1,9 @@
 """Summaries of flights, problems, fits, runs and vehicles: text in a session, a table in a
 notebook.
 
-Each `of_...` function makes a `Summary` of one object; `as_text` and `as_html` lay it out. The
-classes call these from `__repr__` and `_repr_html_`. Since they import this module, it imports
-none of them, and its arguments are `Any`.
+Each `of_...` function makes a `Summary` of one object; `as_text` and `as_html` format it. The
+classes call these functions from `__repr__` and `_repr_html_`. They import this module, so it
+imports none of them, and its arguments are `Any`.
 """
 
 import html
@@ -20,7 +20,7 @@ from heli_jax.numbers import NOTHING, measured, number, percent, vaf_percent
 type Row = tuple[str, ...]
 
 
-# Between objects and their layout, so that text and HTML cannot differ in what they show.
+# Text and HTML share this content, so they cannot differ.
 class Summary(NamedTuple):
     """Content of a summary."""
 
@@ -31,9 +31,9 @@ class Summary(NamedTuple):
 
 
 def as_text(summary: Summary) -> str:
-    """A summary as lines of text, its columns in line."""
+    """Return a summary as lines of text with aligned columns."""
     rows = [row for row in (summary.head, *summary.rows) if row]
-    # Without rows and head there are no columns, and zip gives none.
+    # Without rows and head there are no columns, and zip returns none.
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [
         "  " + "  ".join(map(str.ljust, row, widths)).rstrip() if any(row) else "" for row in rows
@@ -42,7 +42,9 @@ def as_text(summary: Summary) -> str:
 
 
 def as_html(summary: Summary) -> str:
-    """A summary as HTML; names and notes come from logs and files, so all text is escaped."""
+    """Return a summary as HTML. All text is escaped, since names and notes come from logs and
+    files.
+    """
 
     def cells(row: Row, tag: str) -> str:
         return "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in row)
@@ -55,12 +57,12 @@ def as_html(summary: Summary) -> str:
 
 
 def of_flight(flight: Any) -> Summary:
-    """Signals with their ranges in SI, what inputs do between samples, and the reader's notes."""
+    """Summarise the signals with ranges in SI, the hold of inputs, and the reader's notes."""
     rows = []
     for role in ("inputs", "outputs"):
         for name, values in getattr(flight, role).items():
             hold = flight.hold[name] if role == "inputs" else ""
-            # Outputs have no hold: they are compared at their samples alone.
+            # Outputs have no hold, since they are compared only at their samples.
             rows.append((role[:-1], name, *_range(values), hold))
     used = ", held out" if flight.hold_out else ""
     known = [f"differs in {n} = {number(v, 6)}" for n, v in flight.known.items()]
@@ -75,8 +77,8 @@ def of_flight(flight: Any) -> Summary:
 
 
 def of_problem(problem: Any) -> Summary:
-    """Summarise the free parameters with bounds and priors, and the flights that are fitted."""
-    # As stated, not as transformed: the search may be in logarithms.
+    """Summarise the free parameters with bounds and priors, and the fitted flights."""
+    # Values as configured, without the transforms of the search.
     rows = []
     for name, free in problem.free.items():
         prior = "" if free.prior is None else f"{number(free.prior.mean)} ± {number(free.prior.sd)}"
@@ -96,12 +98,12 @@ def of_problem(problem: Any) -> Summary:
 def of_estimates(
     estimates: Mapping[str, Any], *, stopped: bool = False
 ) -> tuple[Row, tuple[Row, ...]]:
-    """Head and rows: value, sd, 95 % interval, unit and prior share of each estimate.
+    """Return head and rows: value, sd, 95 % interval, unit and prior share of each estimate.
 
     Args:
-        stopped: whether the optimiser did not converge, and no number is a result.
+        stopped: True if the optimiser did not converge, so that no number is a result.
     """
-    # prior share: of the estimate's variance, what the priors and not the data explain.
+    # prior share: the priors' part of the estimate's variance.
     head = ("parameter", "estimate", "sd", "95 % interval", "unit", "prior share")
     rows = []
     for name, e in estimates.items():
@@ -115,30 +117,31 @@ NOT_DETERMINED = "not determined"
 
 
 def cells_of(e: Any, *, stopped: bool = False) -> tuple[str, str, str]:
-    """Value, sd and 95 % interval of an estimate or a combination; the last two are empty where it
-    is not determined, or the fit stopped before an optimum.
+    """Return value, sd and 95 % interval of an estimate or a combination.
+
+    The last two are empty if it is not identifiable or the fit stopped before an optimum.
     """
     if stopped:
         known = math.isfinite(e.value)
         return f"{number(e.value, 3)} (no result)" if known else NOT_DETERMINED, "", ""
-    # What is not identifiable keeps its value in fit.json; a number here would be read as an
+    # fit.json keeps the value of a parameter that is not identifiable. Here it would look like an
     # estimate.
     if e.sd is None or not math.isfinite(e.sd):
         return NOT_DETERMINED, "", ""
-    # To the digits that the sd leaves, all four alike.
+    # All four numbers have the digits that the sd allows.
     value, low, high, sd = measured(e.sd, e.value, e.lower95, e.upper95)
     untrusted = e.lower95 is None or e.upper95 is None
     return value, sd, "not trusted" if untrusted else f"{low} to {high}"
 
 
 def of_fit(fit: Any) -> Summary:
-    """Status, verdict, estimates with intervals, and agreement by output."""
+    """Summarise status, verdict, estimates with intervals, and agreement by output."""
     head, rows = of_estimates(fit.estimates)
     agreement = [f"{name}: VAF {vaf_percent(m.vaf)}" for name, m in fit.metrics.items()]
     by = f" by instrument ({', '.join(fit.instruments)})" if fit.instruments else ""
     return Summary(
         f"Fit of {fit.model} by {fit.method}{by}: {fit.status}",
-        # The interval's own name: whether it allows for autocorrelated residuals.
+        # This name states whether the interval allows for autocorrelated residuals.
         (*head[:3], fit.interval, *head[4:]),
         rows,
         (fit.verdict.text, *agreement, *fit.notes),
@@ -146,17 +149,18 @@ def of_fit(fit: Any) -> Summary:
 
 
 def precision_of(run: Any) -> tuple[str, str]:
-    """The floating-point type of a run, and what it costs where it is below float64 (else empty).
+    """Return the floating-point type of a run, and the loss of precision below float64 (else
+    empty).
 
     Args:
-        run: a Trajectory, concrete or not.
+        run: a Trajectory, concrete or traced.
     """
     records = (run.states, run.outputs)
     types = {np.dtype(v.dtype) for r in records for v in naming.asdict(r).values()}
     least = min((t for t in types if t.kind == "f"), key=lambda t: t.itemsize, default=None)
     if least is None or least.itemsize >= 8:
         return "float64", ""
-    # Measured on the bench (roll), beside the same run in float64.
+    # Measured for the roll model on the bench, against the same run in float64.
     digits = np.finfo(least).precision + 1
     return least.name, (
         f"computed in {least.name}, {digits} digits a number in place of 16, which leaves a roll "
@@ -166,22 +170,25 @@ def precision_of(run: Any) -> tuple[str, str]:
 
 
 def of_trajectory(run: Any, statuses: Sequence[str]) -> Summary:
-    """Signals with their ranges in SI and how the run ended (`statuses` are the words for it); of
-    a batch, and within jit, the shapes alone."""
+    """Summarise the signals with ranges in SI and the end of a run.
+
+    For batches, and within jit, only shapes are shown. `statuses` are the words for the status
+    codes.
+    """
     signals = [
         (role, name, values)
         for role, record in (("state", run.states), ("output", run.outputs), ("input", run.inputs))
         for name, values in naming.asdict(record).items()
     ]
     said = tuple(filter(None, (precision_of(run)[1],)))
-    # A repr must never fail: within jit there are no numbers, only shapes.
+    # A repr must never fail. Within jit only shapes are known.
     if np.ndim(run.times) != 1 or not _concrete([run.times, run.finite, *(v for *_, v in signals)]):
         shape = tuple(np.shape(run.times))
         rows = tuple((role, name, str(tuple(np.shape(v)))) for role, name, v in signals)
         head = ("", "signal", "shape")
         return Summary(f"Trajectory, times of shape {shape}", head, rows, said)
     times = np.asarray(run.times)
-    # By role as well: an output may have another unit than the state of the same name.
+    # The key includes the role, since an output and a state of the same name may differ in unit.
     units = {
         (role, name): naming.unit(type(record), name) or ""
         for role, record in (("state", run.states), ("output", run.outputs), ("input", run.inputs))
@@ -200,12 +207,12 @@ def of_trajectory(run: Any, statuses: Sequence[str]) -> Summary:
 
 
 def of_vehicle(vehicle: Any) -> Summary:
-    """The constants that were given, with unit and meaning; `vehicle` is any record of numbers."""
+    """Summarise the given constants with unit and meaning; `vehicle` is any record of numbers."""
     record, rows, missing = type(vehicle), [], []
     for name, value in naming.asdict(vehicle).items():
         if not _concrete([value]) or np.ndim(value) != 0:
             shown = f"shape {tuple(np.shape(value))}" if hasattr(value, "shape") else repr(value)
-        elif np.isnan(float(value)):  # how a Helicopter marks a constant that its file left out
+        elif np.isnan(float(value)):  # NaN marks a constant that the file does not give
             missing.append(name)
             continue
         else:
@@ -216,17 +223,17 @@ def of_vehicle(vehicle: Any) -> Summary:
 
 
 def _concrete(values: Iterable[Any]) -> bool:
-    """True if all are numbers and not traced by JAX."""
+    """True if all values are numbers and none is a tracer of JAX."""
     try:
         for value in values:
             np.asarray(value, dtype=float)
-    except Exception:  # JAX's tracers, within jit and vmap, each have an error of their own
+    except Exception:  # JAX's tracers raise various errors within jit and vmap
         return False
     return True
 
 
 def _range(values: np.ndarray) -> tuple[str, str]:
-    # NaN stands for samples that are missing, and for a run from where it diverged.
+    # NaN marks missing samples, and a run after it diverged.
     finite = np.asarray(values, float)[np.isfinite(values)]
     if not finite.size:
         return NOTHING, NOTHING

@@ -1,4 +1,4 @@
-"""A whole sweep as a function, for a script, a notebook and the command line alike."""
+"""A complete sweep as a function, for scripts, notebooks and the command line."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -27,36 +27,36 @@ def run_sweep(
     """Run the design of a configuration's `sweep`.
 
     Args:
-        config: of `load_config`, or the path of a configuration.
-        out: a directory for sweep.zarr, summary.json, config.yaml and figures/; in memory, and
-            without figures, unless given.
-        figures: whether to draw: it takes seconds.
-        **options: of `heli_jax.sweeps.run.Options`, as of `heli_jax.sweep`: resume, chunk, lanes,
-            devices, client, memory, progress, say.
+        config: result of `load_config`, or the path of a configuration.
+        out: directory for sweep.zarr, summary.json, config.yaml and figures/; default: results in
+            memory, without figures.
+        figures: True to draw figures, which takes seconds.
+        **options: fields of `heli_jax.sweeps.run.Options`, as for `heli_jax.sweep`: resume, chunk,
+            lanes, devices, client, memory, progress, say.
 
     Returns:
         A Dataset over `element`, with axes and `status` as coordinates.
 
     Raises:
-        InputError: something of the configuration is wrong, or `out` exists (without `resume`),
-            is of another sweep, or cannot be written to.
+        InputError: the configuration is wrong, or `out` exists (without `resume`), belongs to
+            another sweep, or cannot be written to.
     """
-    # Here, since xarray and zarr take a second, which a fit should not wait for.
+    # xarray and zarr take a second to import, which a fit need not wait for.
     from heli_jax.sweeps.run import Options
     from heli_jax.sweeps.run import run_sweep as run_job
 
     config = config if isinstance(config, Experiment) else configuration.load(config)
     job = _sweep_job(config)
     design = config.config.sweep
-    assert design is not None  # `_sweep_job` refuses a configuration without
+    assert design is not None  # `_sweep_job` refuses a configuration without sweep
     resolved = as_yaml(configuration.resolved(config))
     notes = []
-    # Not refused: a fit's configuration has its disturbance, and a sweep over Ixx may do without.
+    # Not refused: a fit's configuration may have a disturbance that a sweep over Ixx does not need.
     if config.config.disturbance is not None and "seed" not in job.design.names:
         words = "disturbance: nothing is drawn without an axis seed, as seed: {values: [0]}"
         notes.append(note("sweep.nothing-drawn", words))
     out = None if out is None else Path(out)
-    # What is given here goes before what the configuration says.
+    # Arguments take precedence over the configuration.
     carrying = Options(
         **{
             "chunk": design.chunk,
@@ -70,7 +70,8 @@ def run_sweep(
             job,
             out,
             carrying,
-            # In the directory to be run again, in the store to travel with the numbers.
+            # The copy in the directory serves to repeat the sweep, that in the store to document
+            # it.
             files={"config.yaml": resolved},
             attributes={"configuration": resolved, "seed": design.seed or 0},
             notes=notes,
@@ -82,7 +83,7 @@ def run_sweep(
 
 
 def _sweep_job(config: Experiment) -> "Job":
-    # `drive` gives the experiment anew, since wind adds inputs to its model.
+    # Use the experiment of `drive`, since wind adds inputs to its model.
     from heli_jax import generate
     from heli_jax.config.sweeps import simulates, sweep_job
 
@@ -90,16 +91,16 @@ def _sweep_job(config: Experiment) -> "Job":
 
 
 def _draw_sweep(out: Path, dataset: "xr.Dataset", say: Callable[[str], None]) -> None:
-    """The figures of a sweep; what they leave out is said."""
+    """Draw the figures of a sweep, and report results that they leave out."""
     from heli_jax.report.sweeps import RESULTS, results, write_figures, write_page
 
     try:
         write_figures(out / "figures", dataset)
         with run_directory.whole_file(out / "report.html", f"--out {out}: report.html") as page:
             write_page(page, out, out.name)
-    except OSError as e:  # the results are safe in the store by now
+    except OSError as e:  # the store already has the results
         raise InputError(f"--out {out}: figures cannot be written ({e.strerror or e})") from e
-    # A figure for each result and axis: of dozens nobody would look at any.
+    # Each result and axis needs a figure, so only the first results are drawn.
     count = len(results(dataset))
     if count > RESULTS:
         say(f"slices and maps are of the first {RESULTS} of {count} results")

@@ -1,7 +1,6 @@
 """Terminal output: sentences and tables, and the progress of long work on standard error.
 
-No number is ever cut off or in two, and no name of a log, a file or a configuration reaches the
-terminal with what it would obey.
+Numbers are never cut. Names from logs, files and configurations cannot send control sequences.
 """
 
 import contextlib
@@ -21,26 +20,26 @@ from heli_jax.stages import Note, Stage
 
 type _Row = tuple[str, ...]
 _BETWEEN = 3
-"""columns from one column's end to the next one's beginning"""
+"""Space between two columns of a table [characters]."""
 _AFTER = 2.0
-"""s: a stage that is done sooner shows nothing"""
+"""Shortest stage that shows progress [s]."""
 _EVERY = 30.0
-"""s between two lines where standard error is no terminal"""
+"""Time between two progress lines if standard error is no terminal [s]."""
 _COUNTED = 100_000
-"""steps beyond which a share is shown: bytes of a file"""
+"""Number of steps above which a percentage is shown (bytes of a file)."""
 
 
 def plain_text(text: str) -> str:
-    """Words without what a terminal would obey: escape sequences, marks that turn the direction of
-    writing, halves of characters."""
+    """Return text without escape sequences, direction marks and lone surrogates."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() or c == "\n" else " " if c.isspace() else "?" for c in text)
 
 
 def tell(text: str, file: TextIO | None = None) -> None:
-    """Print sentences on `file`, standard output unless given; on a terminal with new lines between
-    words. A new line in them stays one."""
+    """Print sentences on `file` (default: standard output), wrapped between words on a terminal.
+    Line breaks in the text are kept.
+    """
     text = plain_text(terminal_sentence(text))
     stream = sys.stdout if file is None else file
     if stream.isatty():
@@ -50,7 +49,7 @@ def tell(text: str, file: TextIO | None = None) -> None:
 
 
 def _folded(line: str, width: int) -> str:
-    # A terminal would begin a new line within a number. What is one word, such as a path, it may.
+    # A terminal would break a line within a number. A single long word, such as a path, may break.
     indent = " " * (len(line) - len(line.lstrip()) + 2)
     return textwrap.fill(
         line,
@@ -63,10 +62,10 @@ def _folded(line: str, width: int) -> str:
 
 
 def print_table(head: _Row, rows: Sequence[_Row], *, keys: int = 1) -> None:
-    """Print a table on standard output, its columns as wide as they need; as a list where that is
-    wider than the terminal. A pipe has lines of any length.
+    """Print a table on standard output with columns of their natural width; print a list if it is
+    wider than the terminal. A pipe has no limit.
     """
-    # Imported here, not above: rich takes a tenth of a second, which `heli-jax --help` has not.
+    # rich takes a tenth of a second to import, too long for `heli-jax --help`.
     from rich.box import SIMPLE_HEAD
     from rich.cells import cell_len
     from rich.console import Console
@@ -87,8 +86,8 @@ def print_table(head: _Row, rows: Sequence[_Row], *, keys: int = 1) -> None:
         table.add_column(name, justify="left" if i == 0 else "right", no_wrap=True)
     for row in rows:
         table.add_row(*row)
-    # '[deg]' in a unit or a signal's name is markup to rich and would vanish, ':m:' an emoji.
-    # Printed here: rich ends the program where nobody reads any more.
+    # rich would treat '[deg]' as markup and ':m:' as an emoji. Print here, since rich ends the
+    # program on a closed pipe.
     text = io.StringIO()
     console = Console(
         file=text,
@@ -102,27 +101,26 @@ def print_table(head: _Row, rows: Sequence[_Row], *, keys: int = 1) -> None:
     print("\n".join(line.rstrip() for line in text.getvalue().splitlines()))
 
 
-# Any: a table of the page, a NamedTuple of head and rows.
+# Any: a page's table, a NamedTuple of head and rows.
 def tell_table(table: Any, keys: int = 1) -> None:
-    """A table of the page, its numbers and units in ASCII as all of the terminal's; `keys` as of
-    `print_table`."""
+    """Print a page's table with numbers and units in ASCII; `keys` as for `print_table`."""
     print_table(table.head, [tuple(map(plain_cell, row)) for row in table.rows], keys=keys)
 
 
 def say(text: str) -> None:
-    """Print a line on standard error: standard output is for results, which may be piped on."""
+    """Print a line on standard error. Standard output is for results, which may be piped."""
     tell(f"heli-jax: {shortened(text)}", sys.stderr)
 
 
 def say_notes(text: str) -> None:
-    """Print a line where it is a note: a doubt is no progress that may be hidden."""
+    """Print a line only if it is a note, since --quiet hides progress but no doubts."""
     if isinstance(text, Note):
         say(text)
 
 
 @contextlib.contextmanager
 def progress_shown(quiet: bool) -> Iterator[None]:
-    """Show the stages of work that last, unless `quiet`."""
+    """Show the stages of long work, unless `quiet`."""
     if quiet:
         yield
         return
@@ -135,13 +133,13 @@ def progress_shown(quiet: bool) -> Iterator[None]:
 
 
 class _Display:
-    """An `Observer`: a line that changes on a terminal, else a line now and then."""
+    """Observer that shows one changing line on a terminal, else a line at intervals."""
 
     def __init__(self) -> None:
         self.stack: list[Stage] = []
         self.over = threading.Event()
         self.lock = threading.Lock()
-        # Any: of rich, which is imported only when there is something to show.
+        # Any: rich is imported only when there is something to show.
         self.live: Any = None
 
     def begin(self, stage: Stage) -> None:
@@ -152,12 +150,12 @@ class _Display:
 
     def end(self, stage: Stage) -> None:
         self.stack.remove(stage)
-        # The line goes with the last of them: what is printed next may be a result.
+        # Hide the line after the last stage, since the next output may be a result.
         if not self.stack:
             self.hide()
 
     def hide(self) -> None:
-        """Show nothing more."""
+        """Hide the display."""
         self.over.set()
         with self.lock:
             if self.live is not None:
@@ -183,22 +181,24 @@ class _Display:
 
         with self.lock:
             if not over.is_set():
-                # What else is printed meanwhile comes above the line.
+                # Other output appears above the line.
                 console = Console(stderr=True)
                 live = Live(console=console, get_renderable=line, transient=True)
                 live.start()
                 self.live = live
 
     def _text(self) -> str:
-        stack = self.stack[-1:]  # of another thread, which may end the last of them now
+        stack = self.stack[-1:]  # another thread may remove the last stage now
         return (
             plain_text(terminal_sentence(in_words(stack[0], time.perf_counter()))) if stack else ""
         )
 
 
 def in_words(stage: Stage, now: float) -> str:
-    """A stage as it stands: `fitting Ixx: step 12, cost 1.2e+03, 14 s`; `now` [s] is of the clock
-    `time.perf_counter`."""
+    """Return the state of a stage: `fitting Ixx: step 12, cost 1.2e+03, 14 s`.
+
+    `now` is a time of `time.perf_counter` [s].
+    """
     done, total, spent = stage.done, stage.total, now - stage.began
     parts = []
     if stage.first is not None:
@@ -206,7 +206,7 @@ def in_words(stage: Stage, now: float) -> str:
         of = f"{done} of {total}" if total else f"step {done}"
         parts = [f"{100 * done / total:.0f} %" if total and share else of]
     parts += [*([stage.detail] if stage.detail else []), _time(spent)]
-    # The first step compiles: a rate that contained it would foretell hours.
+    # The first step includes compilation, which would make the estimated time far too long.
     if stage.first is not None and total and stage.first[0] < done < total:
         rate = (done - stage.first[0]) / (now - stage.first[1])
         parts.append(f"{_time((total - done) / rate)} left")

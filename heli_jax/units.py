@@ -1,7 +1,7 @@
-"""Units: everything inside is SI; conversion happens once, where a file is read.
+"""Units: internal values are in SI; conversion happens once, when a file is read.
 
-The angle is a dimension of its own here, so that a length cannot pass for an angle and a
-frequency in Hz means turns per second: 25 Hz of rotor speed is 157 rad/s.
+The angle is a dimension of its own here, so a length cannot pass for an angle. Hz means turns per
+second: 25 Hz of rotor speed is 157 rad/s.
 """
 
 import functools
@@ -12,9 +12,8 @@ from typing import Any
 
 from heli_jax.errors import nearest
 
-# A registry of its own rather than pint's default: that calls the radian dimensionless (so that a
-# metre of stick would pass for a radian of blade), reads 'a' as a year, and has a thousand
-# units to read before the first is used.
+# pint's default registry makes the radian dimensionless, so a metre of stick would pass for a
+# radian of blade. It also reads 'a' as a year and loads a thousand units.
 _DEFINITIONS = """
 milli- = 1e-3 = m-
 micro- = 1e-6 = u- = µ-
@@ -61,7 +60,7 @@ farad = ampere * second / volt = F
 
 @functools.cache
 def _registry() -> Any:
-    import pint  # kept out of the library's import time
+    import pint  # slow import
 
     registry = pint.UnitRegistry(None)
     for line in _DEFINITIONS.strip().splitlines():
@@ -69,7 +68,7 @@ def _registry() -> Any:
     return registry
 
 
-# A unit is names with small whole exponents, multiplied or divided: nothing that computes.
+# A unit is a product or quotient of names with small integer exponents; no other arithmetic.
 _FACTOR = r"(?:1|[A-Za-zµ°%_]+)(?:\s*(?:\^|\*\*)\s*-?\d)?"
 _UNIT = re.compile(rf"{_FACTOR}(?:\s*[*/·]\s*{_FACTOR}|\s+{_FACTOR})*")
 _EXAMPLES = (
@@ -77,17 +76,17 @@ _EXAMPLES = (
     *("rad", "mrad", "deg", "rev", "rpm", "Hz", "kt", "kg", "g", "lb", "slug", "N", "lbf", "gee"),
     *("Pa", "J", "W", "A", "V", "ohm", "H", "F", "%", "stick"),
 )
-"""what is said to be known; docs/units.md has all"""
+"""Units that error messages list; docs/units.md has all."""
 
 
-# Units as files spell them: `degrees_per_second`, `deg s-1`, `m/s²`, `Grad/s`, `deg_s`.
+# Spellings of units in files: `degrees_per_second`, `deg s-1`, `m/s²`, `Grad/s`, `deg_s`.
 _SUPERSCRIPTS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
 _RAISED = re.compile(r"([A-Za-z°%])([⁻]?[¹²³⁴⁵⁶⁷⁸⁹])")
 _PER = re.compile(r"(?<=[A-Za-z°%])(?:_| )+per(?:_| )+|(?<=[a-z])p(?=s$|s\^?2$)")
-# As UDUNITS has it (Unidata): an exponent right behind the name, products by a point.
+# UDUNITS spelling (Unidata): the exponent follows the name, and a point is a product.
 _EXPONENT = re.compile(r"(?<=[A-Za-zµ°])(-?[1-9])(?![0-9.])")
 _POINT = re.compile(r"(?<=[A-Za-z0-9])\.(?=[A-Za-z])")
-# In a name there is no stroke: deg_s. Of these no product with a second is logged.
+# Names cannot contain a slash: deg_s. No log has a product of these units and a second.
 _UNDERLINED = re.compile(
     r"(deg|degree|degrees|rad|radian|radians|mrad|cdeg|m|meter|meters|metre|metres|cm|mm|ft|km)"
     r"_(s|sec|secs|second|seconds|h|min)(\^?2)?"
@@ -101,7 +100,7 @@ _WORD = re.compile(r"[A-Za-zµ°%_]+")
 
 
 def _as_known(text: str) -> str:
-    """A unit as pint reads it: names with `^` exponents, products and quotients."""
+    """Return a unit in pint's spelling: names with `^` exponents, products and quotients."""
     text = _RAISED.sub(lambda m: f"{m[1]}^{m[2].translate(_SUPERSCRIPTS)}", text.strip())
     if text in _WORDS:
         return _WORDS[text]
@@ -111,7 +110,7 @@ def _as_known(text: str) -> str:
     return _WORD.sub(lambda m: _WORDS.get(m[0], m[0]), text)
 
 
-# Any, as pint's quantities have no type that can be imported without pint.
+# Any, since pint's types cannot be imported without pint.
 @functools.cache
 def _parse(unit: str) -> Any:
     registry = _registry()
@@ -120,7 +119,7 @@ def _parse(unit: str) -> Any:
     if text in ("", "1", "-", "dimensionless"):
         return registry.Quantity(1.0)
     try:
-        # Before pint sees it: pint evaluates powers, and 9**9**9**9 does not end.
+        # Check before pint parses: pint evaluates powers, and 9**9**9**9 does not end.
         if len(text) > 60 or not _UNIT.fullmatch(text):
             raise ValueError
         expression = text.replace("%", "percent").replace("°", "degree")
@@ -132,20 +131,20 @@ def _parse(unit: str) -> Any:
         if not math.isfinite(quantity.magnitude):  # 'nan' and 'inf' parse as numbers
             raise ValueError
         return quantity
-    except Exception as e:  # pint raises many kinds for text that is no unit
+    except Exception as e:  # pint raises many types for text that is no unit
         raise ValueError(_unknown(unit, text)) from e
 
 
 def _unknown_names(expression: str) -> list[str]:
-    """The names in an expression that stand for no unit."""
+    """Return the names in an expression that are no units."""
     return [n for n in re.findall(r"[A-Za-zµ°_]+", expression) if not _is_known(n)]
 
 
 def _is_known(name: str) -> bool:
     registry = _registry()
     meanings = registry.parse_unit_name(name, case_sensitive=True)
-    # pint takes an s at the end for a plural. Of a whole word it is one (degrees); `rads` may have
-    # been meant for rad/s.
+    # pint reads a final s as a plural. That is right for whole words (degrees), but `rads` may mean
+    # rad/s.
     if name.endswith("s") and len(name) > 1:
         singular = registry.parse_unit_name(name[:-1], case_sensitive=True)
         meanings = [m for m in meanings if m not in singular or name.endswith(f"{m[1]}s")]
@@ -159,7 +158,7 @@ _FROM_ANOTHER_ZERO = {
 
 
 def _unknown(unit: str, text: str) -> str:
-    """Return a sentence on a unit that cannot be read, with the names that are near it."""
+    """Return a message on an unreadable unit, with the closest known names."""
     if text in _FROM_ANOTHER_ZERO:
         remedy = _FROM_ANOTHER_ZERO[text]
         return f"unit {text!r} counts from another zero than K; of a signal state {remedy}"
@@ -169,9 +168,9 @@ def _unknown(unit: str, text: str) -> str:
         wrong = names[0] if names else wrong
     if wrong != text[:60]:
         place = f" in {unit[:60]!r}"
-    # Case first: `hz` is nearer to Hz than to h.
+    # Compare case first: by distance, `hz` is no closer to Hz than to h.
     alike = [n for n in _EXAMPLES if n.lower() == wrong.lower()]
-    # Units are few enough to be all of use.
+    # There are few units, so listing all is useful.
     every = f"; known are {', '.join(_EXAMPLES)} and their products, as N m/A"
     near = nearest(wrong, alike or _EXAMPLES, every)
     return f"unknown unit {(wrong if place else unit[:60])!r}{place}{near}"
@@ -179,9 +178,9 @@ def _unknown(unit: str, text: str) -> str:
 
 @functools.cache
 def factor(unit: str, si: str) -> float:
-    """The number that turns a value in `unit` into the SI unit `si`.
+    """Return the factor that converts a value in `unit` to the SI unit `si`.
 
-    A plain number is taken for an angle in radians, as SI does (`1/s` for `rad/s`).
+    As in SI, a plain number may be an angle in radians (`1/s` for `rad/s`).
 
     Raises:
         ValueError: the unit is unknown, or of another kind than `si`.
@@ -189,11 +188,11 @@ def factor(unit: str, si: str) -> float:
     have, want = _parse(unit), _parse(si)
     if have.dimensionality == want.dimensionality:
         return float((have / want).to_base_units().magnitude)
-    # Only where the file leaves the angle out: '1/s' may stand for rad/s. The other way round, Hz
-    # or rad/s for 1/s, is refused, since a factor of 2 pi would go unseen.
+    # Only files may leave out the angle: '1/s' may mean rad/s. Hz or rad/s for 1/s is refused,
+    # since a factor of 2 pi could go unnoticed.
     if "[angle]" not in dict(have.dimensionality) and _without_angle(have) == _without_angle(want):
         base = have.to_base_units()
-        # Nobody logs radians a minute: 1/min is how many write turns, 2 pi times as many.
+        # Logs do not use radians per minute: 1/min usually means turns, a factor of 2 pi.
         if dict(have.dimensionality) == {"[time]": -1.0} and float(base.magnitude) != 1.0:
             raise ValueError(
                 f"unit {unit!r} is a number in a time, of turns or of radians, expected 'rpm' of "
@@ -214,7 +213,7 @@ def fits(unit: str, si: str) -> bool:
 
 
 def turn(si: str) -> float | None:
-    """A full turn in an SI unit; None where that is no angle."""
+    """Return a full turn in an SI unit; None if the unit is no angle."""
     return factor("turn", si) if fits("turn", si) else None
 
 
@@ -226,12 +225,12 @@ _SI = (
 
 
 def si_of(unit: str) -> str:
-    """The SI unit of the same kind as `unit`.
+    """Return the SI unit of the same kind as `unit`.
 
     Raises:
-        ValueError: the unit is unknown, or none of the kinds that occur here.
+        ValueError: the unit is unknown, or of a kind that is not listed.
     """
-    # A list and not pint's base units: those write kg m^2/s^2 where a reader knows N m.
+    # pint's base units would give kg m^2/s^2 instead of the familiar N m.
     kind = _parse(unit).dimensionality
     for si in _SI:
         if _parse(si).dimensionality == kind:
@@ -246,7 +245,7 @@ _BASE = {
 
 
 def base_of(unit: str) -> dict[str, int]:
-    """The exponents of kg, m, s, rad, A and K in a unit of any kind, those that are not zero.
+    """Return the nonzero exponents of kg, m, s, rad, A and K in a unit.
 
     Raises:
         ValueError: the unit is unknown.
@@ -265,7 +264,7 @@ def is_unit(unit: str) -> bool:
 
 
 def as_text(exponents: Mapping[str, int]) -> str:
-    """The SI unit with these exponents of kg, m, s, rad, A and K: `kg m^2`, `rad/s^2/V`."""
+    """Return the SI unit with these exponents of kg, m, s, rad, A and K: `kg m^2`, `rad/s^2/V`."""
 
     def power(unit: str, n: int) -> str:
         return unit if n == 1 else f"{unit}^{n}"
@@ -276,7 +275,7 @@ def as_text(exponents: Mapping[str, int]) -> str:
 
 
 def _shortest(exponents: Mapping[str, int]) -> dict[str, int]:
-    """The exponents with volt for ampere and newton for kg, where these are less."""
+    """Return the exponents with volt for ampere and newton for kg, if fewer remain."""
     spellings = [dict(exponents)]
     volts = -exponents.get("A", 0)
     for volt in range(min(volts, 0), max(volts, 0) + 1):  # kg m^2/s^3/A

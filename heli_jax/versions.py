@@ -1,4 +1,4 @@
-"""Versions of what numbers came from."""
+"""Versions of the software behind the results."""
 
 import contextlib
 import importlib.metadata
@@ -24,8 +24,9 @@ def version() -> str:
 
 
 def versions() -> dict[str, str]:
-    """The versions of Python and of the packages that numbers depend on."""
-    # Of the installed distributions: not every package has a __version__, and none is imported.
+    """Return the versions of Python and of the packages that affect numbers."""
+    # Read the metadata of installed distributions. Some packages have no __version__, and this
+    # imports none.
     packages = {}
     for name in _PACKAGES:
         # llvmlite is an extra.
@@ -35,7 +36,7 @@ def versions() -> dict[str, str]:
 
 
 def changed_since(old: Mapping[str, str]) -> str:
-    """Say which versions differ from those that work was begun with; empty where none does."""
+    """Return the versions that have changed since the work began, in words; empty if none has."""
     changed = [f"{n} {old[n]} then, {v} now" for n, v in versions().items() if old.get(n, v) != v]
     return f"begun with other versions ({', '.join(changed)}): last digits may differ" * bool(
         changed

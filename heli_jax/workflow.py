@@ -1,7 +1,7 @@
-"""A whole analysis as functions, for a script, a notebook and the command line alike.
+"""Complete analyses as functions, for scripts, notebooks and the command line.
 
 `load_config` reads a configuration; `run_fit` does what `heli-jax fit` does, `run_check` what
-`heli-jax check` does. `load_fit` reads what an earlier fit wrote.
+`heli-jax check` does. `load_fit` reads an earlier fit.
 """
 
 import shutil
@@ -34,42 +34,42 @@ from heli_jax.report.files import SupplementaryAnalyses
 from heli_jax.stages import Note, recorded, stage
 from heli_jax.yaml_file import as_yaml
 
-# Words for people as the work goes on. A function and not a logger, which a notebook would have to
-# set up and the command line to capture.
+# Receives progress messages. A logger would have to be set up in notebooks and captured by the
+# command line.
 type Say = Callable[[str], None]
 
 
-# A function of its own, so that the default of `progress` has a name in help().
+# A named function, so that help() shows the default of `progress`.
 def _silent(_: str) -> None:
     pass
 
 
 @dataclass(frozen=True, eq=False)
 class FitRun:
-    """A fit with all that its configuration asks for beside it."""
+    """A fit with all results that its configuration asks for."""
 
     config: Experiment
     problem: Problem
     fit: Fit
     baseline: Baseline | None = None
-    """the recursive least squares on the same data; None where it is off or has none to give"""
+    """Recursive least squares on the same data; None if it is off or fails."""
     supplementary: SupplementaryAnalyses = field(default_factory=SupplementaryAnalyses)
-    """model selection and further intervals, where the configuration asks for them"""
+    """Model selection and further intervals, if the configuration asks for them."""
     directory: Path | None = None
-    """where the report is, once it is written"""
+    """Directory of the report, once it is written."""
     began: float = field(default_factory=time.perf_counter)
-    """when the work began, by `time.perf_counter` [s]"""
+    """Start of the work, by `time.perf_counter` [s]."""
 
-    # Drawn anew each time: a figure that is kept could be changed by who got it before. Any, since
-    # matplotlib's classes are named in `report` alone.
+    # Each call draws a new figure, since a caller could change a stored one. Any, since only
+    # `report` imports matplotlib.
     def figure(self, name: str) -> Any:
-        """A figure of the report, drawn anew, as a matplotlib Figure: `response_OUTPUT`,
+        """Draw a figure of the report as a matplotlib Figure: `response_OUTPUT`,
         `match_OUTPUT-INPUT`, `rls`, ...
 
         Raises:
-            ValueError: the report has no figure of that name; the sentence lists those it has.
+            ValueError: the report has no figure of that name; the message lists the names.
         """
-        # Here, since matplotlib takes a second, and a fit without report needs none of it.
+        # matplotlib takes a second to import, and a fit without report does not need it.
         from heli_jax.report.fit_page import Analysis, drawings
         from heli_jax.report.style import styled
 
@@ -92,12 +92,12 @@ def load_config(path: str | Path, overrides: Sequence[str] | Mapping[str, Any] =
     """Read and validate a configuration, its model and its vehicle; no log is opened yet.
 
     Args:
-        path: the configuration (YAML); paths in it begin at its folder.
-        overrides: values in place of the file's: `{"fit.free.a.start": 5}`, or as on the command
-            line, `["fit.free.a.start=5"]`.
+        path: the configuration (YAML); paths in it are relative to its folder.
+        overrides: replacements for values of the file: `{"fit.free.a.start": 5}`, or as on the
+            command line, `["fit.free.a.start=5"]`.
 
     Raises:
-        InputError: anything in the file or an override is wrong.
+        InputError: the file or an override is wrong.
     """
     return configuration.load(path, overrides)
 
@@ -109,21 +109,21 @@ def run_fit(
     progress: Say = _silent,
     began: float | None = None,
 ) -> FitRun:
-    """Fit a configuration's flights, with baseline, intervals and model selection as it asks.
+    """Fit a configuration's flights, with the baseline, intervals and model selection it asks for.
 
     Args:
-        config: of `load_config`, or the path of a configuration.
-        out: directory for the report, as of `write_report`; none is written unless given.
-        progress: called with what the log's reader assumed and what is going on, in words.
-        began: when the work began, by `time.perf_counter` [s]; now unless given.
+        config: result of `load_config`, or the path of a configuration.
+        out: directory for the report (see `write_report`); default: no report.
+        progress: called with progress messages and the assumptions of the log's reader.
+        began: start of the work, by `time.perf_counter` [s]; default: now.
 
     Raises:
-        InputError: a log or something of the configuration is wrong, a log is too slow for the
-            model at its start values (docs/enough.md), or `out` cannot be written.
+        InputError: a log or the configuration is wrong, a log is too slow for the model at its
+            start values (docs/enough.md), or `out` cannot be written.
     """
     began = time.perf_counter() if began is None else began
     if out is not None:
-        out = run_directory.free_directory(Path(out))  # before the work, not after it
+        out = run_directory.free_directory(Path(out))  # fails before the work, not after it
     with recorded() as seconds:
         seconds["loading"] = time.perf_counter() - began
         run = _fit_run(config, progress, began, out)
@@ -136,13 +136,13 @@ def run_fit(
 
 
 class NotWritten(InputError):
-    """A fit is done and its run directory cannot be written; `run` has the fit."""
+    """Error of a run directory that cannot be written; `run` holds the complete fit."""
 
     run: FitRun
 
 
 def _written(run: FitRun, out: Path, progress: Say) -> FitRun:
-    """The run with its directory: that of a moment before, or a new one."""
+    """Return the run with its directory written: the existing one, or a new one."""
     before = run.directory
     try:
         written = _write(run, before or out, replaces=before is not None)
@@ -159,24 +159,26 @@ def _written(run: FitRun, out: Path, progress: Say) -> FitRun:
 def _fit_run(
     config: Experiment | str | Path, progress: Say, began: float, out: str | Path | None
 ) -> FitRun:
-    """`run_fit` without its report; before intervals that take long, that of the fit alone."""
+    """Run `run_fit` without its final report. Before slow intervals, write a report of the fit
+    alone.
+    """
     with stage("reading the log", name="reading"):
         config = config if isinstance(config, Experiment) else load_config(config)
-        # One fit of it alone would look like the study's result.
+        # A fit that ignores the study would look like the study's result.
         if config.config.study is not None:
             raise InputError(
                 f"{config.path}: study: asks for many fits, expected heli_jax.run_study, or "
                 "study: null"
             )
         problem = configuration.problem(config)
-    # Before the fit, so that a unit or a hold taken wrongly is seen while the fit runs.
+    # Report before the fit, so that a wrong unit or hold is seen while the fit runs.
     for said in reading_notes(problem):
         progress(Note(said.sentence))
     options = config.config.fit
-    assert options is not None  # `problem` refuses a configuration without
-    # `fit` knows no file, and its sentence needs one
+    assert options is not None  # `problem` refuses a configuration without fit
+    # `fit` does not know the file that its messages need
     with located(f"{config.path}: fit"):
-        # Refused as by `check`: its estimates would look like any others.
+        # Refuse as `check` does. The estimates would look valid.
         for finding in rates(problem):
             if finding.severity == "refuse":
                 raise ValueError(finding.sentence)
@@ -204,12 +206,13 @@ def _fit_run(
 
 
 def _keep(run: FitRun, out: Path, progress: Say) -> Path | None:
-    """Write a fit before further intervals are sought, so that an interrupt does not lose it;
-    returns its directory."""
+    """Write a fit before further intervals are computed, so that an interrupt does not lose it.
+    Return its directory.
+    """
     words = (
         "The run was interrupted: the requested profile, bootstrap or NUTS intervals are missing."
     )
-    # Its own times: the run's go on.
+    # The copy has its own times, since those of the run continue.
     findings = (*run.fit.findings, note("uncertainty.interrupted", words))
     fitted = replace(run.fit, findings=findings, timing=dict(run.fit.timing))
     with stage("writing the fit", name="report before further intervals"):
@@ -219,14 +222,14 @@ def _keep(run: FitRun, out: Path, progress: Say) -> Path | None:
 
 
 def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Check:
-    """Judge what a configuration's flights can determine, before any fit.
+    """Analyse the identifiability for a configuration's flights, before any fit.
 
     Args:
-        config: of `load_config`, or the path of a configuration.
-        progress: called with what the log's reader assumed, in words.
+        config: result of `load_config`, or the path of a configuration.
+        progress: called with the assumptions of the log's reader.
 
     Raises:
-        InputError: a log or something of the configuration is wrong.
+        InputError: a log or the configuration is wrong.
     """
     config = config if isinstance(config, Experiment) else load_config(config)
     problem = configuration.problem(config)
@@ -238,13 +241,13 @@ def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Ch
 
 
 def reading_notes(problem: Problem) -> list[Finding]:
-    """Notes of the logs' readers, and on the origin of starts that were found."""
+    """Return the notes of the logs' readers, and notes on the origin of estimated start values."""
     guess = problem.first_guess
     return once((*log_notes(problem), *(guess.findings if guess else ())))
 
 
 def log_notes(problem: Problem) -> list[Finding]:
-    """Notes of the logs' readers; each sentence begins with its log."""
+    """Return the notes of the logs' readers; each sentence begins with its log."""
     notes = []
     for flight in problem.flights:
         where = flight.source.path if flight.source else flight.name
@@ -257,10 +260,10 @@ def log_notes(problem: Problem) -> list[Finding]:
                 name,
             )
             for name, reason in flight.hold_reason.items()
-            # Held inputs are what a reader expects of a stick, and need no word.
+            # Readers expect held sticks, so these need no note.
             if flight.hold[name] != "zero-order"
         ]
-    # Several flights may be windows of one log: what is the same for all of them is said once.
+    # Flights may be windows of one log, so repeated notes are removed.
     return once(notes)
 
 
@@ -269,13 +272,13 @@ def _baseline(config: Experiment, problem: Problem, fitted: Fit, progress: Say) 
     if options is None:
         return None
     progress("recursive least squares")
-    # A baseline that fails must not cost the fit: too short a record, or a model that has none.
+    # A failed baseline must not stop the fit. The record may be too short, or the model unsuitable.
     estimate = None
     try:
         estimate = baseline(
             config.model,
             config.vehicle.params,
-            problem.training[0],  # RLS takes one record; the paper has no other
+            problem.training[0],  # RLS takes one record, as in the paper
             order=options.order,
             forgetting=options.forgetting,
         )
@@ -287,7 +290,7 @@ def _baseline(config: Experiment, problem: Problem, fitted: Fit, progress: Say) 
 def _supplementary(
     config: Experiment, problem: Problem, fitted: Fit, progress: Say
 ) -> SupplementaryAnalyses:
-    """Further intervals and model selection, where the configuration asks for them."""
+    """Compute further intervals and model selection, if the configuration asks for them."""
     options = config.config.fit
     assert options is not None
     asked, further, choice, methods = options.intervals, None, None, None
@@ -301,7 +304,7 @@ def _supplementary(
                 seed=options.seed,
                 progress=progress,
             )
-    # Each its own stage, as profiles, bootstrap and NUTS are: any of them may be what takes long.
+    # Each is a stage of its own, since any of them may take long.
     if options.compare:
         with stage("other models"):
             choice = compare_models(config, problem, progress=progress)
@@ -321,34 +324,34 @@ def _supplementary(
 def compare_models(
     config: Experiment | str | Path, problem: Problem | None = None, *, progress: Say = _silent
 ) -> Choice:
-    """Fit the models that `fit.compare` puts beside a configuration's own, and compare them by
-    likelihood ratio, AIC and BIC.
+    """Fit the models of `fit.compare` and the configuration's own, and compare them by likelihood
+    ratio, AIC and BIC.
 
     Args:
-        config: of `load_config`, or the path of a configuration.
-        problem: the configuration's problem where it is at hand (`FitRun.problem`), so that the
-            logs need not be read again.
-        progress: called with what is going on, in words.
+        config: result of `load_config`, or the path of a configuration.
+        problem: the configuration's problem if it exists (`FitRun.problem`), which saves reading
+            the logs again.
+        progress: called with progress messages.
 
     Raises:
         InputError: no axis of the model can be disturbed, or a model cannot be fitted.
     """
     config = config if isinstance(config, Experiment) else load_config(config)
-    # All share the fitted problem's flights: likelihoods of different data do not compare.
+    # All models use the same flights, since likelihoods of different data are not comparable.
     candidates = configuration.candidate_models(config, problem or configuration.problem(config))
     with located(f"{config.path}: fit"):
         return choose(candidates.problems, candidates.nested, progress=progress)
 
 
 def write_report(run: FitRun, out: str | Path) -> FitRun:
-    """Write a fit's run directory: config.yaml, fit.json, signals.csv, report.html, figures/; and
-    posterior.nc and bootstrap.nc where there are draws of NUTS and samples of the bootstrap.
+    """Write a fit's run directory: config.yaml, fit.json, signals.csv, report.html, figures/.
 
-    The directory appears whole or not at all. Returns the run with `directory` set: `out`, or where
-    that exists a numbered sibling, with a warning.
+    It also writes posterior.nc and bootstrap.nc if there are NUTS draws and bootstrap samples. The
+    directory appears complete or not at all. Returns the run with `directory` set to `out`, or to a
+    numbered sibling, with a warning, if `out` exists.
 
     Args:
-        run: of `run_fit`.
+        run: result of `run_fit`.
         out: the directory.
 
     Raises:
@@ -360,15 +363,14 @@ def write_report(run: FitRun, out: str | Path) -> FitRun:
 
 
 def _write(run: FitRun, out: Path, *, replaces: bool = False) -> FitRun:
-    """The run directory, in place of that of an earlier moment of this run where it `replaces`
-    one."""
+    """Write the run directory; `replaces` overwrites the earlier one of this run."""
     from heli_jax.report.fit_page import Analysis
     from heli_jax.report.fit_page import write_report as write_page
     from heli_jax.report.origin import origin
     from heli_jax.report.sample_files import sample_files, write_samples
 
     started = time.perf_counter()
-    # Before the figures: a configuration that cannot be written out fails at once.
+    # Before the figures, since a configuration that cannot be written fails at once.
     text = as_yaml(configuration.resolved(run.config))
     vehicle, extra = run.config.vehicle, _with_responses(run)
     with run_directory.whole(out, replaces=replaces, or_beside=not replaces) as folder:
@@ -383,7 +385,7 @@ def _write(run: FitRun, out: Path, *, replaces: bool = False) -> FitRun:
         png = run.config.config.report.png
         write_page(folder, analysis, title, vehicle.constants, made, png=png)
         run.fit.timing["report"] = time.perf_counter() - started
-        # fit.json comes last, since it holds how long all the rest took.
+        # fit.json comes last, since it holds the times of all other steps.
         run.fit.timing["total"] = time.perf_counter() - run.began
         content = files.fit_json(run.fit, run.problem, run.baseline, extra)
         files.write_json(folder / "fit.json", content)
@@ -391,7 +393,7 @@ def _write(run: FitRun, out: Path, *, replaces: bool = False) -> FitRun:
 
 
 def _with_responses(run: FitRun) -> SupplementaryAnalyses:
-    """The supplementary analyses with those of the frequency domain, which only a report shows."""
+    """Return the supplementary analyses with frequency responses, which only a report needs."""
     if run.supplementary.responses is not None:
         return run.supplementary
     from heli_jax.report.fitted_responses import fitted_responses

@@ -1,4 +1,4 @@
-"""YAML files, read with care: plain data alone, every key once, numbers as YAML 1.2 has them."""
+"""Safe YAML reader: plain data, unique keys, and numbers as in YAML 1.2."""
 
 import re
 from collections.abc import Mapping
@@ -10,19 +10,20 @@ import yaml
 from heli_jax.errors import InputError
 from heli_jax.regular_file import read_regular
 
-# A configuration has some hundred keys in five levels. Past these limits a file is a mistake or a
-# trap: nine aliases of nine aliases of ... fill any memory from twelve lines.
+# A configuration has about a hundred keys in five levels. A larger file is a mistake or an attack:
+# nested aliases of twelve lines can fill any memory.
 _LIMIT_BYTES = 1_000_000
 _LIMIT_NODES = 100_000
 _LIMIT_DEPTH = 40
 EDIT = "EDIT"
-"""stands in a file that was written for the user where only the user knows the number: no file with
-it is accepted"""
+"""Placeholder in a generated file for a number that only the user knows. Files that contain it are
+refused.
+"""
 _LONGEST_KEY = 200
-"""characters: a message that names a key stays a sentence"""
+"""Longest key that a message can name [characters]."""
 
 
-# libyaml where it is there: the parser in Python takes seconds for a large mapping.
+# libyaml if available, since the Python parser takes seconds for a large mapping.
 _Base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
@@ -31,8 +32,8 @@ class _Loader(_Base):
 
 
 # YAML 1.1, which PyYAML follows, reads 1e-4 as text (it wants 1.0e-4), `on` and `no` as booleans
-# and 1:30 as ninety. All its rules but those for null and << go, and those of YAML 1.2's core
-# schema take their place.
+# and 1:30 as ninety. Only its rules for null and << stay; the core schema of YAML 1.2 replaces the
+# others.
 _Loader.yaml_implicit_resolvers = {
     first: [(tag, rx) for tag, rx in resolvers if tag.rsplit(":", 1)[-1] in ("null", "merge")]
     for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
@@ -45,7 +46,8 @@ _Loader.add_implicit_resolver(
 )
 _Loader.add_implicit_resolver(
     "tag:yaml.org,2002:float",
-    # Also integers of more than 18 digits and with leading zeros, which the rule above leaves.
+    # Includes integers of more than 18 digits and with leading zeros, which the rule above
+    # excludes.
     re.compile(
         r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
         r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
@@ -55,16 +57,15 @@ _Loader.add_implicit_resolver(
 
 
 def read_mapping(path: str | Path) -> dict[str, Any]:
-    """The mapping that a YAML file holds.
+    """Return the mapping in a YAML file.
 
     Raises:
-        InputError: no such file, no regular file of at most 1 MB, no text, no YAML, not a mapping,
-            a key twice, or more nested or larger (aliases written out) than any configuration
-            would be.
+        InputError: the file does not exist, is no regular file of at most 1 MB, no text, no YAML or
+            no mapping, has a key twice, or is too large or too deeply nested (aliases expanded).
     """
     data = read_regular(path, "a YAML file (a configuration or a vehicle)", _LIMIT_BYTES)
     try:
-        text = data.decode("utf-8-sig")  # Windows editors put a byte-order mark first
+        text = data.decode("utf-8-sig")  # Windows editors may add a byte-order mark
     except UnicodeDecodeError as e:
         raise InputError(f"{path}: is not text, expected a YAML file") from e
     return parse_mapping(text, str(path))
@@ -74,27 +75,27 @@ _KINDS: dict[type, str] = {str: "text", list: "a list", int: "a number", float: 
 
 
 def parse_mapping(text: str, where: str) -> dict[str, Any]:
-    """Parse a text as `read_mapping` does; `where` stands for the file's name."""
+    """Parse a text as `read_mapping` does; `where` replaces the file's name."""
     value = parse_value(text, where)
     if not isinstance(value, dict):
         kind = "nothing" if value is None else _KINDS.get(type(value), "something else")
-        # A log begins with a row of words, which is YAML for one text.
+        # The first row of a log is words, which YAML reads as one text.
         log = "; of a log `heli-jax new LOG` makes a configuration" if "," in text[:200] else ""
         raise InputError(f"{where}: expected keys with values, got {kind}{log}")
     return value
 
 
 def as_yaml(content: Mapping[str, Any]) -> str:
-    """Plain data as YAML, in its own order."""
+    """Return plain data as YAML, in its own order."""
     return yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True)
 
 
 def parse_value(text: str, where: str) -> Any:
-    """One value as it would stand behind a key: for `--set key=value`."""
+    """Return one value, parsed as after a key, for `--set key=value`."""
     loader = None
     try:
-        # Before the parser: it recurses in C, and enough brackets overflow its stack, which no
-        # handler of exceptions sees.
+        # Check before the parser, which recurses in C. Many brackets overflow its stack, which no
+        # exception handler can catch.
         if _deepest(text) > _LIMIT_DEPTH:
             raise InputError(
                 f"{where}: expected at most {_LIMIT_DEPTH} levels, got data nested deeper"
@@ -103,8 +104,7 @@ def parse_value(text: str, where: str) -> Any:
         node = loader.get_single_node()
         if node is None:
             return None
-        # Nodes, not values: they still have lines, doubled keys and aliases that are not written
-        # out.
+        # Nodes still have line numbers, duplicate keys and unexpanded aliases; values do not.
         _inspect(node, where, 0, set(), [0])
         return loader.construct_document(node)
     except yaml.MarkedYAMLError as e:
@@ -112,7 +112,8 @@ def parse_value(text: str, where: str) -> Any:
         line = f", line {mark.line + 1}" if mark else ""
         problem = " ".join(str(e.problem or e.context or "broken").split())
         raise InputError(f"{where}{line}: {problem}; expected plain YAML") from e
-    # Constructors raise many kinds for a tag with a wrong value (!!int x, !!timestamp 2024-13-45).
+    # Constructors raise many exception types for a tag with a wrong value (!!int x, !!timestamp
+    # 2024-13-45).
     except (
         yaml.YAMLError,
         ValueError,
@@ -132,7 +133,7 @@ def parse_value(text: str, where: str) -> Any:
 
 
 def _deepest(text: str) -> int:
-    """A bound on the nesting, found before the parser recurses into it."""
+    """Return an upper bound of the nesting, before the recursive parser starts."""
     depth = most = 0
     for character in text:
         if character in "[{":
@@ -140,14 +141,14 @@ def _deepest(text: str) -> int:
             most = max(most, depth)
         elif character in "]}":
             depth -= 1
-    # Block style nests by indents and by dashes; each width of indent is a level at most.
+    # Indents and dashes nest in block style; each width of indent is at most one level.
     indents = {len(line) - len(line.lstrip(" ")) for line in text.splitlines() if line.strip()}
     dashes = max((len(m.group()) // 2 for m in re.finditer(r"(?:- )+", text)), default=0)
     return max(most, len(indents), dashes)
 
 
 def _inspect(node: Any, where: str, depth: int, above: set[int], count: list[int]) -> None:
-    """Refuse doubled keys, cycles, and aliases that blow up when they are written out."""
+    """Refuse duplicate keys, cycles, and aliases that grow too large when expanded."""
     count[0] += 1
     if count[0] > _LIMIT_NODES or depth > _LIMIT_DEPTH or id(node) in above:
         line = node.start_mark.line + 1
@@ -155,7 +156,7 @@ def _inspect(node: Any, where: str, depth: int, above: set[int], count: list[int
             f"{where}, line {line}: expected at most {_LIMIT_NODES} values in {_LIMIT_DEPTH} "
             "levels and no alias within itself, got more"
         )
-    # A new set for each branch: the same alias beside itself is no cycle, within itself it is one.
+    # Each branch has its own set: an alias within itself is a cycle, but one beside itself is not.
     above = above | {id(node)}
     if isinstance(node, yaml.MappingNode):
         seen = set()
@@ -170,8 +171,7 @@ def _inspect(node: Any, where: str, depth: int, above: set[int], count: list[int
                     f"{where}, line {line}: expected a key of at most {_LONGEST_KEY} characters, "
                     f"got {len(key.value)}"
                 )
-            # YAML takes the last of two silently: the first, perhaps the one that is meant, is
-            # lost.
+            # YAML silently takes the last of two equal keys, but the first may be the intended one.
             if key.value in seen and key.value != "<<":
                 raise InputError(
                     f"{where}, line {line}: expected each key once, got {key.value!r} twice"

@@ -1,10 +1,10 @@
-"""A bootstrap as one program of machine code beside the same by XLA: `python
-experiments/benchmarks/batched_fits.py`.
+"""A bootstrap as one fused program compared with XLA:
+`python experiments/benchmarks/batched_fits.py`.
 
-Records of the bench's roll model, 60 s at 50 Hz, are fitted anew from the optimum: three
+Records of the bench's roll model, 60 s at 50 Hz, are fitted again from the optimum: three
 parameters, the initial state and a bias, with exact steps and with RK4. Both ways run in turn in
-this process, after one of each that compiles. Times are a record's, of all cores that the process
-may use; the estimates have to agree.
+this process, after one run of each that compiles. Times are per record, on all cores that the
+process may use. The estimates must agree.
 """
 
 import sys
@@ -26,11 +26,11 @@ jax.config.update("jax_enable_x64", True)
 VEHICLE = load_vehicle(Path(__file__).parents[2] / "configs" / "vehicles" / "bench-30.yaml")
 N, DT, FUSED, XLA = 3000, 0.02, 1000, 64
 TURNS = 3
-"""of which the best counts"""
+"""Number of runs; the best counts."""
 
 
 def fitted(**how: Any) -> Fit:
-    """The record that all others are simulated like."""
+    """Fit the record from which all others are simulated."""
     rng = np.random.default_rng(0)
     u = 3e-6 * np.repeat(rng.uniform(-1, 1, N // 25), 25)
     num, den = roll_transfer_function(VEHICLE, stand=True)
@@ -43,7 +43,9 @@ def fitted(**how: Any) -> Fit:
 
 
 def timed(fit: Fit, runs: int, least: int) -> tuple[float, Bootstrap]:
-    """Seconds a record, and what was found; `least` runs are worth a program of machine code."""
+    """Return seconds per record, and the result; with `least` runs or more the fused program is
+    used.
+    """
     many_runs._MANY = least
     begin = time.perf_counter()
     found = bootstrap(fit, runs)

@@ -1,10 +1,10 @@
-"""The R-50's likelihood with Fisher's information by the exact filter and by the one that freezes.
+"""The R-50's likelihood and Fisher information from the exact filter and from one with frozen gain.
 
     .venv/bin/python experiments/benchmarks/filter.py
 
 12,000 samples in four records, 19 states, 8 outputs, 47 unknowns (33 derivatives, 6 intensities of
-the turbulence, 8 noises; with the correlation times 53), on one thread, cold and warm, side by side
-in one process without a cache of compiled programs. The target: 0.5 s warm, 20 s cold.
+the turbulence, 8 noises; with the correlation times 53). On one thread, cold and warm, in one
+process without a cache of compiled programs. The target: 0.5 s warm, 20 s cold.
 """
 
 import dataclasses
@@ -32,16 +32,16 @@ from heli_jax.identification.unknowns.layout import Layout, Noise, layout_of
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_enable_compilation_cache", False)
 TURNS = 3
-"""of which the best counts"""
+"""Number of runs; the best counts."""
 
 
 class Timed(NamedTuple):
-    """A way to the likelihood, compiled and run."""
+    """One way to compute the likelihood, compiled and run."""
 
     cold: float
-    """[s], traced and compiled"""
+    """Time with trace and compilation [s]."""
     warm: float
-    """[s], the best of `TURNS`"""
+    """Best time of `TURNS` [s]."""
     cost: float
     gradient: np.ndarray
     fisher: np.ndarray

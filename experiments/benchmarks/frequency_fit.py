@@ -1,14 +1,13 @@
-"""How long a fit in frequency takes once it is compiled: the bench, and the R-50 in closed loop.
+"""Time of a compiled fit in the frequency domain: the bench, and the R-50 in closed loop.
 
     .venv/bin/python experiments/benchmarks/frequency_fit.py [RUNS]
 
 The bench of experiments/frequency_error.py (one record of 6000 samples, three parameters) and the
 R-50 of experiments/closed_loop_frequency.py (four records of 4500 samples, six outputs, 22
-parameters) directly and by instrument. On one thread, the best of RUNS (5), records in turn: none
-is fitted twice in a row. Search: from the flights to estimates that stay, with the noise's
-spectrum and their covariance. Whole: with everything that `fit` says of them and of the records.
-Processor time, beside it the time that passed, which other load adds to. The targets: 30 ms for the
-bench, 0.5 s for the R-50.
+parameters), directly and with instruments. On one thread, the best of RUNS (5); no record is fitted
+twice in a row. Search: from the flights to converged estimates, with the noise's spectrum and their
+covariance. Whole: with all results of `fit`. Times are processor time and elapsed time, to which
+other load adds. The targets: 30 ms for the bench, 0.5 s for the R-50.
 """
 
 import os
@@ -46,24 +45,24 @@ jax.monitoring.register_event_duration_secs_listener(listen)
 
 
 class Took(NamedTuple):
-    """One fit."""
+    """Times of one fit."""
 
     search: float
-    """[s] of processor time"""
+    """Processor time [s]."""
     search_passed: float
-    """[s] that passed"""
+    """Elapsed time [s]."""
     whole: float
     whole_passed: float
     steps: int
     programs: int
-    """compiled on the way"""
+    """Number of compiled programs."""
 
 
 def search(problem: Problem) -> None:
-    """Estimates with covariance, as `fit` finds them from one start, and nothing else."""
+    """Compute estimates with covariance, as `fit` does from one start, and nothing else."""
     guess = first_guess(problem)
     over = Search(problem, guess.layout, guess.data, 200)
-    # Data of the first search are others by instrument, as in `fit`.
+    # With instruments the first search uses other data, as in `fit`.
     first = Search(problem, guess.layout, guess.begun, 200)
     [begun] = first.run(guess.noise, guess.z[None])
     found = relax_noise_covariance(over, guess.noise, begun)
@@ -76,7 +75,7 @@ def timed(problem: Problem) -> Took:
     times = [(time.process_time(), time.perf_counter())]
     search(problem)
     times.append((time.process_time(), time.perf_counter()))
-    # One start: where delays are free several would be tried, each as long as this.
+    # One start: with free delays several would be tried, each as long as this.
     found = fit(problem, starts=1)
     times.append((time.process_time(), time.perf_counter()))
     assert found.status == "converged", found.status

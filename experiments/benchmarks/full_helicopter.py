@@ -1,7 +1,7 @@
-"""Speed of the variant `full` against the same equations in C, as `helicopter.py` has the other.
+"""Speed of the variant `full` compared with the same equations in C, as in `helicopter.py`.
 
-Flapping, tail force and power, and governor: from hover, 10 s at 50 Hz, RK4 with 4 steps a
-sample, small steps of all sticks, 1024 vehicles that differ in Ixx, on one core.
+Flapping, tail force and power, and governor: from hover, 10 s at 50 Hz, RK4 with 4 steps a sample,
+small steps of all sticks, 1024 vehicles that differ in Ixx, on one core.
 """
 
 import sys
@@ -15,12 +15,12 @@ from heli_jax import models
 
 MODEL = models.helicopter()
 IN_C = (*consistent.IN_C, "I_beta", "k_beta", "K_mu", "h_T", "K_P", "K_I", "Omega")
-"""The vehicle's constants in the order of the C kernel's."""
+"""The vehicle's constants in the order of the C kernel."""
 STICK_STEPS = {
     "x_roll": 2e-4, "x_pitch": 2e-4, "x_yaw": 0.02, "x_collective": 0.01, "x_throttle": 0.0,
 }  # fmt: skip
 TURNS = 5
-"""by which each pair is timed"""
+"""Repetitions of each pair."""
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
-"""Sweeps on a GPU by XLA beside the processor, by batch and precision.
+"""Sweeps on a GPU by XLA compared with the processor, by batch and precision.
 
-Whole batches of the roll model and of the whole helicopter, the compiled part alone: by XLA on the
-GPU, and on the processor by XLA and by the fused kernel. Without a GPU it ends with a sentence.
+It runs the compiled part of batches of the roll model and of the whole helicopter: on the GPU by
+XLA, and on the processor by XLA and by the fused kernel. Without a GPU it ends with a message.
 
     .venv/bin/python experiments/benchmarks/gpu_sweeps.py [--quick] [SAMPLES]
 """
@@ -31,7 +31,7 @@ BATCHES = (1000, 10_000, 100_000, 1_000_000)
 
 
 def described(name: str, solver: str, precision: Any, samples: int, n: int) -> Job:
-    """A sweep over Ixx, of the roll model on its stand or of a whole helicopter."""
+    """Return a sweep over Ixx, of the roll model on its stand or of a whole helicopter."""
     stand = name == "roll"
     model = models.roll_on_stand if stand else models.by_name(name)
     file, Ixx = ("bench-30.yaml", (0.02, 0.05)) if stand else ("x-cell-60.yaml", (0.15, 0.25))
@@ -54,7 +54,7 @@ def cases() -> Iterator[tuple[str, str, str]]:
 
 
 def timed(kind: Any, wanted: Job, n: int, platform: str) -> float:
-    """The least seconds of three batches, after one that compiles."""
+    """Return the least time of three batches [s], after one that compiles."""
     devices = jax.devices(platform)
     program = kind(wanted, 0, devices[:1] if platform != "cpu" else devices, n // len(devices))
     values = arguments(wanted, wanted.design.values(0, n))

@@ -1,12 +1,12 @@
-"""Speed of the whole helicopter against C and SciPy, side by side in one run.
+"""Speed of the whole helicopter compared with C and SciPy in one run.
 
 The consistent model from hover, 10 s at 50 Hz, RK4 with 4 steps a sample, small steps of all
-sticks: against the same equations in C and in SciPy, and its derivatives against itself.
+sticks. It is compared with the same equations in C and in SciPy, and its derivatives with the
+simulation itself.
 
-Everything is on one core, by the affinity of the process before JAX starts, so that JAX has one
-thread as the C kernel has. Times are CPU seconds of the process, in which other load on the machine
-counts least; each pair is run in turn, and the figures are the medians of the times and of the
-ratios. Compilation is from the trace to the machine code.
+All programs run on one core, set by the process affinity before JAX starts, so that JAX has one
+thread like the C kernel. Times are CPU seconds, which other load affects least. Each pair runs in
+turn, and the numbers are medians of times and ratios. Compilation covers trace to machine code.
 """
 
 import ctypes
@@ -42,12 +42,12 @@ VEHICLE = load_vehicle(Path(__file__).parents[2] / "configs" / "vehicles" / "x-c
 MODEL = models.helicopter("consistent")
 N, DT, SUBSTEPS = 500, 0.02, 4
 TURNS = 9
-"""by which each pair is timed"""
+"""Repetitions of each pair."""
 VEHICLES, BLOCK = 1024, 128
 JACOBIAN_BLOCK = 8
-"""Vehicles side by side in a Jacobian, each with its twelve directions: what the caches hold."""
+"""Vehicles per block of a Jacobian, each with twelve directions; limited by the caches."""
 LANES = (8, 16, 32)
-"""Vehicles in flight at once in C: which is best depends on the processor."""
+"""Vehicles per vector in C; the best number depends on the processor."""
 IXX = np.linspace(0.8, 1.25, VEHICLES) * float(VEHICLE.Ixx)
 STICK_STEPS = {"x_roll": 2e-4, "x_pitch": 2e-4, "x_yaw": 0.02, "x_throttle": 0.01}
 FREE = (
@@ -58,16 +58,16 @@ IN_C = (
     "L_T", "K_Omega", "K_theta0", "K_theta0T", "K_throttle", "If", "R1", "R2",
     "L1", "L2", "L3", "L4", "L5", "Sx", "Sy", "Sz",
 )  # fmt: skip
-"""The vehicle's constants in the order of the C kernel's."""
+"""The vehicle's constants in the order of the C kernel."""
 
 
 class Run(NamedTuple):
-    """What all programs start from."""
+    """Common start of all programs."""
 
     start: Any
-    """the state in hover"""
+    """State in hover."""
     inputs: Any
-    """the sticks of hover with steps of half a second, one stick after another; arrays (N,)"""
+    """Sticks of hover with steps of half a second, one stick after another; arrays (N,)."""
 
 
 def hover_and_steps(model: Model = MODEL, stick_steps: dict[str, float] = STICK_STEPS) -> Run:
@@ -81,7 +81,7 @@ def hover_and_steps(model: Model = MODEL, stick_steps: dict[str, float] = STICK_
 
 
 def compile_time(f: Callable[..., Any], *args: Any) -> tuple[Callable[..., Any], float]:
-    """The compiled function and how long it took [s]."""
+    """Return the compiled function and its compilation time [s]."""
     begin = time.process_time()
     program = jax.jit(f).lower(*args).compile()
     return program, time.process_time() - begin
@@ -90,7 +90,7 @@ def compile_time(f: Callable[..., Any], *args: Any) -> tuple[Callable[..., Any],
 def in_turn(
     ours: Callable[[], Any], theirs: Callable[[], Any], runs: int
 ) -> tuple[float, float, float]:
-    """Medians of both times [s], taken in turn, and of their ratio."""
+    """Return the medians of both times [s], measured in turn, and of their ratio."""
     times = []
     for f in [ours, theirs] * (runs + 1):
         begin = time.process_time()
@@ -104,7 +104,7 @@ def in_turn(
 
 
 def batch(run: Run, model: Model = MODEL) -> Callable[[Array], Array]:
-    """Sum of roll^2 of vehicles that differ in Ixx, in blocks, nothing else kept."""
+    """Return the sum of roll^2 of vehicles that differ in Ixx, in blocks, without storing runs."""
 
     def vehicle(Ixx: Array) -> Array:
         total, _ = accumulate(
@@ -125,7 +125,7 @@ def batch(run: Run, model: Model = MODEL) -> Callable[[Array], Array]:
 
 
 def fused(run: Run, model: Model = MODEL) -> Callable[[], np.ndarray]:
-    """The same batch as one program, as sweeps run it."""
+    """Return the same batch as one program, as in sweeps."""
 
     def steps(vehicle: Any, inputs: Any, Ixx: Any) -> Steps:
         options = SimulationOptions(
@@ -152,8 +152,9 @@ def fused(run: Run, model: Model = MODEL) -> Callable[[], np.ndarray]:
 def in_c(
     run: Run, source: str = "helicopter.c", constants: tuple[str, ...] = IN_C
 ) -> Callable[[], np.ndarray]:
-    """The same batch in C, by the fastest build; `constants` are the vehicle's, in the order of
-    the source's."""
+    """Return the same batch in C, with the fastest build; `constants` follow the order of the
+    source.
+    """
     builds = [
         built_in_c(run, source, constants, (f"-DLANES={lanes}", *width))
         for lanes in LANES
@@ -176,7 +177,7 @@ def processor_time(call: Callable[[], Any]) -> float:
 def built_in_c(
     run: Run, source: str, constants: tuple[str, ...], flags: tuple[str, ...]
 ) -> Callable[[], np.ndarray]:
-    """One build of the C kernel."""
+    """Return one build of the C kernel."""
     kernel = compiled(source, flags)
     vehicle = np.array([float(getattr(VEHICLE, n)) for n in constants])
     start = np.array([float(v) for v in run.start])
@@ -193,18 +194,18 @@ def built_in_c(
     return call
 
 
-# SciPy: the same equations once more, with NumPy's numbers as most people write them, and with
-# plain Python's, which is the fastest way for one vehicle.
+# SciPy: the same equations with NumPy's numbers, as usually written, and with plain Python's, which
+# are fastest for one vehicle.
 
 
 class Numbers(NamedTuple):
-    """What a right-hand side computes with."""
+    """Functions and conversions of a right-hand side."""
 
     sin: Any
     cos: Any
     sqrt: Any
     of: Any
-    """the state's numbers out of SciPy's array"""
+    """Conversion of SciPy's state array."""
     back: Any
 
 
@@ -213,7 +214,7 @@ PYTHON = Numbers(math.sin, math.cos, math.sqrt, lambda state: state.tolist(), la
 
 
 def induced_velocity(V2: Any, W: Any, T0: Any, b: Any, sqrt: Any) -> Any:
-    """The Newton steps of the package's inflow."""
+    """Return the induced velocity by the package's Newton steps."""
     sign = -1.0 if T0 < 0 else 1.0
     c, t = sign * W, sign * T0
     q = 2 * c + b
@@ -237,7 +238,7 @@ def induced_velocity(V2: Any, W: Any, T0: Any, b: Any, sqrt: Any) -> Any:
 
 
 def right_hand_side(v: dict[str, float], numbers: Numbers) -> Callable[..., Any]:
-    """rates(t, state, sticks) of a vehicle, its factors computed beforehand."""
+    """Return rates(t, state, sticks) of a vehicle, with precomputed factors."""
     (sin, cos, sqrt, of, back), pi, rho, B, R = numbers, math.pi, v["rho"], v["B"], v["R"]
     half = v["a"] * v["c"] / (pi * R)
     half_T, RK = v["a_T"] * v["c_T"] / (pi * v["R_T"]), v["R_T"] * v["K_Omega"]
@@ -309,7 +310,7 @@ def check_right_hand_side(run: Run) -> None:
 
 
 def by_samples(run: Run, numbers: Numbers) -> float:
-    """Sum of roll^2, one call of solve_ivp a sample, as an input held for it wants."""
+    """Return the sum of roll^2, with one call of solve_ivp per sample, as held inputs require."""
     rates, x = right_hand_side(first_vehicle(), numbers), np.array([float(v) for v in run.start])
     sticks = np.stack([np.asarray(u) for u in run.inputs], axis=1).tolist()
     cost = x[3] ** 2
@@ -320,7 +321,9 @@ def by_samples(run: Run, numbers: Numbers) -> float:
 
 
 def by_one_call(run: Run, numbers: Numbers) -> float:
-    """Sum of roll^2, one call with steps of at most a sample, the sticks looked up by time."""
+    """Return the sum of roll^2 from one call with steps of at most a sample; sticks are looked up
+    by time.
+    """
     rates, x = right_hand_side(first_vehicle(), numbers), np.array([float(v) for v in run.start])
     sticks = np.stack([np.asarray(u) for u in run.inputs], axis=1).tolist()
     times = DT * np.arange(N)
@@ -337,7 +340,7 @@ def by_one_call(run: Run, numbers: Numbers) -> float:
 
 
 def outputs(run: Run) -> Callable[[Array], Array]:
-    """The outputs (13, N) of a vehicle as a function of twelve of its parameters."""
+    """Return the outputs (13, N) of a vehicle as a function of twelve parameters."""
 
     def of(values: Array) -> Array:
         vehicle = replace(VEHICLE, **dict(zip(FREE, values, strict=True)))
@@ -353,7 +356,7 @@ def outputs(run: Run) -> Callable[[Array], Array]:
 def check_derivative(
     forward: Callable[[Array], Array], jacobian: Callable[[Array], Array], z: Array
 ) -> None:
-    """The column of m against a central difference."""
+    """Check the column of m against a central difference."""
     h = 1e-5 * z * (np.array(FREE) == "m")
     expected = (forward(z + h) - forward(z - h)) / (2 * h.sum())
     column = jacobian(z)[:, :, FREE.index("m")]

@@ -1,11 +1,10 @@
-"""Speed against hand-written programs, side by side in one run: `make bench`.
+"""Speed compared with hand-written programs in one run: `make bench`.
 
-Everything runs on one core (the process is pinned where the system allows), each pair in turn;
-the figure is the ratio of the best times, since other load on the machine only adds. The optimum
-is from the same start to the same optimum, the final Jacobian included on both sides; the whole
-of `fit` adds two verdicts, the noise, metrics, whiteness and tables, which SciPy does not give.
-Simulations count the discretisation of every vehicle, where the C kernel is handed its
-coefficients.
+All programs run on one core (the process is pinned if the system allows it), each pair in turn. The
+result is the ratio of the best times, since other load only adds. The optimum is searched from the
+same start, with the final Jacobian on both sides. The whole of `fit` adds two verdicts, the noise,
+metrics, whiteness and tables, which SciPy lacks. Simulations include the discretisation of every
+vehicle, while the C kernel is given its coefficients.
 """
 
 import ctypes
@@ -50,11 +49,11 @@ HERE = Path(__file__).parent
 VEHICLE = load_vehicle(HERE.parents[1] / "configs" / "vehicles" / "bench-30.yaml")
 N, DT, BATCH, BLOCK, SUBSTEPS = 6000, 0.02, 1024, 128, 4
 TURNS = 15
-"""by which each pair is timed"""
+"""Repetitions of each pair."""
 
 
 def closed_form(v: dict[str, float]) -> tuple[list[float], np.ndarray]:
-    """H(s) of eq. 23 on the stand in plain Python."""
+    """Return H(s) of eq. 23 on the stand in plain Python."""
     q = v["rho"] * v["Omega"] ** 2 * v["a"] * v["c"]
     k1 = q * (v["R2"] ** 4 - v["R1"] ** 4) / (8 * v["If"])
     k2 = q * v["R"] ** 4 / (2 * v["Ixx"] * v["L1"] * (v["L2"] + v["L3"]))
@@ -67,7 +66,7 @@ def closed_form(v: dict[str, float]) -> tuple[list[float], np.ndarray]:
 
 
 def bench_record() -> Flight:
-    """6000 samples at 50 Hz with 2 mrad of white noise."""
+    """Return 6000 samples at 50 Hz with 2 mrad of white noise."""
     rng = np.random.default_rng(0)
     u = 3e-6 * np.repeat(rng.uniform(-1, 1, N // 25), 25)
     num, den = roll_transfer_function(VEHICLE, stand=True)
@@ -78,7 +77,7 @@ def bench_record() -> Flight:
 
 
 def ratios(ours: Callable[[], Any], theirs: Callable[[], Any], times: int = 1) -> tuple[float, ...]:
-    """Best times of both [s], taken in turn, and their ratio."""
+    """Return the best times of both [s], measured in turn, and their ratio."""
     ours()
     theirs()
     best = [np.inf, np.inf]
@@ -91,7 +90,9 @@ def ratios(ours: Callable[[], Any], theirs: Callable[[], Any], times: int = 1) -
 
 
 def fit_against_scipy(flight: Flight) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """The optimum from the same start, and the whole of `fit`, against SciPy's optimum."""
+    """Return the optimum from the same start, and the whole of `fit`, compared with SciPy's
+    optimum.
+    """
     free = {"Ixx": Free(0.05), "If": Free(5e-4), "a": Free(5.0, prior=Prior(5.5, 0.5))}
     problem = Problem(models.roll_on_stand, VEHICLE, [flight], free, Nuisance(False, False))
     base = {n: float(getattr(VEHICLE, n)) for n in VEHICLE.__dataclass_fields__}
@@ -140,7 +141,7 @@ def rls_against_numpy(flight: Flight) -> tuple[float, ...]:
 
 
 def batched(flight: Flight, Ixx: jax.Array, solver: str) -> Callable[[], jax.Array]:
-    """Mean-square misfit of each vehicle, in blocks, nothing else kept."""
+    """Return the mean-square misfit of each vehicle, in blocks, without storing runs."""
     u = models.roll_on_stand.Inputs(x_roll=jnp.asarray(flight.inputs["x_roll"]))
     y = jnp.asarray(flight.outputs["roll"])
 

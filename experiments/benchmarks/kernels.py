@@ -1,4 +1,4 @@
-"""C kernels beside these scripts: compiled when they are needed, and called with NumPy arrays."""
+"""C kernels of these benchmarks: compiled when needed, and called with NumPy arrays."""
 
 import ctypes
 import platform
@@ -11,11 +11,11 @@ import numpy as np
 
 FLAGS = ("-O3", "-march=native", "-ffast-math", "-shared", "-fPIC")
 WIDE = ("-mprefer-vector-width=512",) if platform.machine() == "x86_64" else ()
-"""as wide as ours; gcc stays at 256 bits unless told"""
+"""The vector width of our kernel; gcc uses 256 bits by default."""
 
 
 def compiled(source: str, more: tuple[str, ...] = ()) -> Any:
-    """The library of a C file of this folder, compiled with `FLAGS` and more."""
+    """Return the library of a C file in this folder, compiled with `FLAGS` and more."""
     out = Path(tempfile.mkdtemp()) / "kernel.so"
     file = Path(__file__).parent / source
     subprocess.run(["gcc", *FLAGS, *more, str(file), "-o", str(out), "-lm"], check=True)

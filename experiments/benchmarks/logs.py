@@ -1,14 +1,14 @@
-"""Large logs: how long their columns take beside the libraries of their formats, and the memory.
+"""Time and memory for reading large logs, compared with the libraries of their formats.
 
-It makes the files in a temporary folder: CSV and Parquet of 50 columns at 1 kHz, DataFlash, and
-blackbox (`bbl`: many flights of 2 MB; `one.bbl`: a single one, of a twentieth of the size). Every
-reader has a process of its own, in turns with the other library's:
+It makes files in a temporary folder: CSV and Parquet with 50 columns at 1 kHz, DataFlash, and
+blackbox (`bbl`: many flights of 2 MB; `one.bbl`: a single one of a twentieth of the size). Every
+reader has a process of its own, in turn with the other library's:
 
     python experiments/benchmarks/logs.py --minutes 10 --megabytes 50
 
-prints a table: the best of the runs, elapsed and of the processor, the ratios of both to the other
-library, and the process's largest memory beyond what its imports take, in sizes of the file. On a
-machine that is busy otherwise the time of the processor counts. Two hours are --minutes 120.
+prints the best elapsed and processor times, their ratios to the other library's, and the largest
+memory beyond the imports in multiples of the file size. On a busy computer use the processor time.
+Use --minutes 120 for two hours.
 """
 
 import argparse
@@ -23,8 +23,8 @@ import numpy as np
 
 COLUMNS = 50
 FIT = ("t", *(f"c{i}" for i in range(3, 24, 3)))
-"""the columns of a fit: a time, three inputs and four outputs"""
-_MESSAGES = {  # number, kinds, columns, how many a cycle
+"""Columns of a fit: a time, three inputs and four outputs."""
+_MESSAGES = {  # number, types, columns, messages per cycle
     "IMU": (129, "QBffffff", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ", 4),
     "ATT": (130, "QccccCC", "TimeUS,DesRoll,Roll,DesPitch,Pitch,DesYaw,Yaw", 1),
     "RATE": (131, "Qffffff", "TimeUS,RDes,R,ROut,PDes,P,POut", 1),
@@ -75,8 +75,9 @@ def write_dataflash(path: Path, megabytes: float) -> None:
 
 
 def write_blackbox(path: Path, megabytes: float, single: bool) -> None:
-    """Flights of 2 MB, one made frame by frame and then repeated, as a card holds them, or a
-    `single` one."""
+    """Write flights of 2 MB, one made frame by frame and then repeated, as on a card; or a `single`
+    one.
+    """
     sys.path.insert(0, str(Path(__file__).parents[2]))
     from tests.flights.log_writers import blackbox
 
@@ -145,20 +146,20 @@ READERS = {f.__name__: f for f in (ours, fingerprint, pyarrows, pymavlinks)}
 
 
 def peak_memory() -> int:
-    """Of this process [bytes]; `resource` would count what its parent had when it was forked."""
+    """Return the peak memory of this process [bytes]; `resource` would include its parent's."""
     status = Path("/proc/self/status").read_text()
     return 1024 * int(status.split("VmHWM:")[1].split()[0])
 
 
 def child(reader: str, path: Path) -> None:
-    """One reader in this process; prints seconds, those of the processor, and bytes."""
+    """Run one reader in this process; print seconds, processor seconds, and bytes."""
     import pyarrow as pa
     import pyarrow.csv
     import pyarrow.parquet
 
     import heli_jax.flights.open_log  # noqa: F401
 
-    # pyarrow imports pandas when it first makes an array of NumPy.
+    # pyarrow imports pandas at its first NumPy array.
     pa.chunked_array([[1.0]]).to_numpy()
     before = peak_memory()
     began, worked = time.perf_counter(), time.process_time()
@@ -168,7 +169,7 @@ def child(reader: str, path: Path) -> None:
 
 
 def measured(path: Path, readers: list[str], runs: int) -> dict[str, list[float]]:
-    """By reader the least times and memory of some runs, in turns."""
+    """Return the least times and memory of some runs in turn, by reader."""
     best: dict[str, list[float]] = {}
     for _ in range(runs):
         for reader in readers:

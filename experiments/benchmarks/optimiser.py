@@ -1,10 +1,10 @@
-"""The optimiser against optimistix's plain Levenberg-Marquardt: steps, time and optima reached.
+"""The optimiser compared with optimistix's plain Levenberg-Marquardt: steps, time and optima.
 
     .venv/bin/python experiments/benchmarks/optimiser.py [WORDS]
 
-Every first run of the optimiser in the fits of the zoo and of the rig's cases in corpus_cases.py
-(those whose names have WORDS in them) is made again by both from the same point, each compiled. A
-case is listed where one of them fails or ends at another cost, or takes twice the other's steps.
+Both repeat the optimiser's first run in each fit of the zoo and of the rigs in corpus_cases.py
+(those with WORDS in their names), compiled and from the same point. A case is listed if one of them
+fails, ends at another cost, or takes twice the other's steps.
 """
 
 import contextlib
@@ -34,13 +34,13 @@ from heli_jax.identification.estimation.simulated_flights import measured_count
 jax.config.update("jax_enable_x64", True)
 
 SAME = 1e-3
-"""part of the cost by which two optima differ"""
+"""Relative difference of the costs of two distinct optima."""
 TURNS = 5
 MAX_STEPS = 200
 
 
 class Run(NamedTuple):
-    """What one optimiser did."""
+    """Result of one optimiser."""
 
     steps: int
     seconds: float
@@ -49,18 +49,20 @@ class Run(NamedTuple):
 
 
 class _Recorded(BaseException):
-    """Enough is known of a fit."""
+    """Raised to end a fit once its arguments are recorded."""
 
 
 def recorded(case: Any) -> list[tuple[Any, ...]]:
-    """The arguments (layout, data, noise, z0) of the first run of the optimiser in a case's fit,
-    which ends there."""
+    """Return the arguments (layout, data, noise, z0) of the optimiser's first run in a case's fit.
+
+    The fit ends there.
+    """
     calls: list[tuple[Any, ...]] = []
     optimise = multistart.optimise
 
     @functools.wraps(optimise)
     def keep(*args: Any, **options: Any) -> Any:
-        # Initial states alone are another search.
+        # A search over initial states alone is a different one.
         if options.get("held") is None:
             calls.append((*args[:3], jnp.asarray(args[3])))
             raise _Recorded
@@ -78,7 +80,7 @@ def recorded(case: Any) -> list[tuple[Any, ...]]:
 
 
 def timed(run: Callable[[], tuple[int, float, bool]]) -> Run:
-    """The best of some turns, without the first, which compiles."""
+    """Return the best of some runs, without the first, which compiles."""
     steps, cost, converged = run()
     seconds = []
     for _ in range(TURNS):
@@ -89,7 +91,7 @@ def timed(run: Callable[[], tuple[int, float, bool]]) -> Run:
 
 
 def ours(layout: Any, data: Any, noise: Any, z0: Any) -> tuple[int, float, bool]:
-    """heli_jax's optimiser."""
+    """Run heli_jax's optimiser."""
     end = multistart.optimise(layout, data, noise, z0, MAX_STEPS)
     cost = float(np.sum(np.square(rows_of(layout, data, noise, jnp.asarray(end.z)))))
     return int(end.steps), cost / measured_count(data), bool(end.converged)
@@ -113,7 +115,7 @@ def _plain_program(layout: Any) -> Any:
 
 
 def plain(layout: Any, data: Any, noise: Any, z0: Any) -> tuple[int, float, bool]:
-    """optimistix's, with its defaults, on the same residuals."""
+    """Run optimistix's optimiser, with its defaults, on the same residuals."""
     end = _plain_program(layout)(data, noise, z0)
     cost = float(np.sum(np.square(rows_of(layout, data, noise, end.value))))
     done = bool(end.result == optx.RESULTS.successful)
@@ -121,14 +123,14 @@ def plain(layout: Any, data: Any, noise: Any, z0: Any) -> tuple[int, float, bool
 
 
 def main(words: str = "") -> None:
-    """Run and print."""
+    """Run and print the comparison."""
     cases = [c for c in (*zoo_cases(), *rig_cases()) if words in c.name]
     pairs: list[tuple[Run, Run]] = []
     print(f"{'':42}{'ours':>34}{'plain':>34}")
     for case in cases:
         if case.name.startswith("rig") and not case.name.endswith("fit"):
             continue
-        # Each compiled program takes regions of memory, of which a process has so many.
+        # Each compiled program takes memory regions, whose number per process is limited.
         jax.clear_caches()
         for call in recorded(case):
             pair = timed(lambda call=call: ours(*call)), timed(lambda call=call: plain(*call))

@@ -1,9 +1,9 @@
-"""What each command takes of the processor, beside another revision.
+"""Processor time of each command, compared with another revision.
 
-Seconds of user and system time of the whole process, on the demo's configurations: the least of
-several runs, after one that fills the caches, those of Python's bytecode and of JAX's programs
-included; the two revisions take turns. The other one is checked out into a temporary worktree and
-run by the same Python, found by PYTHONPATH. Load on the machine adds to both.
+Times are user and system seconds of the whole process on the demo's configurations. They are the
+least of several runs, after one that fills the caches of bytecode and of JAX's programs. The two
+revisions take turns. The other one is checked out into a temporary worktree and run by the same
+Python through PYTHONPATH. Other load adds to both.
 
     python experiments/benchmarks/processor_times.py [REVISION]
 """
@@ -23,17 +23,17 @@ from script import Size, asked
 
 ROOT = Path(__file__).parents[2]
 _LONGEST = 600.0
-"""a command may take [s], the first time when all is compiled"""
+"""Longest time of a command [s], the first time with compilation."""
 
 
 class Command(NamedTuple):
-    """One command and what is asked of it."""
+    """A command and its limit."""
 
     name: str
     arguments: tuple[str, ...]
-    """OUT stands for a new place"""
+    """Arguments; OUT stands for a new path."""
     bound: float
-    """processor seconds on an idle machine"""
+    """Limit of the processor time on an idle computer [s]."""
 
 
 COMMANDS = (
@@ -46,18 +46,18 @@ COMMANDS = (
 
 
 class Tree(NamedTuple):
-    """A revision of the project, and where what it makes is kept."""
+    """A revision of the project, and a folder for its files."""
 
     folder: Path
-    """with heli_jax and configs"""
+    """Folder with heli_jax and configs."""
     work: Path
-    """with caches of its own"""
+    """Folder with caches of its own."""
 
     def seconds(self, command: Command) -> float:
-        """User and system time of one run.
+        """Return the user and system time of one run [s].
 
         Raises:
-            SystemExit: the command failed; with what it said.
+            SystemExit: the command failed; the message has its output.
         """
         out = self.work / "out"
         shutil.rmtree(out, ignore_errors=True)
@@ -67,7 +67,7 @@ class Tree(NamedTuple):
         environment |= {
             "PYTHONPATH": str(self.folder),
             "PYTHONPYCACHEPREFIX": str(self.work / "bytecode"),
-            # What XLA compiles is known by its content: one folder may serve all.
+            # XLA's programs are identified by content, so one folder serves all.
             "JAX_COMPILATION_CACHE_DIR": os.environ.get(
                 "JAX_COMPILATION_CACHE_DIR", str(self.work / "compiled")
             ),
@@ -90,9 +90,9 @@ class Tree(NamedTuple):
 
 
 def tree(folder: Path, work: Path) -> Tree:
-    """A revision with a copy of the configurations beside the log that they read."""
+    """Return a revision with a copy of the configurations, and the log that they read."""
     work.mkdir()
-    # The present configurations for both: what is compared is the program.
+    # Both use the present configurations, since only the programs are compared.
     shutil.copytree(ROOT / "configs", work / "configs")
     made = Tree(folder, work)
     log = ("simulate", "configs/bench-roll.yaml", "--out", str(work / "runs/demo/bench.csv"))
@@ -102,12 +102,12 @@ def tree(folder: Path, work: Path) -> Tree:
 
 
 def measured(trees: list[Tree], runs: int) -> list[tuple[Command, list[float]]]:
-    """By command the least of the runs of each tree, which take turns."""
+    """Return the least time of each tree by command; the trees take turns."""
     rows = []
     for command in COMMANDS:
         for one in trees:
             one.seconds(command)  # fills the caches
-        # Whose turn it is to be first changes with each run.
+        # The first tree changes with each run.
         times: list[list[float]] = [[] for _ in trees]
         for k in range(runs):
             for i in (range(len(trees)), reversed(range(len(trees))))[k % 2]:
@@ -118,7 +118,7 @@ def measured(trees: list[Tree], runs: int) -> list[tuple[Command, list[float]]]:
 
 
 def main() -> None:
-    """Measure and print one table."""
+    """Measure and print the table."""
     options = asked(
         __doc__,
         "five minutes",

@@ -1,11 +1,11 @@
-"""All responses of a flight beside the same by loops over SciPy.
+"""Time of all responses of a flight, compared with loops over SciPy.
 
     .venv/bin/python experiments/benchmarks/responses.py [MINUTES]
 
 4 inputs that move together, 9 outputs, 10 minutes at 100 Hz. SciPy's loop goes over outputs: csd of
-every pair among the four inputs and the output (15), and the responses solved for at each
-frequency; where spectra of inputs are kept for all outputs it is the lean loop. Neither makes
-coherences or errors. On one thread, the best of some runs each, in turn. The target: 0.2 s warm.
+every pair of the four inputs and the output (15), then a solution at each frequency. The lean loop
+reuses the spectra of inputs for all outputs. Neither computes coherences or errors. On one thread,
+the best of some runs each, in turn. The target: 0.2 s warm.
 """
 
 import os
@@ -44,7 +44,7 @@ def flight(minutes: float) -> Flight:
 
 
 def by_scipy(record: Flight, omega: np.ndarray, lean: bool) -> np.ndarray:
-    """H (k, outputs, inputs)."""
+    """Return H (k, outputs, inputs)."""
     u, y = list(record.inputs.values()), list(record.outputs.values())
     n = round(WINDOW * RATE)
 
@@ -66,7 +66,7 @@ def by_scipy(record: Flight, omega: np.ndarray, lean: bool) -> np.ndarray:
 
 
 def spectra(u: list[np.ndarray], csd: Callable[..., np.ndarray]) -> np.ndarray:
-    """(m, m, k) of every pair of inputs, each pair once."""
+    """Return (m, m, k) of every pair of inputs, with each pair computed once."""
     m = len(u)
     half = {(i, j): csd(u[i], u[j]) for i in range(m) for j in range(i, m)}
     rows = [[half[i, j] if i <= j else half[j, i].conj() for j in range(m)] for i in range(m)]

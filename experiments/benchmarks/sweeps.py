@@ -1,15 +1,14 @@
-"""Speed of sweeps against hand-written programs, side by side in one run, as a table and a figure.
+"""Speed of sweeps compared with hand-written programs in one run, as a table and a figure.
 
 The work is that of `heli_jax.sweep` from the design to the store on disk: the roll model on its
-stand, the mean square misfit of every vehicle to a record. A figure is the slope between a small
-and a large number of vehicles, so that compilation and start-up do not count; ours and the C kernel
-run in turn on the same threads, and the best times of each count, since other load on the machine
-only adds. Ours counts the discretisation of every vehicle, where C is handed its coefficients.
+stand, with the mean square misfit of every vehicle to a record. Each number is the slope between a
+small and a large number of vehicles, so that compilation and start-up do not count. Our program and
+the C kernel run in turn on the same threads. The best times count, since other load only adds. Our
+times include the discretisation of every vehicle, while C is given its coefficients.
 
     .venv/bin/python experiments/benchmarks/sweeps.py [--quick] [--out runs/benchmarks]
 
-Takes three minutes on two cores of their own, nine where they are shared. GPUs have a benchmark of
-their own, `gpu_sweeps.py`.
+It takes three minutes on two free cores, nine on shared ones. For GPUs see `gpu_sweeps.py`.
 """
 
 import argparse
@@ -48,15 +47,16 @@ BUILDS = {
     for lanes in (8, 16, 32)
     for bits in (256, 512)
 }
-"""of the C kernel: the best of them is what is compared with"""
+"""Builds of the C kernel; the best one is compared."""
 CHUNK = {"exact": 65_536, "rk4": 8192, "dask": 4096}
-"""what `sweep` takes for the larger number; the same for the smaller one, else no slope is right;
-with two workers, what it takes of 16 chunks"""
+"""Chunk of `sweep` for the larger number. The smaller number needs the same chunk for a correct
+slope. With two workers, the chunk for 16 chunks.
+"""
 REDUCE = {"misfit": Reduce("rmse", "roll")}
 
 
 class Sizes(NamedTuple):
-    """How much is measured."""
+    """Sizes of the measurements."""
 
     exact: tuple[int, int]
     rk4: tuple[int, int]
@@ -65,7 +65,7 @@ class Sizes(NamedTuple):
     lengths: tuple[int, ...]
     most: int
     runs: int
-    """of the most and four times as many, in turn: whole chunks both"""
+    """Repetitions of the largest number and four times as many, in turn; both are whole chunks."""
 
 
 FULL = Sizes(
@@ -76,7 +76,7 @@ QUICK = Sizes((65_536, 131_072), (8192, 16_384), 3, (1, 100, 10_000), (100, 1000
 
 
 def record(samples: int) -> Flight:
-    """A driven run with 2 mrad of noise."""
+    """Return a driven run with 2 mrad of noise."""
     rng = np.random.default_rng(0)
     u = 3e-6 * np.repeat(rng.uniform(-1, 1, -(-samples // 25)), 25)[:samples]
     num, den = roll_transfer_function(VEHICLE, stand=True)
@@ -97,7 +97,7 @@ def seconds(run: Callable[[], Any]) -> float:
 
 
 def ours(flight: Flight, n: int, solver: str, **options: Any) -> float:
-    """Seconds of a sweep to disk."""
+    """Return the time of a sweep to disk [s]."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "sweep"
         return seconds(
@@ -117,7 +117,9 @@ def in_threads(work: Callable[[int], None], threads: int) -> None:
 
 
 def arrays(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """What the C kernel takes of n vehicles: discrete coefficients, and those of the equations."""
+    """Return the C kernel's arguments for n vehicles: discrete coefficients, and those of the
+    equations.
+    """
     values = design(n).values(0, n)
 
     def scalars(Ixx: Any, If: Any) -> Any:
@@ -143,7 +145,9 @@ def in_c(
     coefficients: tuple[np.ndarray, np.ndarray],
     threads: int,
 ) -> Callable[[], np.ndarray]:
-    """The C kernel on all vehicles, on some threads; it returns the mean squares."""
+    """Return a call of the C kernel on all vehicles with some threads, which returns
+    mean squares.
+    """
     matrix = coefficients[0] if solver == "exact" else coefficients[1]
     parts = [np.ascontiguousarray(p) for p in np.array_split(matrix, threads, axis=1)]
     costs = [np.zeros(p.shape[1]) for p in parts]
@@ -172,7 +176,7 @@ def against_c(
     pairs: int,
     devices: list[Any],
 ) -> list[float]:
-    """Microseconds a vehicle, ours by backend and then each kernel's, in turn."""
+    """Return microseconds per vehicle of our backends, then of each kernel, measured in turn."""
     small, large = sizes
     coefficients = arrays(large)
     few = (coefficients[0][:, :small], coefficients[1][:, :small])
@@ -196,7 +200,7 @@ def against_c(
 
 
 def check(flight: Flight, solver: str, cost: np.ndarray) -> None:
-    """Both give the same numbers."""
+    """Check that both give the same numbers."""
     dataset = sweep(
         models.roll_on_stand, VEHICLE, flight, design(cost.size), REDUCE, solver=solver,
         substeps=SUBSTEPS, chunk=CHUNK[solver],
@@ -205,7 +209,7 @@ def check(flight: Flight, solver: str, cost: np.ndarray) -> None:
 
 
 def in_numpy(flight: Flight, coefficients: np.ndarray, n: int) -> Callable[[], np.ndarray]:
-    """The recurrence with NumPy, all vehicles side by side."""
+    """Return the recurrence in NumPy, for all vehicles at once."""
     A, B = coefficients[:16, :n].reshape(4, 4, n), coefficients[16:, :n]
     u, y = flight.inputs["x_roll"], flight.outputs["roll"]
 
@@ -220,7 +224,7 @@ def in_numpy(flight: Flight, coefficients: np.ndarray, n: int) -> Callable[[], n
 
 
 def in_scipy(flight: Flight, n: int) -> Callable[[], np.ndarray]:
-    """SciPy's cont2discrete and lfilter, vehicle by vehicle."""
+    """Return SciPy's cont2discrete and lfilter, vehicle by vehicle."""
     values = design(n).values(0, n)
     u, y = flight.inputs["x_roll"], flight.outputs["roll"]
 
@@ -240,7 +244,7 @@ def in_scipy(flight: Flight, n: int) -> Callable[[], np.ndarray]:
 def in_numba(
     flight: Flight, coefficients: np.ndarray, threads: int
 ) -> Callable[[], np.ndarray] | None:
-    """The C kernel's loops in Numba; None where it is not installed."""
+    """Return the C kernel's loops in Numba; None if it is not installed."""
     try:
         import numba
     except ImportError:
@@ -272,7 +276,7 @@ def in_numba(
 
 
 def per_vehicle(run: Callable[[], Any], n: int, times: int = 3) -> float:
-    """Microseconds a vehicle, the best of some runs after one that does not count."""
+    """Return microseconds per vehicle, the best of some runs after a first one."""
     run()
     return 1e6 * min(seconds(run) for _ in range(times)) / n
 
@@ -280,7 +284,7 @@ def per_vehicle(run: Callable[[], Any], n: int, times: int = 3) -> float:
 def slopes(
     flight: Flight, sizes: tuple[int, int], solver: str, ways: list[dict[str, Any]]
 ) -> list[float]:
-    """Microseconds a vehicle for each of some ways, in turn, as the slope of the best times."""
+    """Return microseconds per vehicle of each way, in turn, as the slope of the best times."""
     for way in ways:
         ours(flight, sizes[0], solver, **way)
     best = [[np.inf, np.inf] for _ in ways]
@@ -292,7 +296,7 @@ def slopes(
 
 
 def threads_over_one(kernel: Any, flight: Flight, solver: str, n: int, threads: int) -> float:
-    """How much the machine gives the C kernel for its threads, the best of five in turn."""
+    """Return the C kernel's speed-up by its threads, the best of five in turn."""
     coefficients = arrays(n)
     ways = [in_c(kernel, flight, solver, coefficients, k) for k in (1, threads)]
     best = [np.inf, np.inf]
@@ -302,14 +306,15 @@ def threads_over_one(kernel: Any, flight: Flight, solver: str, n: int, threads: 
 
 
 def by_length(N: int) -> float:
-    """Microseconds a vehicle of N samples, of so many that start-up does not show."""
+    """Return microseconds per vehicle of N samples, with enough vehicles to hide start-up."""
     n = min(100_000_000 // N, 131_072)
     return slopes(record(N), (n, 4 * n), "exact", [{"chunk": min(n, 32_768)}])[0]
 
 
 def on_workers(flight: Flight, n: int, workers: int) -> float:
-    """Microseconds a vehicle on a local dask cluster, from a quarter of the vehicles to the last;
-    the best of three sweeps."""
+    """Return microseconds per vehicle on a local dask cluster, between a quarter and all of the
+    vehicles; the best of three sweeps.
+    """
     from heli_jax.sweeps.cluster import connected
 
     best = np.inf
@@ -327,7 +332,7 @@ def on_workers(flight: Flight, n: int, workers: int) -> float:
 
 
 def memory_of(n: int) -> float:
-    """Peak resident memory [MB] of a sweep of 1000 samples, in a process of its own."""
+    """Return the peak resident memory [MB] of a sweep of 1000 samples, in a process of its own."""
     program = [sys.executable, __file__, "--memory", str(n)]
     run = subprocess.run(program, capture_output=True, text=True, check=True)
     return float(run.stdout)
@@ -335,14 +340,16 @@ def memory_of(n: int) -> float:
 
 def memory(n: int) -> None:
     ours(record(1000), n, "exact")
-    # Not what getrusage says: a process that is started there counts what its parent held.
+    # getrusage would include the memory of the parent process.
     held = next(v for v in Path("/proc/self/status").read_text().splitlines() if "VmHWM" in v)
     print(int(held.split()[1]) / 1024)
 
 
 def linearity(n: int, times: int) -> float:
-    """Time a vehicle of 4 n over that of n, both beyond one chunk, so that start-up does not count;
-    of the best times in turn."""
+    """Return time per vehicle of 4 n over that of n, from the best times in turn.
+
+    Both exceed one chunk, so that start-up does not count.
+    """
     flight, chunk = record(1000), CHUNK["exact"]
     best = dict.fromkeys((chunk, n, 4 * n), np.inf)
     ours(flight, n, "exact")
@@ -409,7 +416,7 @@ def on_cpu(sizes: Sizes) -> tuple[list[tuple[str, str, str]], dict[str, Any]]:
 
 
 def ours_at(flight: Flight, n: int) -> float:
-    """Microseconds a vehicle of a whole sweep of n in memory, compiled before."""
+    """Return microseconds per vehicle of a whole sweep of n in memory, already compiled."""
 
     def run() -> None:
         sweep(models.roll_on_stand, VEHICLE, flight, design(n), REDUCE)

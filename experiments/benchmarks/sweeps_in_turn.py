@@ -1,8 +1,8 @@
-"""Sweeps and the best C in turn, in the processor's time: for a machine that does other work too.
+"""Processor time of sweeps and the best C kernel in turn, for a busy computer.
 
-The work and the kernels are those of `sweeps.py`, and so are the threads; a figure is again the
-slope between a small and a large number of vehicles, here the median of some rounds, and a ratio
-that of the same round. What a processor waits for (the disk, the other thread) does not count.
+Work, kernels and threads are those of `sweeps.py`. Each number is again the slope between a small
+and a large number of vehicles, here the median of some rounds; ratios are within a round. Waiting
+(for the disk, the other thread) does not count.
 
     .venv/bin/python experiments/benchmarks/sweeps_in_turn.py [exact | rk4] [ROUNDS]
 """
@@ -22,11 +22,11 @@ from kernels import compiled
 from sweeps import BACKENDS, BUILDS, arrays, check, in_c, ours, record
 
 SIZES = {"exact": (65_536, 131_072), "rk4": (8192, 16_384)}
-"""whole chunks of a sweep"""
+"""Numbers of vehicles; whole chunks of a sweep."""
 
 
 def ways(solver: str) -> dict[str, list[Callable[[], Any]]]:
-    """By name what is run of a small and of a large number of vehicles."""
+    """Return by name the runs of a small and of a large number of vehicles."""
     flight, devices, sizes = record(6000), jax.local_devices(), SIZES[solver]
     large = arrays(sizes[1])
     some = [(large[0][:, :n], large[1][:, :n]) for n in sizes]

@@ -1,4 +1,4 @@
-"""What `experiments/coverage.py` runs: each module of this folder holds the cases of one subject.
+"""Cases of `experiments/coverage.py`: each module has the cases of one subject.
 
 A module has a function `cases()` that returns a list of `Case`.
 """
@@ -11,7 +11,7 @@ from typing import NamedTuple
 from heli_jax import Fit
 
 BENCH = Path(__file__).parents[2] / "configs" / "vehicles" / "bench-30.yaml"
-"""the vehicle file, from wherever a study is started"""
+"""Path of the vehicle file, independent of the working folder."""
 
 
 class Interval(NamedTuple):
@@ -26,13 +26,13 @@ class Interval(NamedTuple):
 
 @dataclass(frozen=True)
 class Run:
-    """What one record says."""
+    """Result of one record."""
 
     status: str
-    """of the fit; runs that did not converge are counted and left out of the statistics"""
+    """Status of the fit; runs that did not converge are counted, but left out of the statistics."""
     parameters: dict[str, Interval] = field(default_factory=dict)
     flags: dict[str, bool] = field(default_factory=dict)
-    """what must not happen, by name: how often each is true is counted"""
+    """Events that must not happen, by name; their number is reported."""
 
 
 @dataclass(frozen=True)
@@ -41,13 +41,13 @@ class Case:
 
     name: str
     one_run: Callable[[int], Run]
-    """a seed to what its record says"""
+    """Function from a seed to the result of its record."""
     runs: int = 200
-    """at full size"""
+    """Number of runs at full size."""
 
 
 def intervals(result: Fit, truth: dict[str, float]) -> Run:
-    """The intervals of a fit's estimates (or nuisances) beside the truth."""
+    """Return the intervals of a fit's estimates (or nuisances), with the truth."""
     everything = {**result.nuisance, **result.estimates}
     parameters = {}
     for name, true in truth.items():

@@ -1,7 +1,8 @@
 """Output error with autocorrelated residuals: AR(1) noise with missing samples, and the disturbed
-bench, whose residuals are as large as its response.
+bench.
 
-The records come from scipy and the closed form of eq. 23, not from our own simulation.
+The bench's residuals are as large as its response. The records come from scipy and the closed form
+of eq. 23, not from our own simulation.
 """
 
 import dataclasses
@@ -29,7 +30,7 @@ MISSING: dict[str, Missing] = {
 
 
 def ar_run(missing: Missing, seed: int) -> Run:
-    """60 s of the bench with AR(0.9) measurement noise."""
+    """Fit 60 s of the bench with AR(0.9) measurement noise."""
     n = 3000
     vehicle = load_vehicle(BENCH)
     num, den = roll_transfer_function(vehicle, stand=True)
@@ -44,7 +45,7 @@ def ar_run(missing: Missing, seed: int) -> Run:
 
 
 def disturbed_run(seed: int) -> Run:
-    """The records of monte_carlo.py: 120 s, and an acceleration with a correlation time of 1 s."""
+    """Fit records of monte_carlo.py: 120 s, with an acceleration of 1 s correlation time."""
     n = 6000
     vehicle = load_vehicle(BENCH)
     rng = np.random.default_rng(seed)

@@ -1,4 +1,6 @@
-"""The disturbed bench, simulated from the paper's equations with SciPy alone; no case by itself."""
+"""The disturbed bench, simulated from the paper's equations with SciPy alone; it has no case
+itself.
+"""
 
 import numpy as np
 import scipy.linalg
@@ -8,8 +10,10 @@ from heli_jax import Helicopter
 
 
 def matrices(v: Helicopter) -> tuple[np.ndarray, np.ndarray]:
-    """A (4, 4) and B (4,) of eqs 21-22 on the stand; the state is roll, its rate, the flybar's
-    angle and its rate."""
+    """Return A (4, 4) and B (4,) of eqs 21-22 on the stand.
+
+    The state is roll and its rate, the flybar's angle and its rate.
+    """
     names = ("a", "R", "c", "R1", "R2", "L1", "L2", "L3", "L4", "L5", "Omega", "rho", "Ixx", "If")
     g = {n: float(getattr(v, n)) for n in names}
     force = g["rho"] * g["Omega"] ** 2 * g["a"] * g["c"]
@@ -25,9 +29,9 @@ def matrices(v: Helicopter) -> tuple[np.ndarray, np.ndarray]:
 def response(
     v: Helicopter, u: np.ndarray, dt: float, sigma: float, tau: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """States (N, 5) with an Ornstein-Uhlenbeck roll acceleration, the last one, from rest.
+    """Return states (N, 5) from rest; the last is an Ornstein-Uhlenbeck roll acceleration.
 
-    Exact from sample to sample (Van Loan, 1978); the disturbance begins stationary.
+    They are exact from sample to sample (Van Loan, 1978), and the disturbance is stationary.
     """
     A, B = np.zeros((5, 5)), np.zeros((5, 1))
     A[:4, :4], B[:4, 0] = matrices(v)

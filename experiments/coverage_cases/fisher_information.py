@@ -1,4 +1,4 @@
-"""Filter error on a measured roll rate: is J'J Fisher's information, with noise given and free?
+"""Filter error on a measured roll rate: J'J as Fisher information, with given and free noise.
 
 The records come from the paper's equations with SciPy, not from our own simulation.
 """

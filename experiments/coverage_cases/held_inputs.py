@@ -1,8 +1,9 @@
 """Inputs that move between samples, as records of a stick or a surface do.
 
 An unstable aircraft (short period of Jategaonkar, 2006, chapter 9: speed 44.57 m/s) is flown with a
-continuous elevator: a pilot's smooth commands and a feedback of the vertical speed, integrated by
-scipy, logged at 20 Hz. And a roll that answers 17 ms late is logged at 25 Hz.
+continuous elevator: a pilot's smooth commands and a feedback of the vertical speed. scipy
+integrates it, and it is logged at 20 Hz. A second case is a roll with a delay of 17 ms, logged at
+25 Hz.
 """
 
 from collections.abc import Callable
@@ -59,15 +60,16 @@ AIRCRAFT = Model(
 
 
 def smooth(rng: np.random.Generator, duration: float, pace: float) -> Callable[[float], float]:
-    """A pilot's command of unit size [s] -> 1: a cubic spline through random points, `pace` [s]
-    apart."""
+    """Return a pilot's command of unit size over time [s]: a cubic spline through random points,
+    `pace` [s] apart.
+    """
     knots = np.arange(-2.0 * pace, duration + 3.0 * pace, pace)
     spline = scipy.interpolate.CubicSpline(knots, rng.uniform(-1.0, 1.0, knots.size))
     return lambda t: float(spline(t))
 
 
 def aircraft_record(seed: int, hold: str = "linear", noise: float = 1.0) -> Flight:
-    """One flight, logged at 20 Hz with that much of `NOISE`."""
+    """Return one flight, logged at 20 Hz with a multiple of `NOISE`."""
     rng = np.random.default_rng(seed)
     command = smooth(rng, DURATION, 1.2)
 
@@ -93,8 +95,11 @@ def aircraft_record(seed: int, hold: str = "linear", noise: float = 1.0) -> Flig
 
 
 def aircraft_problem(seed: int, hold: str = "linear", noise: float = 1.0) -> Problem:
-    """All derivatives but Zq, which w and q do not tell from the speed, in windows of 2 s: over a
-    whole record an unstable aircraft diverges from any error of its initial state."""
+    """Return a problem with all derivatives except Zq, in windows of 2 s.
+
+    w and q cannot separate Zq from the speed. Over a whole record, an unstable aircraft diverges
+    with any error of its initial state.
+    """
     starts = {"Zw": -1.2, "Zde": -5.0, "Mw": 0.2, "Mq": -3.0, "Mde": -11.0}
     free = {n: Free(v) for n, v in starts.items()}
     record = aircraft_record(seed, hold, noise)
@@ -133,7 +138,7 @@ ROLL = Model(
 
 
 def late_record(seed: int, hold: str = "linear") -> Flight:
-    """A roll rate that answers 17 ms late to a smooth stick, logged at 25 Hz."""
+    """Return a roll rate 17 ms after a smooth stick, logged at 25 Hz."""
     rng = np.random.default_rng(seed)
     stick = smooth(rng, 120.0, 0.9)
 

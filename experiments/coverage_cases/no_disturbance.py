@@ -1,7 +1,7 @@
-"""Filter error on the bench where there is white noise and no disturbance.
+"""Filter error on the bench with white noise and without a disturbance.
 
-Whatever it says of a disturbance that is not there must be a number that can be believed, or none.
-The records come from scipy and the closed form of eq. 23, not from our own simulation.
+Its estimate of the absent disturbance must be correct, or missing. The records come from scipy and
+the closed form of eq. 23, not from our own simulation.
 """
 
 from typing import Any
@@ -40,7 +40,7 @@ def one_run(seed: int, poles: int = 1) -> Run:
 
 
 def flags(result: Fit) -> dict[str, bool]:
-    """What must not be said of a disturbance that is not there."""
+    """Return wrong statements about the absent disturbance."""
     sigma, tau = result.nuisance["sigma_w"], result.nuisance["tau_w"]
     absent = sigma.value == 0.0 and sigma.sd is None and tau.sd is None
     noted = any(f.code == "noise.no-disturbance" for f in result.findings)

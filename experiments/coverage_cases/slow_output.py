@@ -1,8 +1,8 @@
 """A roll angle at 5 Hz with jitter beside a roll rate at 50 Hz, by output error.
 
 The truth is scipy's, at a twentieth of the sample time, from the closed form of eq. 23 (and the
-same times s for the rate). The angle comes to the grid as a log's slow channel does; for comparison
-it is interpolated along straight lines to the grid, as one would do by hand.
+same times s for the rate). The angle is resampled as a log's slow channel; for comparison it is
+interpolated linearly, as a user might.
 """
 
 from typing import Any

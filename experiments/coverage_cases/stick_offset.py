@@ -1,4 +1,4 @@
-"""Free roll with a stick that is not centred, which the log does not show.
+"""Free roll with an offset of the stick that is not in the log.
 
 The records come from scipy and the closed form of eq. 23.
 """

@@ -1,4 +1,4 @@
-"""Responses of a model that handling qualities are read from, and those of flights."""
+"""Responses of a model and of flights for handling qualities."""
 
 from collections.abc import Collection
 from typing import NamedTuple
@@ -22,32 +22,33 @@ from heli_jax.analysis.response_curves import (
 from heli_jax.dynamics.model import Axis, Model, axes_of
 
 _ATTITUDES = {"roll": "p", "pitch": "q", "yaw": "r"}
-"""axes by name, and what an output with the rate about each is usually called"""
+"""Axes, and the usual name of an output with the rate about each."""
 _ANGLES = {"roll": "phi", "pitch": "theta", "yaw": "psi"}
 _STICKS = {"roll": "lat", "pitch": "lon", "yaw": "ped"}
-"""what the input of each axis is called where a model does not name its stick"""
+"""Usual name of each axis's input in models that do not name the stick."""
 
 
 class HandlingPair(NamedTuple):
-    """A response that handling qualities are read off."""
+    """A response for handling qualities."""
 
     input: str
     output: str
     kind: Kind = "rate"
     integrated: bool = False
-    """whether the output is a rate, whose response is divided by i omega"""
+    """True if the output is a rate, whose response is divided by i omega."""
     gain: float = 1.0
-    """of an open loop"""
+    """Gain of an open loop."""
 
     @property
     def words(self) -> str:
-        """`lat to p, integrated`"""
+        """Description, such as `lat to p, integrated`."""
         return f"{self.input} to {self.output}" + (", integrated" if self.integrated else "")
 
 
 class Handling(NamedTuple):
-    """Handling qualities of one pair by model and data; text says why one is missing, None if not
-    asked."""
+    """Handling qualities of one pair by model and data; text gives the reason for a missing one,
+    None means not requested.
+    """
 
     pair: HandlingPair
     model: HandlingQualities | str | None
@@ -55,13 +56,13 @@ class Handling(NamedTuple):
 
 
 def handling_pairs(model: Model, outputs: Collection[str]) -> tuple[HandlingPair, ...]:
-    """By axis of roll, pitch and yaw its stick with the angle, or else the rate, of the outputs."""
+    """Return for roll, pitch and yaw the stick with the angle, or else the rate, of the outputs."""
     pairs = []
     for axis in axes_of(model):
         stick = _stick(model, axis)
         if stick is None:
             continue
-        # Outputs have the names of states, or their own: roll for phi.
+        # Outputs have the names of states, or their own, such as roll for phi.
         angles = [n for n in (axis.angle, axis.name) if n in outputs]
         rates = [n for n in (axis.rate, _ATTITUDES[axis.name]) if n in outputs]
         if angles:
@@ -72,17 +73,17 @@ def handling_pairs(model: Model, outputs: Collection[str]) -> tuple[HandlingPair
 
 
 def _stick(model: Model, axis: Axis) -> str | None:
-    """The input that turns the vehicle about an axis of roll, pitch or yaw."""
+    """Return the input that turns the vehicle about a roll, pitch or yaw axis."""
     inputs = naming.names(model.Inputs)
     named = (axis.stick, _STICKS.get(axis.name))
     return next((str(n) for n in named if n in inputs), None) if axis.name in _ATTITUDES else None
 
 
 def handling_gaps(model: Model, outputs: Collection[str]) -> tuple[str, ...]:
-    """Axes whose angle or rate was logged and that have no stick, a sentence each."""
+    """Return a sentence for each axis with a logged angle or rate but no stick."""
     axes = axes_of(model)
     with_stick = {a.name for a in axes if _stick(model, a) is not None}
-    # An axis of another name is none of an aircraft's, such as a pendulum's with the angle theta.
+    # An axis of another name is not an aircraft's, such as a pendulum's with the angle theta.
     other = {o for a in axes if a.name not in _ATTITUDES for o in (a.angle, a.rate)}
     logged_outputs = {
         n: [o for o in (_ANGLES[n], n, r) if o in outputs and o not in other]
@@ -99,7 +100,7 @@ def handling_gaps(model: Model, outputs: Collection[str]) -> tuple[str, ...]:
 
 
 def prepared(pair: HandlingPair, curve: Curve) -> Curve:
-    """The curve of an attitude, or of an open loop with its gain."""
+    """Return the curve of an attitude, or of an open loop with its gain."""
     curve = integrated(curve) if pair.integrated else curve
     return times(curve, pair.gain) if pair.gain != 1.0 else curve
 
@@ -107,7 +108,7 @@ def prepared(pair: HandlingPair, curve: Curve) -> Curve:
 def measured_handling(
     flight_responses: FlightResponses, pair: HandlingPair
 ) -> HandlingQualities | str:
-    """Handling qualities of a measured response, or why there are none in words."""
+    """Return the handling qualities of a measured response, or the reason why there are none."""
     output = flight_responses.outputs.get(pair.output)
     response = None if output is None else output.pairs.get(pair.input)
     if output is None or response is None:

@@ -1,10 +1,9 @@
-"""Frequency responses of flights together: every output to every input that moves.
+"""Frequency responses from several flights: every output to every input that moves.
 
-An output's response is taken from parts of flights without a missing sample. Windows look at a part
-of a record, and see inputs whose answers lie outside of it and answers whose inputs do: of noise
-this makes a random error; of a sweep, which visits each frequency once, one that no
-average takes away. It is that of a model's response as well, which is known before and behind the
-windows.
+An output's response uses the parts of flights without missing samples. A window shows inputs whose
+responses lie outside it, and responses whose inputs do. For noise inputs this is a random error.
+For a sweep, which visits each frequency once, no average removes it. A model's response has the
+same error, and there it can be computed.
 
 Source: Pintelon and Schoukens (2012), chapter 6, for the errors of windows.
 """
@@ -40,36 +39,36 @@ from heli_jax.flights.holds import without_jumps
 from heli_jax.flights.parts import spans
 
 _ROUNDS = 2
-"""in which a transfer function is fitted again without what the windows add to it"""
+"""Rounds in which a transfer function is fitted again without the error added by windows."""
 _MOST_SAID = 3
-"""outputs of which a refusal says why they have no response"""
+"""Most outputs for which a refusal gives the reason."""
 _AS_ONE = 1e-6
-"""less than 1, coherence of two inputs that move as one at all frequencies"""
+"""Distance of a coherence from 1 below which two inputs are proportional at all frequencies."""
 
 
 type Parts = tuple[tuple[int, int, int], ...]
-"""flight, first sample and the one behind the last of each part"""
+"""Flight, first sample and end (exclusive) of each part."""
 type Names = tuple[list[str], tuple[str, ...]]
-"""of the inputs, and of those with an instrument"""
+"""Names of the inputs, and of the inputs with an instrument."""
 
 
 class Windows(NamedTuple):
-    """Settings by which responses were computed."""
+    """Settings with which responses were computed."""
 
     records: Sequence[Float[np.ndarray, "c N"]]
-    """inputs, instruments and outputs of each part of a flight"""
+    """Inputs, instruments and outputs of each part of a flight."""
     inputs: Sequence[int]
-    """their places among the signals"""
+    """Indices among the signals."""
     instruments: Sequence[int] | None
-    """as many; None without"""
+    """Index of each input's instrument; None without instruments."""
     omega: Float[np.ndarray, " k"]
-    """[rad/s]"""
+    """Frequencies [rad/s]."""
     seconds: float
-    """length of a window"""
+    """Length of a window [s]."""
 
 
 class Wanted(NamedTuple):
-    """A transfer function that is to be fitted to one response."""
+    """A transfer function to fit to one response."""
 
     input: str
     output: str
@@ -77,81 +76,81 @@ class Wanted(NamedTuple):
     poles: int
     delay: bool = True
     band: tuple[float, float] | None = None
-    """[Hz]"""
+    """First and last frequency [Hz]."""
     coherence: float = 0.6
-    """frequencies of less in the mean over an octave are left out: there feedback and what is not
-    linear have their way"""
+    """Least mean coherence over an octave; below it, feedback and nonlinearity dominate."""
 
 
 class Settings(NamedTuple):
     """Frequencies and window length of responses."""
 
     band: tuple[float, float] | None = None
-    """first and last frequency [Hz]; None: two periods in a window to 0.4 of the rate"""
+    """First and last frequency [Hz]; None: from two periods in a window to 0.4 of the rate."""
     window: float | None = None
-    """length [s]; None: a fifth of the longest flight, 30 s at most"""
+    """Length [s]; None: a fifth of the longest flight, at most 30 s."""
     points: int = 120
-    """frequencies, equally spaced in the logarithm"""
+    """Number of frequencies, equally spaced in the logarithm."""
     transfer_functions: tuple[Wanted, ...] = ()
 
 
 class Pair(NamedTuple):
-    """An output's response to an input; arrays (k,)."""
+    """Response of an output to an input; arrays (k,)."""
 
     H: np.ndarray
-    """in SI units of output over input"""
+    """Response, in SI units of output over input."""
     sd: np.ndarray
-    """of its real and of its imaginary part"""
+    """Standard deviation of the real and of the imaginary part."""
     coherence: np.ndarray
-    """partial: what the other inputs explain is taken out; of the flights in which it moves"""
+    """Partial coherence, without the parts of other inputs, in the flights where the input moves.
+    """
     half95: float = Z95
-    """half of a 95 % interval in sd: Student's t of the averages that there are"""
+    """Half-width of a 95 % interval [sd]: Student's t for the number of averages."""
     added: np.ndarray | float = 0.0
-    """what windows added to H at the ends of records and was taken off (`window_ends`)"""
+    """Subtracted error that windows add to H at the ends of records (`without_ends`)."""
 
 
 class Output(NamedTuple):
     """Responses, coherence and noise of one output."""
 
     pairs: dict[str, Pair]
-    """by input"""
+    """Responses by input."""
     multiple: np.ndarray
-    """(k,) coherence with all inputs together"""
+    """Coherence (k,) with all inputs together."""
     noise: np.ndarray
-    """(k,) density of what they leave [SI^2/Hz]"""
+    """Density (k,) of the residual [SI^2/Hz]."""
     averages: float
-    """independent ones"""
+    """Number of independent averages."""
 
 
 class FlightResponses(NamedTuple):
     """All responses of some flights."""
 
     omega: np.ndarray
-    """(k,) [rad/s]"""
+    """Frequencies (k,) [rad/s]."""
     outputs: dict[str, Output]
     instruments: tuple[str, ...]
-    """inputs whose responses are taken by an excitation that was logged"""
+    """Inputs whose responses use a logged excitation."""
     window: float
-    """[s]"""
+    """Length of a window [s]."""
     fits: tuple[tuple[Wanted, TransferFit | str], ...]
-    """in the order in which they were asked for; in words why there is none"""
+    """Fits in the requested order; a text gives the reason why one is missing."""
     holds: dict[str, Hold]
-    """by input what it does between samples"""
+    """Hold of each input between samples."""
     notes: tuple[Finding, ...]
 
 
 def flight_responses(flights: Sequence[Flight], settings: Settings = Settings()) -> FlightResponses:
-    """Frequency responses of all flights together.
+    """Return the frequency responses of all flights together.
 
-    Inputs with an instrument in every flight (`Flight.instruments`) are taken by it.
+    Inputs with an instrument in every flight (`Flight.instruments`) use it.
 
     Args:
-        flights: of one rate, with the same inputs; an output's parts without a missing sample
-            that are at least a window long are used.
+        flights: flights of one rate with the same inputs. An output's parts without missing samples
+            are used if they are at least a window long.
 
     Raises:
         ValueError: rates differ, nothing moves, the band does not fit the window or the rate, or
-            no output has a part that is long enough.
+            every output's parts are too short.
     """
     flights = [without_jumps(f) for f in flights]
     dt, window, moving = chosen(flights, settings.window)
@@ -178,7 +177,7 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
         try:
             outputs |= _outputs(made, dt, (names, group), np.array(list(step.values())))
         except TooFewAveragesError as e:
-            # Outputs with fewer averages than inputs are no reason to keep back the others.
+            # Outputs with fewer averages than inputs must not stop the others.
             without.append(note("responses.none", f"{', '.join(group)}: no response, {e}", *group))
         windows |= dict.fromkeys(group, made)
     if not outputs:
@@ -192,8 +191,8 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
 
 
 def _frequencies(settings: Settings, window: float, dt: float, step: float) -> np.ndarray:
-    # Fewer than two periods in a window are not told from its own shape; what moves faster than
-    # an input was logged nothing is known of.
+    # Fewer than two periods in a window cannot be distinguished from the window's shape.
+    # Frequencies above the input's logging rate are unknown.
     low, high = settings.band or (2.0 / window, HIGHEST / step)
     if not low < high:
         if settings.window is None and settings.band is None:
@@ -229,7 +228,7 @@ def _notes(flights: Sequence[Flight], inputs: list[str], by: tuple[str, ...]) ->
         note("responses.still", f"{n} does not move: no input is seen to move it", n)
         for n in resting
     ]
-    # The bias has no sign of its own in any of the numbers below: it has to be said.
+    # No number below reveals the sign of this bias, so a note states it.
     without = [n for n in inputs if n not in by]
     if without:
         taken = "inputs that do not follow" if len(without) > 1 else "an input that does not follow"
@@ -257,13 +256,13 @@ def _windows(records: list[np.ndarray], omega: np.ndarray, window: float, names:
 def _moving_as_one(
     flights: Sequence[Flight], inputs: list[str], outputs: dict[str, Output]
 ) -> list[Finding]:
-    """Doubt about inputs that move together, whose responses cannot be separated."""
+    """Return doubts about inputs that move together, whose responses cannot be separated."""
     pairs = (pair for output in outputs.values() for pair in output.pairs.values())
     if len(inputs) < 2 or any(np.isfinite(pair.H).any() for pair in pairs):
         return []
     U = [np.stack([f.inputs[n] - np.mean(f.inputs[n]) for n in inputs]) for f in flights]
     alike = np.abs(np.corrcoef(np.concatenate(U, axis=1))) > 1.0 - _AS_ONE
-    # Where none is another's multiple one is a sum of others.
+    # If no pair is proportional, one input is a sum of others.
     those = [n for n, one in zip(inputs, alike, strict=True) if np.sum(one) > 1] or inputs
     words = (
         f"{' and '.join(those)} move as one: no response tells what each of them does; move them "
@@ -275,7 +274,7 @@ def _moving_as_one(
 def _weak(
     omega: np.ndarray, instruments: tuple[str, ...], outputs: dict[str, Output]
 ) -> list[Finding]:
-    """Name the frequencies at which an instrument hardly moves its input."""
+    """Return notes on frequencies at which an instrument hardly moves its input."""
     notes = []
     for name in instruments:
         pairs = [output.pairs[name] for output in outputs.values()]
@@ -297,8 +296,10 @@ def _weak(
 def _outputs(
     windows: Windows, dt: float, names: tuple[Names, list[str]], steps: np.ndarray
 ) -> dict[str, Output]:
-    """Each output's responses; none above half the rate at which an input was logged, whose usual
-    `steps` (inputs,) [s] are."""
+    """Return each output's responses, up to half the rate at which an input was logged.
+
+    `steps` (inputs,) are the usual sample times of the inputs [s].
+    """
     (inputs, instruments), outputs = names
     records, omega, window = windows.records, windows.omega, windows.seconds
     m, first = len(inputs), len(inputs) + len(instruments)
@@ -333,10 +334,10 @@ def _outputs(
 
 
 def _own(records: Sequence[np.ndarray], dt: float, omega: np.ndarray, window: float) -> np.ndarray:
-    """At which frequencies every signal has power of its own: (signals, k).
+    """Return where each signal has power of its own (signals, k).
 
-    Where one has none its spectrum is that of the window's sidelobes, which are coherent as well:
-    two signals behind low-pass filters would show a response far above them.
+    Elsewhere its spectrum comes from the window's sidelobes, which are coherent too. Two low-passed
+    signals would show a response far above their filters.
     """
     length = round(window / dt)
     power = 0.0
@@ -352,11 +353,12 @@ def _own(records: Sequence[np.ndarray], dt: float, omega: np.ndarray, window: fl
 def steady_sd(
     omega: np.ndarray, output: Output, input: str, seconds: float
 ) -> tuple[np.ndarray, float]:
-    """Return the sd of a response's real and imaginary part (k,), and its degrees of freedom. With
-    few averages the noise is a mean over frequencies, so that weights stay smooth.
+    """Return the sd of a response's real and imaginary part (k,), and its degrees of freedom.
+
+    With few averages the noise is a mean over frequencies, so that weights stay smooth.
 
     Args:
-        omega: (k,) [rad/s]
+        omega: frequencies (k,) [rad/s].
     """
     pair = output.pairs[input]
     noise = np.where(np.isfinite(pair.H), output.noise, np.nan)
@@ -372,7 +374,7 @@ def _fits(
     windows: dict[str, Windows],
     holds: dict[str, Hold],
 ) -> tuple[tuple[Wanted, TransferFit | str], ...]:
-    """The transfer functions, or why one cannot be fitted: the responses are there all the same."""
+    """Return the fitted transfer functions, or the reason why one cannot be fitted."""
     fits = []
     for request in settings.transfer_functions:
         output = outputs.get(request.output)
@@ -396,34 +398,33 @@ def _fitted(
     low, high = request.band or (0.0, np.inf)
     used = (octave_mean(omega, pair.coherence) >= request.coherence) & (hz >= low) & (hz <= high)
     H = np.where(used, pair.H, np.nan)
-    # With its hold, which is half a sample late, so that the delay is the vehicle's own.
+    # The hold is part of the model, since it adds half a sample of delay that is not the vehicle's.
     hold = holds[request.input]
     sd, freedom = steady_sd(omega, output, request.input, windows.seconds)
     measured = Measured(omega, H, sd, windows.seconds, pair.coherence, hold, freedom)
     orders = request.zeros, request.poles, request.delay
     fitted = fit_transfer(measured, *orders)
     for _ in range(_ROUNDS):
-        # What the windows do to the record they do to the transfer function.
+        # Windows change the transfer function as they change the record.
         added = window_error(fitted, windows, list(holds).index(request.input), hold)
         if added is None:
             break
-        # All that they do, at the ends too.
+        # Remove the complete error of the windows, including that at the ends.
         fitted = fit_transfer(measured._replace(H=H + pair.added - added), *orders)
     return fitted
 
 
 _AT_REST = 0.01
-"""of an input's largest standard deviation in a part, below which it rests in another"""
+"""Standard deviation below which an input is at rest in a part [fraction of its largest]."""
 
 
 def groups(
     flights: Sequence[Flight], window: int, without: list[Finding]
 ) -> list[tuple[list[str], Parts]]:
-    """Outputs by the parts that they are known in, so that inputs are transformed once for all of
-    them.
+    """Group outputs by their usable parts, so that inputs are transformed once for each group.
 
     Args:
-        without: why an output has no part is added to them.
+        without: receives the reasons why outputs have no part.
     """
     by_parts: dict[Parts, list[str]] = {}
     order = dict.fromkeys(n for f in flights for n in f.outputs)
@@ -437,7 +438,7 @@ def groups(
 
 
 def parts_of(flights: Sequence[Flight], output: str, window: int) -> Parts | str:
-    """The parts without a missing sample, or in words why there is none."""
+    """Return the parts without a missing sample, or the reason why there are none."""
     parts, longest = [], 0
     for i, f in enumerate(flights):
         if output not in f.outputs:
@@ -457,7 +458,7 @@ def parts_of(flights: Sequence[Flight], output: str, window: int) -> Parts | str
 def records_of(
     flights: Sequence[Flight], names: Names, outputs: list[str], parts: Parts
 ) -> list[np.ndarray]:
-    """Inputs, instruments and outputs (signals, N) of each part."""
+    """Return inputs, instruments and outputs (signals, N) of each part."""
     inputs, instruments = names
     return [
         np.stack(
@@ -477,26 +478,26 @@ def coherence_where_moving(
     moving: Sequence[int],
     window: int,
 ) -> Float[np.ndarray, "k l m"]:
-    """Coherence in the flights in which an input moves, of that in all.
+    """Return the coherence in the flights where an input moves, from that in all flights.
 
-    Of sweeps of one stick at a time the others are at rest, and the noise of those flights is
-    nothing that they could be coherent with.
+    With sweeps of one stick at a time, the noise of other flights would reduce the coherence of an
+    input at rest.
 
     Args:
-        moving: the inputs, or their instruments, by their place among the signals.
+        moving: indices of the inputs, or of their instruments, among the signals.
     """
     windows = np.array([max(r.shape[1] - window + 1, 0) for r in records], float)
     sizes = np.array([np.std(r[list(moving)], axis=1) for r in records])
     moves = sizes > _AT_REST * np.max(sizes, axis=0)
     used = np.sum(np.where(moves, windows[:, None], 0.0), axis=0)
-    # One that moves in parts alone that are shorter than a window has none.
+    # An input that moves only in parts shorter than a window has no coherence.
     share = np.where(used > 0, used, np.sum(windows)) / np.sum(windows)
     with np.errstate(all="ignore"):
         return coherence / (coherence + share * (1.0 - coherence))
 
 
 _BLOCK = 4096
-"""frequencies at a time, each with its images"""
+"""Frequencies that are computed together, each with its images."""
 
 
 def forgets(fitted: TransferFit, seconds: float) -> bool:
@@ -508,8 +509,10 @@ def forgets(fitted: TransferFit, seconds: float) -> bool:
 def window_error(
     fitted: TransferFit, windows: Windows, input: int, hold: Hold
 ) -> Complex[np.ndarray, " k"] | None:
-    """Return the error that windows add to the response of a transfer function; None if it does
-    not decay within a window."""
+    """Return the error that windows add to the response of a transfer function.
+
+    Returns None if the response does not decay within a window.
+    """
     if not forgets(fitted, windows.seconds):
         return None
     kept = sorted({*windows.inputs, *(windows.instruments or ())})
@@ -525,8 +528,8 @@ def window_error(
 
 
 def _answer(fitted: TransferFit, u: Float[np.ndarray, " N"], hold: Hold) -> Float[np.ndarray, " N"]:
-    """A transfer function's output (N,), from rest at the first value of its input."""
-    # Padded, or the end of the record would wrap round onto its beginning.
+    """Return a transfer function's output (N,), starting at rest at the first input value."""
+    # Padding prevents the end of the record from wrapping around to its beginning.
     size = 2 * u.size
     lines = np.fft.rfft(u - u[0], size)
     omega = 2.0 * np.pi * np.arange(1, lines.size) / (size * hold.dt)

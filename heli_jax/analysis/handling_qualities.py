@@ -1,24 +1,24 @@
-"""Handling qualities read off a frequency response: bandwidth, phase delay, crossover, margins.
+"""Handling qualities from a frequency response: bandwidth, phase delay, crossover, margins.
 
-Of the response of an attitude to a stick, as ADS-33E-PRF (2000), Figure 2, defines them:
+Definitions for the response of an attitude to a stick, from ADS-33E-PRF (2000), Figure 2:
 
 - w180, the neutral stability frequency: where the phase is -180 deg;
 - phase bandwidth: the highest frequency below it with 45 deg of phase margin, phase -135 deg;
 - gain bandwidth: the highest one below it with 6 dB of gain margin, where the gain is 6 dB above
   that at w180;
-- bandwidth: of rate responses the lesser of both, of attitude command the phase bandwidth;
-- phase delay: (lag at 2 w180 - 180) / (57.3 * 2 w180), angles in degrees; where the phase is not
-  straight between w180 and 2 w180 the lag is that of the line fitted to it by least squares.
+- bandwidth: the lesser of both for rate responses, the phase bandwidth for attitude command;
+- phase delay: (lag at 2 w180 - 180) / (57.3 * 2 w180), angles in degrees. If the phase is not
+  straight between w180 and 2 w180, the lag is that of a least-squares line.
 
-Intervals rest on each number's derivative by all that the response hangs on (the delta method, by
-finite differences), be it the parameters of a fit or the random errors of a measured response;
-those of frequencies are where the response's own interval holds the level that defines them.
+Intervals come from the delta method, with finite differences by all that the response depends on:
+the parameters of a fit, or the random errors of a measured response. The interval of a frequency is
+where the response's own interval contains the defining level.
 
-Compared with what others say of the standard, not with its own text: Ham, Gardner and Tischler
+Checked against publications about the standard, not against its text. Ham, Gardner and Tischler
 (1993), Flight testing and frequency domain analysis for rotorcraft handling qualities
-characteristics: the attitude's response to the stick, a rate's over s in its place, the phase delay
-by two points or by least squares from the neutral stability frequency to its double (CIFER weighs
-that line by coherence, here it is not weighed); Frost and others (2002), AIAA 2002-4869: 45 deg of
+characteristics: the attitude's response to the stick, or a rate's over s; the phase delay by two
+points or by least squares from the neutral stability frequency to its double (CIFER weights that
+line by coherence; here it is not weighted). Frost and others (2002), AIAA 2002-4869: 45 deg of
 phase margin for attitude command, the lesser of that and 6 dB of gain margin for rate responses.
 """
 
@@ -41,30 +41,31 @@ UNITS = {
     "phase_margin": "deg",
     "gain_margin": "dB",
 }
-"""of every number by its name"""
+"""Unit of each quantity, by name."""
 NUMBERS: dict[str, tuple[str, ...]] = {
     "rate": tuple(UNITS)[:6],
     "attitude-command": tuple(UNITS)[:6],
     "open-loop": ("crossover", "w180", "phase_margin", "gain_margin"),
 }
-"""by kind of response what may be known of it"""
+"""Quantities of each kind of response."""
 _DB = 20.0 / np.log(10.0)
 _Z95 = 1.959963984540054
 _POINTS = 500
-"""of the grid on which crossings are looked for"""
+"""Number of grid points for the search for crossings."""
 _STEP = 1e-4
-"""of finite differences, in standard deviations"""
+"""Step of finite differences [sd]."""
 _LINE = 60
-"""frequencies from w180 to 2 w180 through which the line of the phase delay is fitted"""
+"""Number of frequencies from w180 to 2 w180 for the line of the phase delay."""
 _RISES = np.radians(10.0)
-"""of phase from the lowest frequency to the crossover, from which on a loop is called one of an
-unstable vehicle"""
+"""Least phase rise from the lowest frequency to the crossover that indicates an unstable vehicle
+[rad].
+"""
 _VAGUE = 2.0
-"""the factor by which a frequency's interval may reach to either side"""
+"""Largest factor from a frequency to either end of its interval."""
 
 
 class Number(NamedTuple):
-    """One number with its 95 % interval; sd and interval are NaN where they are not known."""
+    """A value with its 95 % interval; sd and interval are NaN if unknown."""
 
     value: float
     sd: float
@@ -73,8 +74,10 @@ class Number(NamedTuple):
 
     @property
     def known(self) -> bool:
-        """True if it has an interval: a model whose parameters the data do not determine, or whose
-        fit did not converge, has none."""
+        """True if the number has an interval.
+
+        There is none if the parameters are not identifiable or the fit did not converge.
+        """
         return self.sd >= 0.0
 
 
@@ -83,23 +86,23 @@ class HandlingQualities(NamedTuple):
 
     kind: Kind
     numbers: dict[str, Number]
-    """by name, those that are determined; `UNITS` has the units"""
+    """Determined quantities by name; units are in `UNITS`."""
     sentences: tuple[str, ...]
-    """why others are not, and what is to be heeded"""
+    """Reasons why others are missing, and cautions."""
     sign: int
-    """-1 where the response was turned over: a stick that is logged the other way round"""
+    """-1 if the response was inverted, since the stick is logged with the opposite sign."""
     band: tuple[float, float]
-    """[rad/s] in which the response is known"""
+    """Band in which the response is known [rad/s]."""
 
 
 def handling_qualities(curve: Curve, kind: Kind = "rate") -> HandlingQualities:
-    """Bandwidth and phase delay of an attitude's response, or crossover and margins of a loop.
+    """Return bandwidth and phase delay of an attitude's response, or crossover and margins of a
+    loop.
 
     Args:
-        curve: the response of an attitude to a stick, or an open loop's that is closed by negative
-            unity feedback. The sign of an attitude's response does not matter: it is taken for
-            that of a vehicle whose lag grows from 0 or 90 deg on, as its gain falls. An open loop
-            is taken as it is.
+        curve: the response of an attitude to a stick, or of an open loop for negative unity
+            feedback. The sign of an attitude's response does not matter: its lag is assumed to grow
+            from 0 or 90 deg as the gain falls. The sign of an open loop is kept.
     """
     x = np.log(np.geomspace(*curve.band, _POINTS))
     points = curve.at(np.exp(x))
@@ -113,7 +116,7 @@ def handling_qualities(curve: Curve, kind: Kind = "rate") -> HandlingQualities:
             continue
         if name in _LEVELS:
             _put_frequency(name, response, values, by, numbers, sentences)
-        # The delays hang on w180.
+        # The delays depend on w180.
         elif kind == "open-loop" or "w180" in numbers:
             numbers[name] = _linear(values[name], by[name])
     if kind == "open-loop":
@@ -125,11 +128,11 @@ def handling_qualities(curve: Curve, kind: Kind = "rate") -> HandlingQualities:
 
 
 def _branch(x: np.ndarray, points: Point) -> tuple[int, np.ndarray]:
-    """The sign of the response, and its phase (k,) [rad] unwrapped, on the branch of its slope."""
+    """Return the response's sign and its unwrapped phase (k,) [rad], on the branch of its slope."""
     phase = np.unwrap(points.phase)
-    # Bode's relation: a gain that falls with the n-th power of the frequency goes with n right
-    # angles of lag, whatever the stick's sign. It fails near a mode that grows, and delays add to
-    # the lag towards higher frequencies: what most of the lower half of the band says.
+    # Bode's relation: a gain that falls with the n-th power of frequency has n right angles of lag,
+    # for any sign of the stick. It fails near a growing mode, and delays add lag at high
+    # frequencies. So the majority in the lower half of the band decides.
     low = slice(0, x.size // 2)
     turns = np.round((phase - 0.5 * np.pi * np.gradient(points.log_gain, x))[low] / np.pi)
     values, counts = np.unique(turns, return_counts=True)
@@ -138,8 +141,10 @@ def _branch(x: np.ndarray, points: Point) -> tuple[int, np.ndarray]:
 
 
 def _loop_phase(x: np.ndarray, points: Point) -> np.ndarray:
-    """An open loop's phase (k,) [rad] unwrapped, between -360 and 0 deg at the crossover: its sign
-    is known, and that of an unstable vehicle may lag by 180 deg from the lowest frequency on."""
+    """Return an open loop's unwrapped phase (k,) [rad], between -360 and 0 deg at the crossover.
+
+    Its sign is known. With an unstable vehicle the lag may be 180 deg at the lowest frequency.
+    """
     phase = np.unwrap(points.phase)
     falls = np.flatnonzero((points.log_gain[:-1] > 0) & (points.log_gain[1:] <= 0))
     if falls.size:
@@ -155,11 +160,11 @@ class _Response(NamedTuple):
     """A curve on a grid, with its phase on one branch; arrays (k,)."""
 
     x: np.ndarray
-    """logarithm of the frequency"""
+    """Natural logarithm of the frequency."""
     gain: np.ndarray
-    """natural logarithm"""
+    """Natural logarithm of the gain."""
     phase: np.ndarray
-    """[rad]"""
+    """Phase [rad]."""
     points: Point
 
 
@@ -169,14 +174,15 @@ _LEVELS: dict[str, tuple[str, float]] = {
     "gain_bandwidth": ("gain", np.nan),
     "crossover": ("gain", 0.0),
 }
-"""by frequency the quantity whose level defines it, and the level; that of the gain bandwidth moves
-with the gain at w180"""
+"""Quantity and level that define each frequency. The level of the gain bandwidth moves with the
+gain at w180.
+"""
 
 
 def _values(kind: Kind, x: np.ndarray, gain: np.ndarray, phase: np.ndarray) -> dict[str, float]:
-    """The numbers of a response on a grid, those that there are; of frequencies the logarithms.
+    """Return the existing quantities of a response on a grid; frequencies as logarithms.
 
-    `level` is that of the gain bandwidth.
+    `level` is the level of the gain bandwidth.
     """
     found: dict[str, float | None] = {"w180": _fall(x, phase, -np.pi, first=True)}
     neutral = found["w180"]
@@ -199,8 +205,10 @@ def _values(kind: Kind, x: np.ndarray, gain: np.ndarray, phase: np.ndarray) -> d
 def _fall(
     x: np.ndarray, values: np.ndarray, level: float, below: float | None = None, first: bool = False
 ) -> float | None:
-    """Return the last place (or the first) where values (k,) fall below a level; None where there
-    is none before `below`."""
+    """Return the last place (or the first) where values (k,) fall below a level.
+
+    Returns None if there is none before `below`.
+    """
     off = values - level
     i = np.flatnonzero((off[:-1] > 0) & (off[1:] <= 0))
     places = x[i] + (x[i + 1] - x[i]) * off[i] / (off[i] - off[i + 1])
@@ -209,7 +217,7 @@ def _fall(
 
 
 def _delays(x: np.ndarray, phase: np.ndarray, neutral: float) -> dict[str, float | None]:
-    """The phase delay between w180 and its double, by two points and by a line."""
+    """Return the phase delay between w180 and its double, by two points and by a line."""
     omega = np.exp(neutral) * np.linspace(1.0, 2.0, _LINE)
     lag = np.interp(np.log(omega), x, phase)
     return {
@@ -219,7 +227,7 @@ def _delays(x: np.ndarray, phase: np.ndarray, neutral: float) -> dict[str, float
 
 
 def _derivatives(kind: Kind, response: _Response) -> dict[str, np.ndarray]:
-    """Derivatives (q,) of the numbers; NaN where they are not known."""
+    """Return the derivatives (q,) of the quantities; NaN where unknown."""
     x, gain, phase, points = response
     steps = []
     for by_gain, by_phase in zip(points.gain_gradient.T, points.phase_gradient.T, strict=True):
@@ -235,10 +243,11 @@ def _derivatives(kind: Kind, response: _Response) -> dict[str, np.ndarray]:
 def _ends(
     response: _Response, name: str, values: dict[str, float], by: dict[str, np.ndarray]
 ) -> tuple[float, float]:
-    """Frequencies [rad/s] next to a number's past which the curve's band (Fieller) leaves out the
-    level; beyond the band infinitely far away, NaN where errors are not known.
+    """Return the ends of a frequency's interval [rad/s], where the curve's band (Fieller) leaves
+    the level.
 
-    Not the error over the slope: of a noisy curve the slope is known worse than the value.
+    An end outside the band is infinite; unknown errors give NaN. The error over the slope is not
+    used, since for a noisy curve the slope is less certain than the value.
     """
     of_gain = _LEVELS[name][0] == "gain"
     level, by_level = _LEVELS[name][1], 0.0
@@ -275,7 +284,7 @@ def _put_frequency(
     numbers: dict[str, Number],
     sentences: list[str],
 ) -> None:
-    """Put a frequency among the numbers, or a sentence where its interval says nothing."""
+    """Add a frequency to the numbers, or a sentence if its interval is too wide."""
     omega, sd = float(np.exp(values[name])), float(np.linalg.norm(by[name]))
     low, high = _ends(response, name, values, by)
     if low < omega / _VAGUE or high > omega * _VAGUE or sd > 1.0:
@@ -303,8 +312,7 @@ def _explain_attitude(
 ) -> None:
     """State why numbers of an attitude's response are missing.
 
-    Args:
-        high: end of the band [rad/s].
+    Args: high: upper end of the band [rad/s].
     """
     if "phase_bandwidth" not in values:
         sentences.append(_missing("phase bandwidth", "the phase does not fall through -135 deg"))
@@ -344,8 +352,9 @@ def _put_bandwidth(kind: Kind, numbers: dict[str, Number], sentences: list[str])
 
 
 def _explain_loop(response: _Response, values: dict[str, float], sentences: list[str]) -> None:
-    """State why numbers of a loop are missing, and how far the gain of one around an unstable
-    vehicle may fall."""
+    """State why numbers of a loop are missing, and the gain reduction limit around an unstable
+    vehicle.
+    """
     if "crossover" not in values:
         sentences.append(_missing("crossover", "the gain does not fall through 0 dB in the band"))
     else:

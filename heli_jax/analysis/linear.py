@@ -10,11 +10,11 @@ from heli_jax.dynamics.jacobians import StateSpace, jacobians
 from heli_jax.dynamics.model import Model, axes_of
 from heli_jax.dynamics.onboard.delays import require_past
 
-# Params, State and Inputs are classes of the user's: `Any` below.
+# Params, State and Inputs are the user's classes, hence `Any` below.
 
 
 class Linearization(NamedTuple):
-    """A, B, C, D about a point, with the names of their rows and columns."""
+    """Matrices A, B, C, D at a point, with the names of their rows and columns."""
 
     matrices: StateSpace
     states: tuple[str, ...]
@@ -22,7 +22,7 @@ class Linearization(NamedTuple):
     outputs: tuple[str, ...]
 
     def to_control(self) -> Any:  # python-control is an extra: its class cannot be named here
-        """The same as a `control.StateSpace` of python-control, with its names.
+        """Return a `control.StateSpace` of python-control with the same names.
 
         Raises:
             ImportError: python-control is not installed.
@@ -39,11 +39,11 @@ class Linearization(NamedTuple):
 
 
 def linearize(model: Model, params: Any, state: Any = None, inputs: Any = None) -> Linearization:
-    """The model's matrices at a point.
+    """Return the model's matrices at a point.
 
     Args:
-        state: the model's initial state unless given.
-        inputs: zeros unless given.
+        state: default: the model's initial state.
+        inputs: default: zeros.
     """
     return Linearization(
         jacobians(model, params, state, inputs),
@@ -54,11 +54,11 @@ def linearize(model: Model, params: Any, state: Any = None, inputs: Any = None) 
 
 
 def modes(model: Model, params: Any, state: Any = None, inputs: Any = None) -> np.ndarray:
-    """Eigenvalues of A [1/s], (n,) complex, slowest first.
+    """Return the eigenvalues of A [1/s], (n,) complex, slowest first.
 
     Args:
-        state: the model's initial state unless given.
-        inputs: zeros unless given.
+        state: default: the model's initial state.
+        inputs: default: zeros.
 
     Raises:
         ValueError: the delay of a delay line is negative.
@@ -69,42 +69,42 @@ def modes(model: Model, params: Any, state: Any = None, inputs: Any = None) -> n
 
 
 class Mode(NamedTuple):
-    """A motion of its own."""
+    """An eigenmode."""
 
     eigenvalue: complex
-    """[1/s]; of a pair the one with the positive imaginary part"""
+    """Eigenvalue [1/s]; for a pair, the one with positive imaginary part."""
     name: str
-    """what moves most, as 'roll with flybar roll', or 'phugoid'"""
+    """Dominant motion, such as 'roll with flybar roll', or 'phugoid'."""
     frequency: float
-    """undamped, |eigenvalue| [rad/s]"""
+    """Undamped frequency |eigenvalue| [rad/s]."""
     damping: float
-    """ratio, 1 for a motion that does not oscillate, negative where it grows"""
+    """Damping ratio; 1 without oscillation, negative for a growing mode."""
     shares: dict[str, float]
-    """of each state in the mode; they add up to 1"""
+    """Share of each state in the mode; the sum is 1."""
 
 
-# Which motion a state that belongs to no axis is of; others stand for themselves.
+# Motions of states that belong to no axis; other states stand for themselves.
 _MOTIONS = {
     "x": "surge", "dx": "surge", "y": "sway", "dy": "sway", "z": "heave", "dz": "heave",
     "Omega": "rotor speed", "governor": "governor", "vi": "inflow",
 }  # fmt: skip
 _TAKES_PART = 0.2
-"""share of a motion in a mode from which on the mode has its name too"""
+"""Least share of a motion in a mode for the mode's name to include it."""
 _STILL = 1e-9
-"""of the fastest eigenvalue (or 1/s): slower is zero, which rounding has spread"""
+"""Largest eigenvalue that counts as zero after rounding [fraction of the fastest, or of 1/s]."""
 
 
 def eigenmodes(
     model: Model, params: Any, state: Any = None, inputs: Any = None
 ) -> tuple[Mode, ...]:
-    """The modes of the linearisation, slowest first, named by the states that take part.
+    """Return the modes of the linearisation, slowest first, named by the dominant states.
 
-    A state's share is its participation factor |left x right eigenvector|; in a mode that does not
-    move (an eigenvalue of zero, a position or a heading) it is the right eigenvector's alone.
+    A state's share is its participation factor |left x right eigenvector|; for an eigenvalue of
+    zero (a position or a heading) it is that of the right eigenvector alone.
 
     Args:
-        state: the model's initial state unless given.
-        inputs: zeros unless given.
+        state: default: the model's initial state.
+        inputs: default: zeros.
 
     Raises:
         ValueError: the delay of a delay line is negative.
@@ -112,31 +112,30 @@ def eigenmodes(
     require_past(model, params)
     A = np.asarray(jacobians(model, params, state, inputs).A, np.float64)
     values, left, right = scipy.linalg.eig(A, left=True)
-    # At least 1/s: of a model that does not move at all every eigenvalue is zero.
+    # At least 1/s, since all eigenvalues may be zero.
     largest = max(float(np.max(np.abs(values), initial=0.0)), 1.0)
     names, motions, result = naming.names(model.State), _motions(model), []
     for i in np.argsort(np.abs(values), kind="stable"):
         value = complex(values[i])
-        if value.imag < 0:  # the other one of its pair tells the same
+        if value.imag < 0:  # its conjugate has the same content
             continue
         still = abs(value) < _STILL * largest
-        # The product does not depend on units. Of several zeros the left eigenvectors are any that
-        # span the same space, so that products say nothing.
+        # The product does not depend on units. For several zeros, left eigenvectors are an
+        # arbitrary basis of their space, so products are meaningless.
         part = np.abs(right[:, i]) if still else np.abs(left[:, i] * right[:, i])
         part = part / np.sum(part)
         shares = dict(zip(names, (float(p) for p in part), strict=True))
         size = abs(value)
-        # A mode that stays where it is does not oscillate; the ratio itself is rounding over
-        # rounding.
+        # A mode with zero eigenvalue does not oscillate; its ratio would be rounding over rounding.
         damping = 1.0 if still else -value.real / size
         result.append(Mode(value, _mode_name(shares, motions), size, damping, shares))
     return tuple(result)
 
 
 def _motions(model: Model) -> dict[str, str]:
-    """The motion that each state belongs to."""
+    """Return the motion of each state."""
     motions, axes = dict(_MOTIONS), axes_of(model)
-    # Along the axes of the body where the rates are about these; alone, w may be anything.
+    # Body axes if the rates are body rates. Otherwise w may mean anything.
     if any(axis.rate in ("p", "q", "r") for axis in axes):
         motions |= {"u": "surge", "v": "sway", "w": "heave"}
     if any(axis.name == "heave" for axis in axes):
@@ -155,19 +154,19 @@ def _mode_name(shares: dict[str, float], motions: dict[str, str]) -> str:
         by_motion[motion] = by_motion.get(motion, 0.0) + share
     ordered = sorted(by_motion, key=lambda m: -by_motion[m])
     part = [m for m in ordered if by_motion[m] >= _threshold(m)]
-    # The body before what moves with it.
+    # Name the body before motions relative to it.
     part = sorted(part or ordered[:1], key=lambda m: m.startswith(("flybar", "rotor", "inflow")))
     return " with ".join(_known(part))
 
 
 def _threshold(motion: str) -> float:
-    # The tilt is one state where a body has two, an angle and its rate.
+    # Tilt is one state, while a body axis has two, an angle and its rate.
     return 0.75 * _TAKES_PART if motion.endswith("flapping") else _TAKES_PART
 
 
 def _known(part: list[str]) -> list[str]:
-    """The motions of a mode, those that have a name of their own together under it."""
-    # Attitude and speed in turn, each driving the other: the pitch's is the phugoid of books.
+    """Merge motions of a mode that together have a name of their own."""
+    # Attitude and speed that drive each other in turn; in pitch this is the phugoid of textbooks.
     for axis, along, name in (("pitch", "surge", "phugoid"), ("roll", "sway", "lateral phugoid")):
         if {axis, along} <= set(part):
             part = [name, *(m for m in part if m not in (axis, along))]

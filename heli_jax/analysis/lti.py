@@ -1,4 +1,4 @@
-"""Between discrete and continuous transfer functions: c2d, d2c, and what can go wrong."""
+"""Conversion between discrete and continuous transfer functions: c2d and d2c, with their limits."""
 
 from typing import Literal
 
@@ -10,13 +10,13 @@ Polynomials = tuple[np.ndarray, np.ndarray]
 
 
 def c2d(num: ArrayLike, den: ArrayLike, dt: float) -> Polynomials:
-    """The zero-order-hold equivalent of H(s) = num/den for steps of `dt` [s].
+    """Return the zero-order-hold equivalent of H(s) = num/den for steps of `dt` [s].
 
     Both results have the length of `den`, and the denominator begins with 1.
 
     Args:
-        num: of H(s), highest power first.
-        den: of H(s), highest power first.
+        num: numerator of H(s), highest power first.
+        den: denominator of H(s), highest power first.
         dt: time between samples [s].
 
     Raises:
@@ -26,7 +26,8 @@ def c2d(num: ArrayLike, den: ArrayLike, dt: float) -> Polynomials:
     n = A.shape[0]
     M = np.zeros((n + 1, n + 1))
     M[:n, :n], M[:n, n:] = A, B
-    # The exponential of [[A, B], [0, 0]] holds the integral of the held input: A may be singular.
+    # The exponential of [[A, B], [0, 0]] contains the integral of the held input, also for singular
+    # A.
     E = scipy.linalg.expm(M * dt)
     return _polynomials(E[:n, :n], E[:n, n:], C, D)
 
@@ -34,21 +35,20 @@ def c2d(num: ArrayLike, den: ArrayLike, dt: float) -> Polynomials:
 def d2c(
     num: ArrayLike, den: ArrayLike, dt: float, method: Literal["zoh", "real-log"] = "zoh"
 ) -> Polynomials:
-    """A continuous H(s) for the discrete Hd(z) = num/den with steps of `dt` [s].
+    """Return a continuous H(s) for the discrete Hd(z) = num/den with steps of `dt` [s].
 
-    "zoh" inverts the zero-order hold and refuses where no inverse of the same order exists.
-    "real-log" takes the real part of the matrix logarithm of [[Ad, Bd], [0, 1]], as the numbers
-    of Kim & Tilbury's eq. 35 were made from eq. 34; where "zoh" refuses, its result is another
-    system than Hd.
+    "zoh" inverts the zero-order hold and raises if no inverse of the same order exists. "real-log"
+    takes the real part of the matrix logarithm of [[Ad, Bd], [0, 1]], which gives Kim & Tilbury's
+    eq. 35 from eq. 34. Where "zoh" raises, its result differs from Hd.
 
     Args:
-        num: of Hd(z), highest power first.
-        den: of Hd(z), highest power first.
+        num: numerator of Hd(z), highest power first.
+        den: denominator of Hd(z), highest power first.
         dt: time between samples [s].
 
     Raises:
-        ValueError: no such method, not a proper transfer function, a pole at z = 0 (its logarithm
-            does not exist), or, with "zoh", a pole on the negative real axis, which is named.
+        ValueError: unknown method, not a proper transfer function, a pole at z = 0 (no logarithm
+            exists), or, with "zoh", a pole on the negative real axis, which the message names.
     """
     if method not in ("zoh", "real-log"):
         raise ValueError(f"method: expected 'zoh' or 'real-log', got {method!r}")
@@ -56,10 +56,10 @@ def d2c(
     n = A.shape[0]
     poles = np.asarray(np.linalg.eigvals(A), dtype=np.complex128)
     size = max(1.0, float(np.max(np.abs(poles), initial=0.0)))
-    # A pole at zero is a whole sample of delay, which no system of finite order in s has.
+    # A pole at zero is a whole sample of delay, which a system of finite order in s cannot have.
     if np.any(np.abs(poles) < 1e-12 * size):
         raise ValueError("the discrete system has a pole at z = 0: its logarithm does not exist")
-    # Rounding may turn a real pole a little off the axis.
+    # Rounding may move a real pole slightly off the axis.
     negative = poles[(poles.real < 0) & (np.abs(poles.imag) < 1e-9 * size)].real
     if method == "zoh" and negative.size:
         named = ", ".join(f"{p:.3f}" for p in sorted(negative))
@@ -70,8 +70,8 @@ def d2c(
         )
     M = np.eye(n + 1)
     M[:n, :n], M[:n, n:] = A, B
-    # [[Ad, Bd], [0, 1]] is the exponential of [[A, B], [0, 0]] dt.
-    # logm warns where eigenvalues are negative; that case was named above.
+    # [[Ad, Bd], [0, 1]] is the exponential of [[A, B], [0, 0]] dt. logm warns for negative
+    # eigenvalues, which were handled above.
     L = np.asarray(scipy.linalg.logm(M.astype(complex))).real / dt
     if not np.isfinite(L).all():
         raise ValueError("the matrix logarithm of the discrete system does not exist")
@@ -90,11 +90,11 @@ def _state_space(num: ArrayLike, den: ArrayLike, dt: float) -> tuple[np.ndarray,
         raise ValueError("den must have a power of one at least")
     if b.size > a.size:
         raise ValueError("num is of higher order than den: not a proper transfer function")
-    # A leading one in the denominator fixes the factor that both polynomials have in common.
+    # A leading 1 in the denominator fixes the common factor of both polynomials.
     b, a = b / a[0], a / a[0]
     padded = np.concatenate([np.zeros(a.size - b.size), b])
     n = a.size - 1
-    # The controllable canonical form.
+    # Controllable canonical form.
     A = np.eye(n, k=-1)
     A[0] = -a[1:]
     B = np.eye(n, 1)
@@ -104,14 +104,15 @@ def _state_space(num: ArrayLike, den: ArrayLike, dt: float) -> tuple[np.ndarray,
 
 def _polynomials(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> Polynomials:
     den = np.real(np.poly(A))
-    # By coefficients and not as det(s - A + bc) - det(s - A), in which small coefficients are
-    # differences of large ones.
+    # Not det(s - A + bc) - det(s - A), which has small coefficients as differences of large ones.
     num = D[0, 0] * den + _numerator(A, B[:, 0], C[0])
     return num, den
 
 
 def _numerator(A: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """num of c (s - A)^-1 b by Leverrier's recursion: linear in b and c, nothing cancels."""
+    """Return num of c (s - A)^-1 b by Leverrier's recursion, linear in b and c, without
+    cancellation.
+    """
     n = A.shape[0]
     den = np.real(np.poly(A))
     num = np.zeros(n + 1)

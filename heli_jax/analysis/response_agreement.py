@@ -9,34 +9,35 @@ from jaxtyping import Bool, Complex, Float
 from heli_jax.analysis.spectra import COHERENT, Windowed, octave_mean
 
 USUAL_J = 100.0
-"""at most, where a response is usually called acceptable (Tischler and Remple, 2012, chapter 11)"""
+"""Largest J of a response usually called acceptable (Tischler and Remple, 2012, chapter 11)."""
 _POINTS = 20
-"""frequencies, equally spaced in the logarithm, that J is usually taken over"""
+"""Usual number of frequencies for J, equally spaced in the logarithm."""
 _MISFIT = 2.0
-"""times what random errors let expect, from which on squared errors speak against the model"""
+"""Ratio of squared errors to those expected from random errors at which the model is doubted."""
 
 
 class PairAgreement(NamedTuple):
-    """One response."""
+    """Agreement of one response."""
 
     input: str
     output: str
     low: float
     high: float
-    """first and last frequency that takes part [Hz]; NaN where none does"""
+    """First and last frequency used [Hz]; NaN if none is."""
     lines: int
-    """frequencies that take part"""
+    """Number of frequencies used."""
     of: int
-    """and of all in the band"""
+    """Number of frequencies in the band."""
     coherence: float
-    """mean partial coherence over those that take part"""
+    """Mean partial coherence over the frequencies used."""
     J: float
-    """Tischler's cost over about twenty of them with a coherence of 0.6 in the mean over an octave;
-    NaN where there are none"""
+    """Tischler's cost over about twenty frequencies with a mean coherence of 0.6 over an octave;
+    NaN if there are none.
+    """
     chi_squared: float
-    """squared errors over their variance, in the mean; 1 is expected"""
+    """Mean of squared errors over their variance; 1 is expected."""
     of_none: float
-    """the same of a model without any response: how far the measured one stands above its errors"""
+    """The same for a model without response: the measured response relative to its errors."""
 
 
 APART = (
@@ -46,22 +47,22 @@ APART = (
 
 
 class ResponseAgreement(NamedTuple):
-    """All responses together."""
+    """Agreement of all responses together."""
 
     pairs: tuple[PairAgreement, ...]
     chi_squared: float
-    """squared errors per degree of freedom, between all outputs and inputs"""
+    """Squared errors per degree of freedom, over all outputs and inputs."""
     lower95: float
     upper95: float
-    """what random errors let expect of it with 95 % probability"""
+    """95 % interval of chi_squared expected from random errors."""
     freedom: float
-    """degrees of freedom: independent numbers less unknowns"""
+    """Degrees of freedom: independent values minus unknowns."""
     window: float
-    """[s]"""
+    """Length of a window [s]."""
     averages: tuple[tuple[str, float], ...]
-    """independent ones by output"""
+    """Number of independent averages, by output."""
     instruments: tuple[str, ...]
-    """inputs whose responses are taken by an excitation that was logged"""
+    """Inputs whose responses use a logged excitation."""
     notes: tuple[str, ...]
 
     @property
@@ -76,7 +77,7 @@ class ResponseAgreement(NamedTuple):
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Sentences on the responses that are not compared."""
+        """Sentences on responses that are not compared."""
         words = list(self.notes)
         left = [f"{p.input} to {p.output}" for p in self.pairs if not p.lines]
         if left:
@@ -99,7 +100,7 @@ def pair_agreements(
     variance: Float[np.ndarray, "k p m"],
     coherence: Float[np.ndarray, "k p m"],
 ) -> tuple[PairAgreement, ...]:
-    """Response by response."""
+    """Return the agreement of each response."""
     out = []
     for j, output in enumerate(w.outputs):
         for i, input in enumerate(w.inputs):
@@ -125,9 +126,12 @@ def pair_agreements(
 
 
 def _J(w: Windowed, used: np.ndarray, of_pair: tuple[np.ndarray, np.ndarray, np.ndarray]) -> float:
-    """Over frequencies about equally spaced in the logarithm, as it is usually taken; where the
-    response is coherent, since errors of noise in decibels know no bound."""
-    # Here: it brings SciPy's optimiser, which takes longer to import than this to run.
+    """Return J over frequencies about equally spaced in the logarithm, where the response is
+    coherent.
+
+    Errors of noise in decibels are unbounded.
+    """
+    # Local import: SciPy's optimiser takes longer to import than this function to run.
     from heli_jax.analysis.transfer_fit import Measured, mismatch
 
     used = used & (octave_mean(2.0 * np.pi * w.hz, of_pair[2]) >= COHERENT)
@@ -142,7 +146,9 @@ def _J(w: Windowed, used: np.ndarray, of_pair: tuple[np.ndarray, np.ndarray, np.
 
 
 def expected_interval(freedom: float, of_noise: float) -> tuple[float, float]:
-    """Return the 95 % interval of chi-squared over its degrees of freedom if the noise was
-    estimated from the residual of the responses: Fisher's F."""
+    """Return the 95 % interval of chi-squared over its degrees of freedom, from Fisher's F.
+
+    The noise was estimated from the residual of the responses.
+    """
     low, high = scipy.special.fdtri(freedom, max(of_noise, 1.0), np.array([0.025, 0.975]))
     return float(low), float(high)

@@ -1,6 +1,6 @@
-"""Frequency responses as smooth curves with errors: of a measured response, and of a model.
+"""Frequency responses as smooth curves with errors: from measurement or from a model.
 
-Both know at every frequency gain and phase, and how they hang on what the response rests on: the
+Both give gain and phase at any frequency, and their derivatives by their sources of error: the
 random errors of bins, or the parameters of a fit with their covariance.
 """
 
@@ -20,34 +20,34 @@ from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
 
 _HALF_OCTAVE = 0.5 * np.log(2.0)
-"""logarithm of how far a local fit to a measured response reaches to either side"""
+"""Half-width of a local fit to a measured response [log frequency]."""
 _PRECISE = 0.03
-"""relative random error of bins up to which it is so; with larger ones it reaches further, to an
-octave"""
+"""Relative random error of bins at which the half-width starts to grow, up to an octave."""
 _LEAST_BINS = 7
-"""in a local fit, which reaches further where there are fewer"""
+"""Least number of bins in a local fit, which widens if there are fewer."""
 _SHARP, _SURELY = 0.2, 4.0
-"""relative (or rad), and in standard deviations, by which two bins side by side are off their local
-fits where a response is sharper than these"""
+"""Deviation of two adjacent bins from their local fits that indicates a sharper response [relative
+or rad; sd].
+"""
 _AROUND = 3
-"""bins to either side that say where the phase of one is"""
+"""Number of bins to either side that give the expected phase of a bin."""
 
 
 class Point(NamedTuple):
-    """A response at k frequencies, and what it hangs on: q numbers of unit variance."""
+    """A response at k frequencies, with derivatives by q independent errors of unit variance."""
 
     log_gain: Float[np.ndarray, " k"]
-    """natural logarithm"""
+    """Natural logarithm of the gain."""
     phase: Float[np.ndarray, " k"]
-    """[rad], on any branch"""
+    """Phase [rad], on any branch."""
     gain_gradient: Float[np.ndarray, "k q"]
-    """of the logarithm of the gain; NaN where no error is known"""
+    """Derivative of the logarithm of the gain; NaN if no error is known."""
     phase_gradient: Float[np.ndarray, "k q"]
-    """[rad]"""
+    """Derivative of the phase [rad]."""
 
     @property
     def response(self) -> Complex[np.ndarray, " k"]:
-        """The response itself."""
+        """Response, complex."""
         return np.exp(self.log_gain + 1j * self.phase)
 
     @property
@@ -57,7 +57,7 @@ class Point(NamedTuple):
 
     @property
     def phase_sd(self) -> Float[np.ndarray, " k"]:
-        """[rad]"""
+        """Standard deviation of the phase [rad]."""
         return np.linalg.norm(self.phase_gradient, axis=1)
 
 
@@ -65,15 +65,15 @@ class Curve(NamedTuple):
     """A response at any frequency of a band."""
 
     at: Callable[[Float[np.ndarray, " k"]], Point]
-    """by frequency [rad/s]"""
+    """Function of frequency [rad/s]."""
     band: tuple[float, float]
-    """[rad/s]"""
+    """Band [rad/s]."""
     caution: str = ""
-    """where the curve is not the response itself, in words"""
+    """Frequencies at which the curve may differ from the response, in words."""
 
 
 def integrated(curve: Curve) -> Curve:
-    """The response of an angle, from that of its rate."""
+    """Return the response of an angle, from that of its rate."""
 
     def at(omega: np.ndarray) -> Point:
         p = curve.at(omega)
@@ -83,7 +83,7 @@ def integrated(curve: Curve) -> Curve:
 
 
 def times(curve: Curve, gain: float) -> Curve:
-    """The response with a gain that is known, such as a loop's; one below zero turns it over."""
+    """Return the response times a known gain, such as a loop's; a negative gain inverts it."""
     turned = np.pi if gain < 0 else 0.0
 
     def at(omega: np.ndarray) -> Point:
@@ -96,9 +96,9 @@ def times(curve: Curve, gain: float) -> Curve:
 def without_hold(
     omega: Float[np.ndarray, " k"], H: Complex[np.ndarray, " k"], hold: Hold
 ) -> Complex[np.ndarray, " k"]:
-    """A sampled record's response without what the input does between samples.
+    """Return a sampled record's response without the hold of the input.
 
-    The images about multiples of the rate stay in it; an attitude hardly has any.
+    Images about multiples of the rate remain, but are small for an attitude.
     """
     _, share = images(omega, hold)
     return H / share[:, share.shape[1] // 2]
@@ -111,20 +111,19 @@ def measured_curve(
     coherence: Float[np.ndarray, " k"],
     window: float,
 ) -> Curve | str:
-    """A measured response by local quadratics in logarithms, or why there is none in words.
+    """Fit local quadratics in logarithms to a measured response; return a reason if that fails.
 
-    Gain and phase are fitted over half an octave to either side, up to an octave where errors are
-    large, each bin by its random error.
-    Errors of bins that one window hardly tells apart are correlated: independent ones are 1.95
-    lines of the window apart. The band is the widest one of coherence 0.6 in the mean over an
-    octave in which no bin leaps by more than a right angle from those around it: that is noise,
-    and past it the number of whole turns is not known.
+    Gain and phase are fitted over half an octave to either side, or up to an octave if errors are
+    large. Each bin is weighted by its random error. Errors of close bins are correlated;
+    independent bins are 1.95 lines of the window apart. The band is the widest one with a mean
+    coherence of 0.6 over an octave in which no bin deviates by more than a right angle from its
+    neighbours. Larger jumps are noise, and beyond them the number of whole turns is unknown.
 
     Args:
-        omega: (k,) [rad/s], rising.
-        H: (k,) NaN where it is not known.
-        sd: (k,) of its real and of its imaginary part.
-        coherence: (k,) partial.
+        omega: frequencies (k,) [rad/s], rising.
+        H: response (k,); NaN where unknown.
+        sd: standard deviation (k,) of the real and of the imaginary part.
+        coherence: partial coherence (k,).
         window: length of the Hann windows [s].
     """
     known = (octave_mean(omega, coherence) >= COHERENT) & np.isfinite(H) & (np.abs(H) > 0)
@@ -136,7 +135,7 @@ def measured_curve(
             f"{coherent.size} frequencies side by side have a coherence of {COHERENT} in the mean "
             f"over an octave, expected {_LEAST_BINS} at least: more `points`, or more excitation"
         )
-    # Unwrapped past a bin that leaps, all that follows may be a turn off.
+    # Beyond a bin that jumps, unwrapping may be wrong by a turn.
     known[coherent] &= ~_leaps(H[coherent], sd[coherent])
     run = _widest(np.log(omega), known)
     if run.size < _LEAST_BINS:
@@ -149,7 +148,7 @@ def measured_curve(
     def at(query: np.ndarray) -> Point:
         value = _local(x, np.log(query), relative)
         gradient, nothing = value @ root, np.zeros((query.size, run.size))
-        # What phase rests on are other numbers than what gain does: both errors are independent.
+        # Gain and phase depend on different random numbers, since their errors are independent.
         log = value @ y
         return Point(
             log[:, 0],
@@ -163,8 +162,9 @@ def measured_curve(
 
 
 def _too_sharp(w: np.ndarray, off: np.ndarray, relative: np.ndarray) -> str:
-    """Return, in words, where a response (k,) differs from its own local fits by more than random
-    error."""
+    """Return, in words, where a response (k,) differs from its local fits by more than random
+    error.
+    """
     far = (off > _SHARP) & (off > _SURELY * relative)
     both = np.flatnonzero(far[:-1] & far[1:])
     if not both.size:
@@ -178,9 +178,10 @@ def _too_sharp(w: np.ndarray, off: np.ndarray, relative: np.ndarray) -> str:
 
 
 def _leaps(H: np.ndarray, sd: np.ndarray) -> np.ndarray:
-    """Return which bins (k,) lie more than a right angle off the phase of their neighbours."""
+    """Return a mask of bins (k,) more than a right angle from the phase of their neighbours."""
     relative = sd / np.abs(H)
-    # By the errors, but not so that one bin has it all: its own may be too small by chance.
+    # Weighted by the errors, but limited so that no single bin dominates. Its error may be too
+    # small by chance.
     weights = 1.0 / (relative**2 + np.median(relative) ** 2)
     phasors = weights * H / np.abs(H)
     around = np.convolve(phasors, np.ones(2 * _AROUND + 1), mode="same") - phasors
@@ -188,16 +189,16 @@ def _leaps(H: np.ndarray, sd: np.ndarray) -> np.ndarray:
 
 
 def _widest(x: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Indices of the longest stretch of x without a gap."""
+    """Return the indices of the longest range of x without a gap."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
     runs = [np.arange(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True)]
     return max(runs, key=lambda r: x[r[-1]] - x[r[0]], default=np.zeros(0, int))
 
 
 def _root(omega: np.ndarray, relative: np.ndarray, window: float) -> np.ndarray:
-    """(k, k) R with R R' the covariance of the relative errors of the bins."""
+    """Return R (k, k), with R R' the covariance of the relative errors of the bins."""
     lines = (omega[:, None] - omega[None, :]) * window / (2.0 * np.pi)
-    # The transform of the squared Hann window; two bins share the square of that.
+    # Transform of the squared Hann window. Two bins share the square of it.
     shares = ((0.0, 3.0 / 8.0), (1.0, 0.25), (-1.0, 0.25), (2.0, 1.0 / 16.0), (-2.0, 1.0 / 16.0))
     shared = sum(c * np.sinc(lines - m) for m, c in shares) / (3.0 / 8.0)
     covariance = relative[:, None] * relative[None, :] * shared**2
@@ -206,14 +207,15 @@ def _root(omega: np.ndarray, relative: np.ndarray, window: float) -> np.ndarray:
 
 
 def _local(x: np.ndarray, query: np.ndarray, relative: np.ndarray) -> np.ndarray:
-    """Rows (l, k) that make of values at x those of local quadratics at the queries."""
+    """Return rows (l, k) that map values at x to local quadratics at the queries."""
     d = x[None, :] - query[:, None]
-    # Further where errors are larger, as the least mean squared error of local quadratics asks.
+    # The half-width grows with the errors, which minimises the mean squared error of local
+    # quadratics.
     size = np.interp(query, x, octave_mean(np.exp(x), relative))
     reach = _HALF_OCTAVE * np.clip((size / _PRECISE) ** (2.0 / 7.0), 1.0, 2.0)
     reach = np.maximum(reach, 1.01 * np.sort(np.abs(d), axis=1)[:, _LEAST_BINS - 1])
     d = d / reach[:, None]
-    # By the errors too, but not so that one bin has it all.
+    # Weighted by the errors, but limited so that no single bin dominates.
     precise = 1.0 / (relative**2 + np.median(relative) ** 2)
     weights = np.maximum(1.0 - d**2, 0.0) ** 2 * precise
     X = np.stack([np.ones_like(d), d, d**2], axis=2)
@@ -222,34 +224,33 @@ def _local(x: np.ndarray, query: np.ndarray, relative: np.ndarray) -> np.ndarray
 
 
 class LinearResponses(NamedTuple):
-    """A model's matrices about a point, and their derivatives by q parameters.
+    """A model's matrices at a point, and their derivatives by q parameters.
 
-    The arrays are NumPy's: derivatives have the parameters first.
+    All are NumPy arrays; derivatives have the parameter as first axis.
     """
 
     model: Model
     matrices: tuple[np.ndarray, ...]
-    """A, B, C, D"""
+    """Matrices A, B, C, D."""
     derivatives: tuple[np.ndarray, ...]
-    """(q, ...) of each"""
+    """Derivatives (q, ...) of each matrix."""
     delays: dict[str, tuple[float, np.ndarray]]
-    """[s] of inputs, and its derivative (q,)"""
+    """Delays of inputs [s], with derivatives (q,)."""
 
 
-# Parameters, state and inputs are records of the model's own classes: Any.
+# Parameters, state and inputs are records of the model's own classes, hence Any.
 
 
 def linear_responses(
     model: Model, params: Any, names: Sequence[str], state: Any = None, inputs: Any = None
 ) -> LinearResponses:
-    """The model's matrices at a point with their derivatives by some parameters.
+    """Return the model's matrices at a point with their derivatives by some parameters.
 
-    The point stays where it is: of a model that is not linear, how it moves with the parameters
-    is left out.
+    The point is fixed. For a nonlinear model, its dependence on the parameters is neglected.
 
     Args:
-        state: the model's initial state unless given.
-        inputs: zeros unless given.
+        state: default: the model's initial state.
+        inputs: default: zeros.
     """
     slopes, (matrices, delays) = jax.device_get(
         _with_slopes(model, params, tuple(names), state, inputs)
@@ -263,7 +264,7 @@ def linear_responses(
 def _with_slopes(
     model: Model, params: Any, names: tuple[str, ...], state: Any, inputs: Any
 ) -> tuple[Any, Any]:
-    """Derivatives by the named parameters of matrices and delays, and both."""
+    """Return derivatives of matrices and delays by the named parameters, and both values."""
     late = dict(model.delays)
 
     def of(values: Array) -> tuple[Any, Any]:
@@ -277,12 +278,11 @@ def _with_slopes(
 
 
 class Acting(NamedTuple):
-    """Transfer function from an input to its action on the model, and the derivatives by q
-    parameters."""
+    """Transfer function of an input's effect on the model, and its derivatives by q parameters."""
 
     gain: float = 1.0
     late: float = 0.0
-    """[s]"""
+    """Delay [s]."""
     by_gain: np.ndarray | None = None
     by_late: np.ndarray | None = None
 
@@ -294,11 +294,11 @@ def modelled_curve(
     band: tuple[float, float],
     acting: Acting = Acting(),
 ) -> Curve:
-    """A model's continuous response, delays included, with errors by those of its parameters.
+    """Return a model's continuous response, with delays, and errors from those of its parameters.
 
     Args:
-        root: (q, r) R with R R' the covariance of the parameters; NaN where it is not known.
-        band: [rad/s]
+        root: R (q, r), with R R' the covariance of the parameters; NaN where unknown.
+        band: first and last frequency [rad/s].
     """
     j = naming.names(of.model.Inputs).index(pair[0])
     i = naming.names(of.model.Outputs).index(pair[1])
@@ -308,7 +308,7 @@ def modelled_curve(
     late = late + acting.late
     by_late = by_late + (zero if acting.by_late is None else acting.by_late)
     by_gain = zero if acting.by_gain is None else acting.by_gain / acting.gain
-    # A parameter that is not known only matters where the response hangs on it.
+    # An unknown parameter matters only where the response depends on it.
     known = np.isfinite(root).all(axis=1)
     certain = np.where(known[:, None], root, 0.0)
 
@@ -331,10 +331,10 @@ def modelled_curve(
     return Curve(at, band)
 
 
-# Envelopes: how far a model's response may be from the measured one before a pilot notices.
+# Envelopes: differences between modelled and measured response that pilots do not notice.
 
-# Numerators and denominators in s, highest power first: of the gain, and of the phase in degrees
-# the argument.
+# Numerators and denominators in s, highest power first. For the phase, the value is the argument in
+# degrees.
 _GAIN = (((0.095, 9.92, 2.15), (1.0, 11.6, 4.95)), ((3.16, 31.61, 22.79), (1.0, 27.14, 1.84)))
 _PHASE = (
     ((475.32, 184100.0, 29460.0), (1.0, 11.66, 0.039)),
@@ -343,27 +343,28 @@ _PHASE = (
 
 
 class Envelope(NamedTuple):
-    """Lower and upper limits of measured over modelled (k,)."""
+    """Lower and upper limits of measured over modelled response (k,)."""
 
     gain_db: tuple[np.ndarray, np.ndarray]
     phase_deg: tuple[np.ndarray, np.ndarray]
 
 
 def unnoticeable(omega: Float[np.ndarray, " k"]) -> Envelope:
-    """Envelopes of maximum unnoticeable added dynamics.
+    """Return the envelopes of maximum unnoticeable added dynamics.
 
-    Pilots of full-size fixed-wing aircraft did not notice added dynamics within them: narrowest
-    about 1 to 5 rad/s, wide at low and at high frequencies. They are a measure to look at, no gate.
+    Pilots of full-size fixed-wing aircraft did not notice added dynamics within them. They are
+    narrowest at about 1 to 5 rad/s, and wide at low and high frequencies. They serve for comparison
+    and are no gate.
 
     Args:
-        omega: (k,) [rad/s]
+        omega: frequencies (k,) [rad/s].
 
     Source: Wood and Hodgkinson (1980), Definition of acceptable levels of mismatch for equivalent
-    systems of augmented CTOL aircraft, MDC A6792, as MIL-STD-1797A and Tischler and Remple (2012)
-    have them; the coefficients are those that the function LoesBound of C. Regan (2006, 'based on
-    Stoliker's routines') lists, number by number, which itself asks for them to be checked: they
-    were not compared with the reports. A lead and a lag of the phase's envelopes by a few
-    milliseconds, which some give beside them, are left out, so that these are the narrower ones.
+    systems of augmented CTOL aircraft, MDC A6792, as in MIL-STD-1797A and Tischler and Remple
+    (2012). The coefficients are those of the function LoesBound of C. Regan (2006, 'based on
+    Stoliker's routines'), number by number. That function asks for a check of its numbers, and they
+    were not compared with the reports. Some sources add a lead and a lag of a few milliseconds to
+    the phase envelopes. These are left out here, so these envelopes are the narrower ones.
     """
     s = 1j * omega
     gain = [20.0 * np.log10(np.abs(np.polyval(n, s) / np.polyval(d, s))) for n, d in _GAIN]

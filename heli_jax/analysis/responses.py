@@ -1,8 +1,8 @@
-"""Frequency responses from averaged spectra: several inputs at once, with coherence and errors.
+"""Frequency responses from averaged spectra with several inputs, with coherence and errors.
 
-Inputs that move together are separated (conditioned responses), and with an instrument, an
-excitation that was logged and that no feedback reaches, the responses are those of the vehicle
-where pilot or autopilot close the loop.
+Inputs that move together are separated (conditioned responses). An instrument is a logged
+excitation outside all feedback; with it the responses are the vehicle's own, even under closed-loop
+control.
 
 Sources: Bendat and Piersol, Random Data (2010), chapters 7 and 9; Wellstead (1981) for responses by
 instrument; Tischler and Remple (2012), chapters 7 to 10.
@@ -19,40 +19,43 @@ from jaxtyping import Complex, Float
 from heli_jax.analysis.spectra import Spectra, octave_mean
 
 _SINGULAR = 1e-9
-"""smallest singular value of the inputs' matrix of coherences, below which they move as one"""
+"""Smallest singular value of the inputs' coherence matrix; below it they move as one."""
 _ROUNDING = 1e-14
-"""of an output's density, what rounding leaves where the inputs explain all of it"""
+"""Rounding error of a fully explained output [fraction of its density]."""
 _STRONG = 0.25
-"""of c S_vv in the mean over an octave, up to which an instrument is strong enough: F of 7.7"""
+"""Largest mean of c S_vv over an octave at which an instrument is strong enough (F of 7.7)."""
 Z95 = 1.959963984540054
-"""half of a 95 % interval in standard deviations that are known"""
+"""Half-width of a 95 % interval [sd], for known standard deviations."""
 
 
 class TooFewAveragesError(ValueError):
-    """Too few averages: at least one more than the inputs is needed."""
+    """Too few averages; at least one more than the inputs is needed."""
 
 
 class Responses(NamedTuple):
-    """From m inputs to l outputs at k frequencies."""
+    """Responses from m inputs to l outputs at k frequencies."""
 
     omega: np.ndarray
-    """(k,) [rad/s]"""
+    """Frequencies (k,) [rad/s]."""
     H: np.ndarray
-    """(k, l, m) complex"""
+    """Responses (k, l, m), complex."""
     sd: np.ndarray
-    """(k, l, m) of the real and of the imaginary part of H: over |H| it is the relative random
-    error of the gain, and that of the phase [rad]"""
+    """Standard deviation (k, l, m) of the real and of the imaginary part of H. Over |H| it is the
+    relative random error of the gain, and the error of the phase [rad].
+    """
     coherence: np.ndarray
-    """(k, l, m) partial coherence of each input, what the others explain taken out; by instrument
-    of that part of the input that follows the instruments"""
+    """Partial coherence (k, l, m) of each input, without the parts of other inputs. With
+    instruments, it is that of the input's part that follows them.
+    """
     multiple: np.ndarray
-    """(k, l) of an output's power, the part that all inputs explain together"""
+    """Share (k, l) of an output's power that all inputs explain together."""
     noise: np.ndarray
-    """(k, l) density of what they leave, per Hz"""
+    """Density (k, l) of the residual, per Hz."""
     averages: float
-    """independent ones"""
+    """Number of independent averages."""
     ends: np.ndarray | None = None
-    """(k, m, m) what of each input in the window's slope counts as each input [1/s]"""
+    """Part (k, m, m) of each input, with the window's derivative, that counts as each input [1/s].
+    """
 
 
 def responses(
@@ -61,18 +64,18 @@ def responses(
     outputs: Sequence[int],
     instruments: Sequence[int] | None = None,
 ) -> Responses:
-    """Responses of each output to each input, the others taken into account.
+    """Return the responses of each output to each input, with the other inputs accounted for.
 
-    Where inputs move as one (or one does not move) no response is determined: it is NaN there, and
-    where an instrument is too weak beside what else moves its input (`fieller`).
+    A response is NaN if inputs move as one, if an input does not move, or if an instrument is too
+    weak compared with other causes of its input (`sd_of_ratio`).
 
     Args:
-        instruments: as many excitations, outside of every feedback; without them the inputs are
-            taken for ones that do not follow the outputs.
+        instruments: one excitation for each input, outside all feedback; without them, inputs are
+            assumed not to depend on the outputs.
 
     Raises:
-        TooFewAveragesError: for so many inputs.
-        ValueError: not as many instruments as inputs.
+        TooFewAveragesError: there are too few averages for the number of inputs.
+        ValueError: the numbers of instruments and inputs differ.
     """
     u, y = list(inputs), list(outputs)
     z = u if instruments is None else list(instruments)
@@ -85,18 +88,18 @@ def responses(
             f"expected at least {m + 1} independent averages for {many}, got "
             f"{n:.2f}: a longer record, or a shorter window"
         )
-    # y = H u + e and a mean of conj(z) e that tends to zero: S_zy = S_zu H^T.
+    # With y = H u + e and a mean of conj(z) e that tends to zero, S_zy = S_zu H^T.
     P = inverse(S[:, z][:, :, u], np.real(S[:, z, z]), np.real(S[:, u, u]))
     H = np.swapaxes(P @ S[:, z][:, :, y], 1, 2)
     left = _left(S, u, y, H)
-    # Covariance of S_zu^-1 S_ze, where that of S_ze is S_zz times the noise over the averages.
+    # Covariance of S_zu^-1 S_ze, where S_ze has the covariance S_zz times noise over averages.
     spread = np.real(np.einsum("kjz,kzw,kjw->kj", P, S[:, z][:, :, z], np.conj(P)))
     error = left[:, :, None] * spread[:, None, :]
     power = np.real(S[:, y, y])
     with np.errstate(all="ignore"):
         coherence = np.abs(H) ** 2 / (np.abs(H) ** 2 + error)
         multiple = np.clip(1.0 - left / power, 0.0, 1.0)
-    # Each input takes one of the averages for its own response.
+    # Each input uses one of the averages for its response.
     sd = np.sqrt(0.5 * error / (n - m))
     if instruments is not None:
         half95 = float(student95(np.asarray(2.0 * (n - m))))
@@ -111,7 +114,7 @@ def responses(
 
 
 def inverse(M: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return the inverse of matrices (k, m, m); NaN where one is singular but for rounding.
+    """Return the inverses of matrices (k, m, m); NaN where one is numerically singular.
 
     Args:
         rows: densities (k, m) of the signals of the rows.
@@ -121,14 +124,14 @@ def inverse(M: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         scaled = M * scale
         sound = np.isfinite(scaled).all((1, 2))
         scaled = np.where(sound[:, None, None], scaled, np.eye(M.shape[1]))
-        # In coherences, so that units do not count.
+        # Scaled to coherences, so that units do not matter.
         sound &= np.linalg.svd(scaled, compute_uv=False)[:, -1] > _SINGULAR
         inverted = np.linalg.inv(np.where(sound[:, None, None], scaled, np.eye(M.shape[1])))
         return np.where(sound[:, None, None], inverted * np.swapaxes(scale, 1, 2), np.nan)
 
 
 def _left(S: np.ndarray, u: list[int], y: list[int], H: np.ndarray) -> np.ndarray:
-    """Density (k, l) of y - H u, not below what rounding leaves."""
+    """Return the density (k, l) of y - H u, bounded below by the rounding error."""
     power = np.real(S[:, y, y])
     crossed = np.real(np.einsum("klm,klm->kl", H, S[:, y][:, :, u]))
     explained = np.real(np.einsum("kla,kab,klb->kl", np.conj(H), S[:, u][:, :, u], H))
@@ -137,14 +140,14 @@ def _left(S: np.ndarray, u: list[int], y: list[int], H: np.ndarray) -> np.ndarra
 
 # Intervals of responses by instrument.
 #
-# These are ratios of two numbers with errors. With w_j the combination of the instruments that goes
-# with input j alone, H_j = S_wy / S_wu, and a response H' agrees with the record in the disc
+# These are ratios of two uncertain numbers. With w_j the combination of the instruments for input j
+# alone, H_j = S_wy / S_wu. A response H' agrees with the record in the disc
 #
 #     |H' - H|^2 <= c (S_ee - 2 Re(conj(H' - H) S_ue) + |H' - H|^2 S_vv),  c = t^2 S_ww / (2 n),
 #
-# with Student's t and v what of the input no instrument explains. Where the excitation is weak
-# beside v, the disc is larger than the first-order error and lies to one side. Where c S_vv reaches
-# 1 it has no end: nothing is known of the response.
+# with Student's t, and v the part of the input that no instrument explains. If the excitation is
+# weak beside v, the disc is larger than the first-order error and off centre. If c S_vv reaches 1,
+# it is unbounded: the response is unknown.
 #
 # Sources: Fieller (1954); Anderson and Rubin (1949) for instruments.
 
@@ -158,13 +161,14 @@ def sd_of_ratio(
     spread: Float[np.ndarray, "k m"],
     half95: float,
 ) -> Float[np.ndarray, "k l m"]:
-    """Standard deviations of real and imaginary part whose 95 % intervals hold Fieller's discs;
-    NaN where these are unbounded.
+    """Return the sd of real and imaginary part whose 95 % intervals contain Fieller's discs.
+
+    It is NaN where a disc is unbounded.
 
     Args:
         omega: frequencies [rad/s].
-        signals: places of the inputs, of the outputs and of the instruments.
-        half95: half of a 95 % interval in standard deviations.
+        signals: indices of the inputs, of the outputs and of the instruments.
+        half95: half-width of a 95 % interval [sd].
     """
     u, y, z = signals
     zz, zu = S[:, z][:, :, z], S[:, z][:, :, u]
@@ -173,19 +177,19 @@ def sd_of_ratio(
             np.einsum("kzj,kzj->kj", np.conj(zu), np.linalg.pinv(zz, rcond=1e-12) @ zu)
         )
         own = np.maximum(np.real(S[:, u, u]) - explained, 0.0)
-        # Of y - H u with each input.
+        # Cross-density of y - H u with each input.
         crossed = S[:, u][:, :, y] - np.einsum("kja,kla->kjl", S[:, u][:, :, u], H)
         c = 0.5 * half95**2 * spread
-        # An input that is its own instrument has nothing of its own, but for rounding.
+        # An input that is its own instrument has no part of its own, apart from rounding.
         direct = np.array([a == b for a, b in zip(u, z, strict=True)])
         room = np.where(direct, 1.0, 1.0 - c * own)[:, None, :]
         aside = np.where(direct, 0.0, np.abs(np.swapaxes(crossed, 1, 2)) * c[:, None, :]) / room
         reach = aside + np.sqrt(c[:, None, :] * left[:, :, None] / room + aside**2)
-        # Among weak ones a single frequency is strong by chance, and has the wrong response by the
-        # same chance: the octave around it has to be strong as well.
+        # A weak instrument may look strong at one frequency by chance, and its response is then
+        # wrong too. The octave around it must be strong as well.
         share = explained / np.maximum(explained + own, 1e-300)
         around = np.stack([octave_mean(omega, v) for v in share.T], axis=1)
-        # c S_vv again, with the octave's share of the input that instruments explain.
+        # c S_vv again, with the octave's share of the input that the instruments explain.
         likely = 0.5 * Z95**2 * spread
         strong = direct | (likely * explained * (1.0 - around) < _STRONG * around)
         return np.where((room > 0) & strong[:, None, :], reach / half95, np.nan)
@@ -193,28 +197,29 @@ def sd_of_ratio(
 
 # Variances from few averages.
 #
-# Of n averages a variance is known to the n - m degrees of freedom that m inputs leave. Weights by
-# such variances trust the frequencies that happened to look quiet: of windows of half a record 72 %
-# of a delay's 95 % intervals held the truth. So the noise is a mean over frequencies.
+# With n averages and m inputs, a variance has n - m degrees of freedom. Weights from such variances
+# favour frequencies that look quiet by chance: with windows of half a record, only 72 % of the 95 %
+# intervals of a delay contained the true value. The noise is therefore a mean over frequencies.
 #
 # Source: Pintelon and Schoukens (2012), section 9.4.
 
 
 _ENOUGH = 40.0
-"""degrees of freedom of a variance from which on weights by it are as good as by the true one"""
+"""Degrees of freedom at which weights from an estimated variance are as good as from the true one.
+"""
 RESOLVED = 1.95
-"""frequencies closer than this over the window's length are not independent (Hann)"""
+"""Least distance of independent frequencies [1/window length] (Hann)."""
 _TRIANGLE = 1.5
-"""equal terms whose mean is as certain as one in a triangle of half this half-width"""
+"""Effective number of terms in a triangle-weighted mean [half-widths]."""
 
 
 def independent_shares(omega: Float[np.ndarray, " k"], seconds: float) -> Float[np.ndarray, " k"]:
     """Return the share of an independent frequency that each frequency (k,) has.
 
     Args:
-        omega: (k,) [rad/s], rising.
+        omega: frequencies (k,) [rad/s], rising.
     """
-    # Half of the way to each neighbour.
+    # Half the distance to each neighbour.
     width = np.gradient(omega) if omega.size > 1 else np.ones(1)
     return np.minimum(width * seconds / (2.0 * np.pi * RESOLVED), 1.0)
 
@@ -222,15 +227,15 @@ def independent_shares(omega: Float[np.ndarray, " k"], seconds: float) -> Float[
 def averaged(
     noise: Float[np.ndarray, " k"], shares: Float[np.ndarray, " k"], averages: float
 ) -> tuple[Float[np.ndarray, " k"], float]:
-    """A mean over as many independent frequencies as it takes, and its degrees of freedom.
+    """Return the mean over enough independent frequencies, and its degrees of freedom.
 
     Args:
-        noise: density (k,); NaN where it is not known.
-        shares: (k,) how much of an independent frequency each is.
+        noise: density (k,); NaN where unknown.
+        shares: share (k,) of an independent frequency that each has.
     """
     known = np.isfinite(noise) & (shares > 0)
     each = 2.0 * averages
-    # Half-width of the triangle, in independent frequencies.
+    # Half-width of the triangle [independent frequencies].
     reach = _ENOUGH / each / _TRIANGLE
     at = np.cumsum(shares) - 0.5 * shares
     near = np.maximum(1.0 - np.abs(at[:, None] - at[None, :]) / reach, 0.0) * np.where(
@@ -244,48 +249,50 @@ def averaged(
 
 
 def student95(freedom: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """Half of a 95 % interval in standard deviations: Student's t.
+    """Return the half-width of a 95 % interval [sd], from Student's t.
 
     Args:
-        freedom: degrees of freedom of the standard deviations, 1 at least; any shape.
+        freedom: degrees of freedom of the standard deviations, at least 1; any shape.
     """
     return scipy.special.stdtrit(np.maximum(freedom, 1.0), 0.975)
 
 
-# What windows add to a response at the ends of a record.
+# Errors that windows add to a response at the ends of a record.
 #
-# Of a response y = h * u a window w shows, by Taylor's series of w(t + tau),
+# For a response y = h * u, a window w gives, by Taylor's series of w(t + tau),
 #
 #     Y_w = H U_w + i H' U_w' + ...,
 #
-# U_w' being the input in the window's slope and H' the derivative of H by frequency. Windows that
-# overlap by two thirds cancel each other's second term, but not at the ends of a record and of each
-# part between missing samples, nor where a window's width brings the input's power from another
-# frequency (the flanks of a sine, frequencies beyond a sweep). All of it is known but H'.
+# where U_w' is the input with the window's derivative and H' the derivative of H by frequency. In
+# windows that overlap by two thirds the second terms cancel, with two exceptions. One is the ends
+# of a record and of each part between missing samples. The other is input power that a window's
+# width brings from another frequency (the flanks of a sine, frequencies beyond a sweep). Only H' is
+# unknown.
 #
-# With e the part of the input in the window's slope that counts as the input, a measured response
-# is, to first order, that at omega + i e. H' is the slope of a straight line through responses at
-# such places. For a single sine they coincide, and H' is unknown: it may then be anything that
-# windows of that length resolve.
+# Let e be the part of U_w' that counts as the input. To first order, a measured response is that at
+# omega + i e. H' is the slope of a straight line through responses at such points. For a single
+# sine the points coincide and H' is unknown: it may be anything that windows of that length
+# resolve.
 #
 # Source: Pintelon and Schoukens (2012), chapter 6.
 
 
 _LINES = 2.5
-"""of the window, around a frequency, that the response's derivative is taken from: its error is
-then a small part of the response's own"""
+"""Half-width around a frequency for the response's derivative [lines of the window]. Its error is
+then a small part of the response's own.
+"""
 _LEAST = 3
-"""frequencies to either side that it is taken from at least"""
+"""Least number of frequencies to either side for the derivative."""
 _ROUNDS = 3
-"""what one input makes of another's response is that response's derivative, and the other way"""
+"""Iterations, since the correction of one input's response depends on the others'."""
 _UNKNOWN = 0.2
-"""of what is taken off, what stays in the response's error"""
+"""Share of the correction that remains in the response's error."""
 _RESOLVES = 1.0
-"""relative change of a response in a line of the window, beyond which none is resolved: what its
-derivative may be where responses do not tell"""
+"""Relative change of a response in one line of the window beyond which it is not resolved. It
+bounds the derivative where responses do not determine it.
+"""
 _ALONE = 2e-2
-"""variance of the places that a straight line lies through, in its half-width squared, below which
-they have no slope"""
+"""Variance of the points of a straight line below which they give no slope [half-width squared]."""
 
 
 def without_ends(
@@ -295,16 +302,16 @@ def without_ends(
     ends: Complex[np.ndarray, "k m m"],
     seconds: float,
 ) -> tuple[Complex[np.ndarray, "k l m"], Float[np.ndarray, "k l m"]]:
-    """Subtract, to first order, the errors that windows add at the ends of records and on the
-    flanks of held inputs; return the responses and their standard deviation.
+    """Return, to first order, the errors that windows add at the ends of records and on the flanks
+    of held inputs, and the responses' standard deviation.
 
     Args:
         omega: frequencies [rad/s], rising.
-        H: l outputs over m inputs; NaN where they are not known.
-        ends: what of each input in the window's slope counts as each input in the window [1/s].
+        H: l outputs over m inputs; NaN where unknown.
+        ends: part of each input, with the window's derivative, that counts as each input [1/s].
     """
     known = np.isfinite(H) & np.isfinite(sd) & (sd > 0)
-    # Where an input has no response of its own it has none to take off.
+    # An input without a response needs no correction.
     ends = np.where(np.isfinite(ends), ends, 0.0)
     own = np.einsum("kii->ki", ends)
     others = ends - own[:, :, None] * np.eye(own.shape[1])
@@ -319,7 +326,7 @@ def without_ends(
         rest = np.where(known, H - 1j * _summed(others, slopes), 0.0)
         slopes = np.stack([line.slope(rest[:, :, j]) for j, line in enumerate(lines)], axis=2)
     added = 1j * _summed(ends, slopes)
-    # What is taken off has errors, and its derivative has them too.
+    # The correction has errors, and so has its derivative.
     chance = _summed(np.abs(ends) ** 2, np.stack([line.variance for line in lines], axis=2))
     return added, np.sqrt(sd**2 + chance + (_UNKNOWN * np.abs(added)) ** 2)
 
@@ -327,7 +334,9 @@ def without_ends(
 def _summed(
     ends: Float[np.ndarray, "k m m"] | Complex[np.ndarray, "k m m"], v: np.ndarray
 ) -> np.ndarray:
-    """(k, l, m) what inputs' derivatives v (k, l, m) make of each input's response."""
+    """Return the contributions (k, l, m) of the inputs' derivatives v (k, l, m) to each input's
+    response.
+    """
     return v @ np.swapaxes(ends, 1, 2)
 
 
@@ -335,20 +344,22 @@ class _Line(NamedTuple):
     """Straight lines through l responses to an input around each frequency."""
 
     near: Complex[np.ndarray, "both k k"]
-    """weights of the places around each, once and times their conjugate distances"""
+    """Weights of the points around each frequency, and these times the conjugate distances."""
     flat: Float[np.ndarray, "k l"]
-    """weights by the responses' errors"""
+    """Weights from the responses' errors."""
     mean: Complex[np.ndarray, "k l"]
-    """conjugate distance of the middle of the places, times the sum of weights"""
+    """Conjugate distance to the centre of the points, times the sum of weights."""
     total: Float[np.ndarray, "k l"]
-    """sum of weights"""
+    """Sum of weights."""
     part: Float[np.ndarray, "k l"]
-    """what a slope takes of the line's, over the weights' determinant; zero where there is none"""
+    """Fraction of the line's slope that is used, over the determinant of the weights; zero if there
+    is none.
+    """
     variance: Float[np.ndarray, "k l"]
-    """of the slope's real and of its imaginary part"""
+    """Variance of the slope's real and of its imaginary part."""
 
     def slope(self, H: Complex[np.ndarray, "k l"]) -> Complex[np.ndarray, "k l"]:
-        """By frequency [s], of responses that are zero where they are not known."""
+        """Return the slope at each frequency [s]; unknown responses must be zero."""
         T0, T1 = self.near @ (self.flat * H)
         return self.part * (self.total * T1 - self.mean * T0)
 
@@ -362,9 +373,9 @@ def _line(
     """Set up the derivatives of l responses to one input.
 
     Args:
-        at: (k,) where the responses were measured.
-        measured: these, zero where they are not known, and the standard deviations of their real
-            and imaginary parts, NaN there.
+        at: points (k,) at which the responses were measured.
+        measured: the responses, zero where unknown, and the sd of their real and imaginary parts,
+            NaN there.
     """
     H, variance = measured[0], measured[1] ** 2
     known = np.isfinite(variance)
@@ -374,12 +385,12 @@ def _line(
     d = (at[None, :] - omega[:, None]) / reach
     width = np.gradient(omega) if omega.size > 1 else np.ones(1)
     near = np.maximum(1.0 - np.abs(d) ** 2, 0.0) * width
-    # Of independent frequencies within reach, and how far apart they are.
+    # Number of independent frequencies within reach.
     independent = np.maximum(reach * seconds / (np.pi * RESOLVED), 1.0)
     with np.errstate(all="ignore"), warnings.catch_warnings():
-        # Of a pair that is known nowhere.
+        # A pair may be unknown at all frequencies.
         warnings.simplefilter("ignore", RuntimeWarning)
-        # By the errors too, but not so that one frequency has it all.
+        # Weighted by the errors too, but limited so that no single frequency dominates.
         flat = np.where(known, 1.0 / (variance + np.nanmedian(variance, axis=0)), 0.0)
         both = np.stack([near, near * np.conj(d)])
         (S0, S1), S2 = both @ flat, (near * np.abs(d) ** 2) @ flat
@@ -389,7 +400,8 @@ def _line(
         chance = variance / (spread / S0**2 * reach**2 * independent)
         alone = _Line(both, flat, S1, S0, np.where(enough, 1.0 / (spread * reach), 0.0), chance)
         before = 0.5 * (_RESOLVES * seconds / (2.0 * np.pi)) ** 2 * np.abs(H) ** 2
-        # The mean of what the line says and of what windows resolve, by their errors.
+        # Mean of the line's slope and the bound from the windows' resolution, weighted by their
+        # errors.
         part = np.where(enough, before / (before + chance), 0.0)
         left = np.where(enough, part * chance, np.where(known, before, 0.0))
     return alone._replace(part=part * alone.part, variance=left)

@@ -1,7 +1,7 @@
 """Spectra of signals in Hann windows, and flights in such windows.
 
-Segments of a record in Hann windows are transformed to the frequencies asked for (any band, any
-resolution); cross-spectra are means over segments and flights.
+Segments of a record in Hann windows are transformed to the requested frequencies (any band, any
+resolution). Cross-spectra are means over segments and flights.
 
 Sources: Bendat and Piersol, Random Data (2010), chapters 7 and 9; Welch (1967), IEEE Trans. Audio
 and Electroacoustics 15(2); Harris (1978), Proceedings of the IEEE 66(1).
@@ -18,74 +18,79 @@ from jaxtyping import Array, Complex, Float
 from heli_jax.flights.flight import Flight
 
 OWN = 10.0
-"""times what the window's sidelobes bring, from which on a spectrum is the signal's own"""
+"""Least ratio to the window's sidelobes at which a spectrum is the signal's own."""
 OVERLAP = 2.0 / 3.0
-"""of a Hann window with the next, for responses. The squares of such windows add up to the same at
-all times: no sample counts for more than another but at the ends of a record, and what they cut off
-of answers that end outside of them, in proportion to the square's slope, cancels; of windows that
-overlap by half it does not"""
+"""Overlap of consecutive Hann windows [fraction of the length].
+
+The squared windows add up to a constant, so all samples have the same weight except at the ends of
+a record. Errors from responses cut off at a window's ends are proportional to the slope of the
+square, and cancel. With half overlap they do not.
+"""
 LONGEST = 30.0
-"""window [s] unless one is stated: what rotorcraft responses are usually taken from"""
+"""Longest default window [s], as is usual for rotorcraft responses."""
 HIGHEST = 0.4
-"""of the rate: above it an anti-aliasing filter has changed what was logged"""
+"""Highest frequency [fraction of the rate]. Above it an anti-aliasing filter changes the record."""
 COHERENT = 0.6
-"""mean coherence over an octave from which on a response is taken for the input's: Tischler and
-Remple, Aircraft and Rotorcraft System Identification (2012)"""
+"""Least mean coherence over an octave of a usable response: Tischler and Remple, Aircraft and
+Rotorcraft System Identification (2012).
+"""
 _SMOOTHED = 3.4
-"""independent lines at least over which the noise's spectrum is smoothed"""
+"""Least number of independent lines over which the noise spectrum is smoothed."""
 _SHARED = (
     1.0 / 3.0 + 3.0**0.5 / (4.0 * np.pi),
     1.0 / 6.0 - 3.0**0.5 / (4.0 * np.pi),
 )
-"""correlation of white noise in a Hann window with that in the next one and in the one after it"""
+"""Correlation of white noise in a Hann window with that in the next window and the one after it."""
 _FOR_MATRIX = 4.0
-"""averages for each output from which a spectral matrix has an inverse of about the right size"""
+"""Averages for each output at which the inverse of a spectral matrix has about the right size."""
 STEPS = round(1.0 / (1.0 - OVERLAP))
-"""from a window to the next, in the length of one. With an overlap of a half kappa of the disturbed
-bench is 4 % less precise"""
+"""Window starts within one window length. With an overlap of a half, kappa of the disturbed bench
+is 4 % less precise.
+"""
 PER_AVERAGE = 1.0 + 2.0 * sum(r**2 for r in _SHARED)
-"""windows that make one independent average: the sum of the squared correlations of transforms of
-white noise in one window with those in all others"""
+"""Windows for one independent average: the sum of the squared correlations of transforms of white
+noise in one window with those in all others.
+"""
 
 
 class Spectra(NamedTuple):
     """Fourier transforms of c signals in W Hann windows at k frequencies."""
 
     omega: np.ndarray
-    """(k,) [rad/s]"""
+    """Frequencies (k,) [rad/s]."""
     X: np.ndarray
-    """(k, W, c), scaled so that squares are one-sided densities per Hz"""
+    """Transforms (k, W, c), scaled so that squares are one-sided densities per Hz."""
     averages: float
-    """independent averages that the windows make: overlapping ones count for less than one"""
+    """Number of independent averages, smaller than the number of overlapping windows."""
     seconds: float
-    """length of a window"""
+    """Length of a window [s]."""
     steep: np.ndarray | None = None
-    """(k, W, m) the first m signals in the window's slope [1/s]"""
+    """Transforms (k, W, m) of the first m signals with the window's derivative [1/s]."""
 
     @property
     def density(self) -> Complex[np.ndarray, "k c c"]:
-        """Means of conj(X_a) X_b: the response from a to b is [a, b] / [a, a]."""
+        """Means of conj(X_a) X_b; the response from a to b is [a, b] / [a, a]."""
         return np.conj(np.swapaxes(self.X, 1, 2)) @ self.X / self.X.shape[1]
 
 
 def segment_transforms(signals: Float[np.ndarray, "c N"], dt: float, length: int) -> Spectra:
-    """Half-overlapping segments, each less its straight line, in a Hann window (Welch 1967), at
-    k = length // 2 + 1 frequencies from zero on.
+    """Transform half-overlapping, detrended segments in a Hann window (Welch 1967) to k = length //
+    2 + 1 frequencies from zero.
 
     Args:
         dt: time between samples [s].
         length: samples of a segment, at most N.
     """
     segments = np.lib.stride_tricks.sliding_window_view(signals, length, axis=1)
-    # The next segment begins where the second half of this one does.
+    # The next segment begins at the second half of this one.
     segments = segments[:, :: length - length // 2]
-    # Less the straight line that fits each best: a drift would leak into the lowest frequencies.
-    # Symmetric about zero, so that slope and mean are found apart from each other.
+    # Remove the best straight line, since a drift would leak into the lowest frequencies. With t
+    # symmetric about zero, slope and mean are independent.
     t, window = np.linspace(-1.0, 1.0, length), np.hanning(length)
     slopes = (segments @ t / (t @ t))[..., None]
     segments = (segments - segments.mean(axis=-1, keepdims=True) - slopes * t) * window
     X = np.moveaxis(np.fft.rfft(segments, axis=-1), -1, 0).swapaxes(1, 2)
-    # Zero frequency and Nyquist's, which an odd length has not, have no twin of negative frequency.
+    # Zero frequency and, for even lengths, the Nyquist frequency have no negative counterpart.
     twins = np.full(len(X), 2.0)
     twins[[0] if length % 2 else [0, -1]] = 1.0
     X = X * np.sqrt(twins * dt / np.sum(window**2))[:, None, None]
@@ -97,9 +102,9 @@ def segment_transforms(signals: Float[np.ndarray, "c N"], dt: float, length: int
 def octave_mean(
     omega: Float[np.ndarray, " k"], coherence: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, " k"]:
-    """Mean coherence (k,) over an octave; zero where there is none.
+    """Return the mean coherence (k,) over an octave; zero where there is none.
 
-    Single frequencies that reach a limit by chance have too large a gain, by the same chance.
+    A single frequency that reaches a limit by chance also has too large a gain.
     """
     octaves = np.log2(omega)
     near = np.abs(octaves[:, None] - octaves[None, :]) <= 0.5
@@ -110,28 +115,27 @@ def octave_mean(
 
 
 def leakage(S: np.ndarray) -> np.ndarray:
-    """Return the power that the Hann window's sidelobes bring to each frequency (k,) from all
-    others.
+    """Return the power (k,) that the Hann window's sidelobes add to each frequency from all others.
 
     Args:
         S: spectral density (k,) of segments in a Hann window.
 
-    Source: Harris (1978), Proceedings of the IEEE 66(1): the window's transform m lines away is at
-    most 1/(pi m (m^2 - 1)) of its height.
+    Source: Harris (1978), Proceedings of the IEEE 66(1). At m lines, the window's transform is at
+    most 1/(pi m (m^2 - 1)) of its peak.
     """
     m = np.arange(S.size, dtype=float)
     sidelobes = np.zeros(S.size)
-    # Up to two lines away is the main lobe: there a signal is itself.
+    # The main lobe reaches two lines away.
     far = m > 2
-    # Its square, and of that the mean of a squared sine: where between two lines a frequency lies
-    # is as good as random.
+    # Squared sidelobe times the mean of a squared sine, since the position of a frequency between
+    # two lines is arbitrary.
     sidelobes[far] = 0.5 / (np.pi * m[far] * (m[far] ** 2 - 1.0)) ** 2
     both = np.concatenate([sidelobes[:0:-1], sidelobes])
     return np.convolve(S, both)[S.size - 1 : 2 * S.size - 1]
 
 
 def is_own(S: np.ndarray) -> np.ndarray:
-    """True (k,) where a density is the signal's own, and not what sidelobes bring."""
+    """True (k,) where a density is the signal's own and not from sidelobes."""
     return OWN * leakage(S) < S
 
 
@@ -143,15 +147,15 @@ def cross_spectra(
     overlap: float = 0.5,
     sloped: int = 0,
 ) -> Spectra:
-    """Hann windows of all records, each segment less its mean, at any frequencies.
+    """Transform all records in Hann windows, each segment without its mean, to any frequencies.
 
     Args:
         records: the same c signals in each, (c, N) with any N; no sample missing.
-        dt: between two samples [s].
+        dt: time between samples [s].
         omega: (k,) [rad/s], above zero and below the Nyquist frequency.
-        seconds: length of a segment; records that are shorter are left out.
-        overlap: of one segment with the next, from 0 to below 1.
-        sloped: how many of the first signals are taken in the window's slope, too.
+        seconds: length of a segment [s]; shorter records are left out.
+        overlap: overlap of consecutive segments, from 0 to below 1.
+        sloped: number of first signals that are also transformed with the window's derivative.
 
     Raises:
         ValueError: no record has a segment, a sample is missing, or a frequency is out of range.
@@ -160,21 +164,22 @@ def cross_spectra(
     step = max(round(length * (1.0 - overlap)), 1)
     _require(records, dt, omega, length)
     window, t = hann(length), np.arange(length)
-    # Of the window, a cosine, per second.
+    # Derivative of the cosine window [1/s].
     slope = np.pi / (length * dt) * np.sin(2.0 * np.pi * t / length)
     turns = np.exp(-1j * np.outer(t, omega * dt)) * np.sqrt(2.0 * dt / np.sum(window**2))
 
     def transforms(record: Float[np.ndarray, "c N"], window: np.ndarray) -> np.ndarray:
         segments = np.lib.stride_tricks.sliding_window_view(record, length, axis=1)[:, ::step]
         kernel = window[:, None] * turns
-        # Less its mean in place of each segment's. Two real products, of fewer operations.
+        # Removing the kernel's mean equals removing each segment's. Two real products take fewer
+        # operations.
         kernel = kernel - kernel.mean(axis=0)
         rows = segments.reshape(-1, length)
         X = rows @ kernel.real + 1j * (rows @ kernel.imag)
         return X.reshape(*segments.shape[:2], -1).transpose(2, 1, 0)
 
     long = [np.asarray(r, np.float64) for r in records if r.shape[1] >= length]
-    # The bulk of the mean here: rounding would leave some of it in each segment.
+    # Remove most of the mean first, since rounding would leave part of it in each segment.
     long = [r - r.mean(axis=1, keepdims=True) for r in long]
     X = np.concatenate([transforms(r, window) for r in long], axis=1)
     steep = None
@@ -201,9 +206,11 @@ def _require(records: Sequence[np.ndarray], dt: float, omega: np.ndarray, length
 
 
 def _independent(window: np.ndarray, step: int, count: int) -> float:
-    """Independent averages of overlapping segments (Welch 1967, for a flat spectrum)."""
-    # Of white noise the transforms of two segments correlate as the windows overlap, and their
-    # squares, which spectra are made of, as the square of that.
+    """Return the number of independent averages of overlapping segments (Welch 1967, flat
+    spectrum).
+    """
+    # For white noise, the transforms of two segments correlate as the windows overlap. Their
+    # squares, which form spectra, correlate as the square of that.
     n, power, total = window.size, float(np.sum(window**2)), 1.0
     for j in range(1, min(count, -(-n // step))):
         shared = float(np.sum(window[: n - j * step] * window[j * step :])) / power
@@ -211,51 +218,52 @@ def _independent(window: np.ndarray, step: int, count: int) -> float:
     return count / total
 
 
-# Flights in windows that overlap by two thirds, each less its mean, at its lines.
+# Flights in windows that overlap by two thirds, each without its mean, at the window's lines.
 
 
 class PairOptions(NamedTuple):
-    """One response that takes part, where not all do."""
+    """One selected response."""
 
     input: str
     output: str
     band: tuple[float, float] | None = None
-    """[Hz]; None: that of all"""
+    """First and last frequency [Hz]; None: that of all responses."""
     coherence: float | None = None
-    """least partial coherence; None: that of all"""
+    """Least partial coherence; None: that of all responses."""
 
 
 class ResponseOptions(NamedTuple):
-    """Frequencies, windows, and the responses that take part."""
+    """Frequencies, windows and selected responses."""
 
     band: tuple[float, float] | None = None
-    """first and last frequency [Hz]; None: a period in a window to 0.4 of the rate"""
+    """First and last frequency [Hz]; None: from a period in a window to 0.4 of the rate."""
     window: float | None = None
-    """length [s]; None: a fifth of the longest flight, 30 s at most"""
+    """Length [s]; None: a fifth of the longest flight, at most 30 s."""
     points: int | None = None
-    """frequencies about equally spaced in the logarithm; None: all lines of the window"""
+    """Number of frequencies, about equally spaced in the logarithm; None: all lines of the window.
+    """
     coherence: float = 0.0
-    """least partial coherence in the mean over an octave; 0 leaves all to their weights"""
+    """Least mean partial coherence over an octave; 0 uses all frequencies, with their weights."""
     pairs: tuple[PairOptions, ...] = ()
-    """those that take part; all where none is named"""
+    """Selected responses; empty: all."""
 
 
 class Choice(NamedTuple):
     """Windows of the flights, and the signals that move in them."""
 
     dt: float
-    """[s]"""
+    """Sample time [s]."""
     window: float
-    """length [s]"""
+    """Length of a window [s]."""
     inputs: tuple[str, ...]
-    """those that move"""
+    """Inputs that move."""
 
 
 def chosen(flights: Sequence[Flight], window: float | None) -> Choice:
-    """Return the windows that responses of some flights are taken from.
+    """Return the windows for the responses of some flights.
 
     Args:
-        window: length [s]; None: a fifth of the longest flight, 30 s at most.
+        window: length [s]; None: a fifth of the longest flight, at most 30 s.
 
     Raises:
         ValueError: rates differ, no flight holds a window, or no input moves.
@@ -282,73 +290,75 @@ def chosen(flights: Sequence[Flight], window: float | None) -> Choice:
 
 
 class Windowed(NamedTuple):
-    """Flights of one rate, W windows of them at k lines; transforms scaled to densities per Hz."""
+    """Flights of one rate in W windows at k lines; transforms are scaled to densities per Hz."""
 
     inputs: tuple[str, ...]
-    """the m that move"""
+    """The m inputs that move."""
     instruments: tuple[str, ...]
-    """those of them that are taken by an excitation that was logged"""
+    """Inputs that use a logged excitation."""
     outputs: tuple[str, ...]
-    """the p of which windows are complete"""
+    """The p outputs with complete windows."""
     dt: float
-    """[s]"""
+    """Sample time [s]."""
     length: int
-    """samples of a window"""
+    """Length of a window [samples]."""
     numbers: tuple[int, ...]
-    """of the k lines, in periods of a window"""
+    """Numbers of the k lines [periods in a window]."""
     starts: tuple[tuple[int, ...], ...]
-    """by flight the first sample of each window"""
+    """First sample of each window, by flight."""
     Z: np.ndarray
-    """(W, k, m) of the instruments, or of the inputs themselves"""
+    """Transforms (W, k, m) of the instruments, or of the inputs themselves."""
     U: np.ndarray
-    """(W, k, m) of the inputs"""
+    """Transforms (W, k, m) of the inputs."""
     Y: np.ndarray
-    """(W, k, p) of the outputs; zero where a sample is missing"""
+    """Transforms (W, k, p) of the outputs; zero where a sample is missing."""
     seen: np.ndarray
-    """(W, p) 1 where all samples of an output are there, else 0"""
+    """Mask (W, p): 1 if all samples of an output exist, else 0."""
     left_out: dict[str, str]
-    """by output that is left out, why"""
+    """Reasons why outputs are left out, by output."""
 
     @property
     def lines(self) -> np.ndarray:
-        """(k,) numbers of the lines"""
+        """Numbers (k,) of the lines."""
         return np.asarray(self.numbers)
 
     @property
     def hz(self) -> np.ndarray:
-        """(k,) frequencies [Hz]"""
+        """Frequencies (k,) [Hz]."""
         return self.lines / (self.length * self.dt)
 
     @property
     def seconds(self) -> float:
-        """length of a window"""
+        """Length of a window [s]."""
         return self.length * self.dt
 
     @property
     def step(self) -> int:
-        """samples from the beginning of a window to that of the next"""
+        """Distance between the starts of consecutive windows [samples]."""
         return _step(self.length)
 
     def later(self, steps: int) -> np.ndarray:
-        """(W - steps,) whether the window so many after each is of the same flight."""
+        """True (W - steps,) where the window `steps` later belongs to the same flight."""
         flight = np.repeat(np.arange(len(self.starts)), [len(s) for s in self.starts])
         return flight[steps:] == flight[: len(flight) - steps]
 
     @property
     def common(self) -> np.ndarray:
-        """(W,) 1 where a window has every sample of all outputs, else 0"""
+        """Mask (W,): 1 if a window has every sample of all outputs, else 0."""
         return np.min(np.asarray(self.seen), axis=1)
 
     @property
     def together(self) -> bool:
-        """True if there are windows enough for the correlation of the outputs' errors: the
-        inverse of a spectral matrix from few averages is too large."""
+        """True if the windows suffice to estimate the correlation of the outputs' errors.
+
+        The inverse of a spectral matrix from few averages is too large.
+        """
         left = np.sum(self.common) / PER_AVERAGE - len(self.inputs)
         return len(self.outputs) == 1 or bool(left * _SMOOTHED >= _FOR_MATRIX * len(self.outputs))
 
     @property
     def averages(self) -> np.ndarray:
-        """(p,) independent averages of each output"""
+        """Independent averages (p,) of each output."""
         return np.sum(self.seen, axis=0) / PER_AVERAGE
 
 
@@ -359,22 +369,22 @@ def window_transforms(
     lines: Sequence[int] | np.ndarray,
     dt: float,
 ) -> Complex[np.ndarray | Array, "c W k"]:
-    """Fourier transforms of Hann windows, scaled so that squares are one-sided densities per Hz.
+    """Return Fourier transforms of Hann windows, scaled to one-sided densities per Hz when squared.
 
     Args:
-        dt: between two samples [s].
+        dt: time between samples [s].
     """
     xp = jnp if isinstance(x, jax.Array) else np
     window = hann(length)
     parts = x[:, np.asarray(starts, int)[:, None] + np.arange(length)]
-    # A constant is in the first line alone, and that is kept.
+    # A constant appears only in the first line, which is kept.
     parts = parts - xp.mean(parts, axis=-1, keepdims=True)
     transforms = xp.fft.rfft(parts * window[None, None], axis=-1)[..., np.asarray(lines, int)]
     return transforms * float((2.0 * dt / np.sum(window**2)) ** 0.5)
 
 
 def hann(length: int) -> Float[np.ndarray, " n"]:
-    """The window."""
+    """Return a periodic Hann window."""
     return 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)
 
 
@@ -383,19 +393,19 @@ def windowed(
     options: ResponseOptions = ResponseOptions(),
     by: Sequence[str] | None = None,
 ) -> Windowed:
-    """Flights in windows.
+    """Transform flights in windows.
 
     Args:
-        flights: of one rate, with the same inputs; samples of outputs may be missing.
-        by: inputs that are taken by their instrument (`Flight.instruments`); all that have one in
-            every flight unless given.
+        flights: flights of one rate with the same inputs; samples of outputs may be missing.
+        by: inputs that use their instrument (`Flight.instruments`); default: all that have one in
+            every flight.
 
     Raises:
         ValueError: rates differ, nothing moves, the band does not fit the window or the rate, or
-            no output has windows enough.
+            every output has too few windows.
     """
     dt, seconds, inputs = chosen(flights, options.window)
-    # Even, so that half of it is a number of samples.
+    # An even length makes half a window a whole number of samples.
     length = 2 * round(0.5 * seconds / dt)
     lines = _lines(options, length, dt)
     instruments = tuple(
@@ -405,7 +415,7 @@ def windowed(
     outputs, seen, left_out = _complete(flights, starts, length, (length * dt, len(inputs)))
 
     def transforms(signals: list[np.ndarray]) -> np.ndarray:
-        """(W, k, c) of signals (c, N) by flight."""
+        """Return transforms (W, k, c) of signals (c, N) by flight."""
         parts = [
             window_transforms(x, s, length, lines, dt) for x, s in zip(signals, starts, strict=True)
         ]
@@ -427,10 +437,10 @@ def _complete(
     length: int,
     asked: tuple[float, int],
 ) -> tuple[tuple[str, ...], np.ndarray, dict[str, str]]:
-    """The outputs that have windows enough, which windows (W, p), and why others have not.
+    """Return the outputs with enough windows, their mask (W, p), and the reasons for the others.
 
     Args:
-        asked: the same in seconds, and how many inputs move.
+        asked: length of a window [s], and number of inputs that move.
     """
     outputs = tuple(dict.fromkeys(n for f in flights for n in f.outputs))
     seen = np.concatenate(
@@ -453,7 +463,7 @@ def _complete(
 
 
 def _lines(options: ResponseOptions, length: int, dt: float) -> np.ndarray:
-    """The lines of the band, or of these the ones nearest to points of a logarithm."""
+    """Return the lines of the band, or those nearest to logarithmic points."""
     if length < 16:
         raise ValueError(f"window: expected at least 16 samples, {16 * dt:.3g} s; got {length}")
     low, high = options.band or (1.0 / (length * dt), HIGHEST / dt)
@@ -484,14 +494,14 @@ def _starts(flight: Flight, length: int) -> tuple[int, ...]:
 
 
 def _step(length: int) -> int:
-    # Rounded up: windows so many steps apart share no sample.
+    # Rounded up, so that windows this many steps apart share no sample.
     return -(-length // STEPS)
 
 
 def _seen(
     flight: Flight, starts: tuple[int, ...], length: int, outputs: tuple[str, ...]
 ) -> np.ndarray:
-    """(windows, p) 1 where a window has every sample of an output."""
+    """Return a mask (windows, p): 1 if a window has every sample of an output."""
     seen = np.zeros((len(starts), len(outputs)))
     for j, name in enumerate(outputs):
         if name in flight.outputs:
@@ -501,6 +511,6 @@ def _seen(
 
 
 def _filled(flight: Flight, outputs: tuple[str, ...]) -> np.ndarray:
-    """(p, N), zero where nothing is measured."""
+    """Return the outputs (p, N), zero where nothing is measured."""
     absent = np.zeros(flight.n_samples)
     return np.stack([np.nan_to_num(flight.outputs.get(n, absent), nan=0.0) for n in outputs])

@@ -1,8 +1,8 @@
 """Transfer functions with a delay, fitted to one measured frequency response.
 
-Complex linear errors by the random error of each frequency: logarithmic ones (CIFER's) are biased
-where the coherence is low. Frequencies that one window cannot tell apart share what they say, so
-that intervals do not depend on how densely a response was drawn.
+Complex linear errors are weighted by the random error of each frequency, since logarithmic errors
+(CIFER) are biased at low coherence. Frequencies that one window cannot resolve share their
+information, so that intervals do not depend on the density of points.
 
 Sources: Sanathanan and Koerner (1963) for the start; Pintelon and Schoukens (2012), chapter 9, for
 the weights and the covariance; Tischler and Remple (2012), chapter 11, for the cost J.
@@ -16,35 +16,39 @@ from jaxtyping import Complex, Float
 from heli_jax.analysis.responses import independent_shares, student95
 
 _ROUNDS = 12
-"""of Sanathanan and Koerner's iteration; it settles in a handful"""
+"""Rounds of Sanathanan and Koerner's iteration, which converges within about five."""
 _DELAYS = 13
-"""from how many delays the search begins: the phase wraps, and each wrap has an optimum"""
+"""Number of start delays. The phase wraps, and each wrap has an optimum."""
 _SEARCHES = 3
-"""of them go on to the optimum"""
+"""Number of starts that are optimised."""
 _AS_LIKELY = 10.8
-"""of squared errors over their variance, what one of two optima may be worse by chance (99.9 %, one
-degree of freedom)"""
+"""Largest chance difference between two optima in squared errors over variance (99.9 %, one degree
+of freedom).
+"""
 _SINGULAR = 1e-10
-"""of the largest singular value of the Jacobian: below it a coefficient is not determined"""
+"""Singular value of the Jacobian below which a coefficient is not determined [fraction of the
+largest].
+"""
 _IMAGES = 50
-"""on either side: their shares fall with the square of their number"""
+"""Number of images on either side; their shares fall with the square of the index."""
 _FAR = 10.0
-"""sd of a coefficient past which nothing is known of it: of its own size, and in the middle of the
-band, where coefficients of the denominator and the delay's phase are of the order of 1"""
+"""Relative sd above which a coefficient is unknown. In mid-band units, denominator coefficients and
+the delay's phase are of order 1.
+"""
 
 
 class Coefficient(NamedTuple):
-    """A number of a transfer function."""
+    """A coefficient of a transfer function."""
 
     value: float
     sd: float
-    """inf where the response does not determine it"""
+    """Standard deviation; inf if the response does not determine the coefficient."""
     lower95: float
     upper95: float
 
     @property
     def determined(self) -> bool:
-        """True if the response determines it."""
+        """True if the response determines the coefficient."""
         return bool(np.isfinite(self.sd))
 
 
@@ -52,51 +56,54 @@ class TransferFit(NamedTuple):
     """(b_m s^m + ... + b_0) / (s^n + a_{n-1} s^{n-1} + ... + a_0) exp(-delay s)."""
 
     numerator: tuple[Coefficient, ...]
-    """highest power first"""
+    """Numerator, highest power first."""
     denominator: tuple[Coefficient, ...]
-    """likewise, after the leading one"""
+    """Denominator, highest power first, without the leading 1."""
     delay: Coefficient | None
-    """[s]; None where none was asked for"""
+    """Delay [s]; None if not requested."""
     chi_squared: float
-    """squared errors over their random errors, per degree of freedom: near 1 where the order is
-    enough and the response is one of a linear vehicle"""
+    """Squared errors over their variance, per degree of freedom. It is near 1 if the order suffices
+    and the vehicle is linear.
+    """
     J: float
-    """Tischler's cost: below 100 usual for a good fit, below 50 for one as good as flight"""
+    """Tischler's cost: below 100 is usual for a good fit, below 50 for one as good as flight data.
+    """
     converged: bool
 
     @property
     def determined(self) -> bool:
-        """True if the response determines every coefficient of the denominator and one of the
-        numerator."""
+        """True if the response determines all denominator coefficients and at least one of the
+        numerator.
+        """
         return all(c.determined for c in self.denominator) and any(
             c.determined for c in self.numerator
         )
 
     @property
     def poles(self) -> np.ndarray:
-        """(n,) complex [1/s]"""
+        """Poles (n,), complex [1/s]."""
         return np.roots([1.0, *(c.value for c in self.denominator)])
 
     @property
     def zeros(self) -> np.ndarray:
-        """(m,) complex [1/s]"""
+        """Zeros (m,), complex [1/s]."""
         return np.roots([c.value for c in self.numerator])
 
     def sampled(self, omega: Float[np.ndarray, " k"], hold: "Hold | None") -> np.ndarray:
-        """Return its response as a sampled record shows it (k,), complex.
+        """Return the response of a sampled record (k,), complex.
 
         Args:
-            omega: (k,) [rad/s]
-            hold: what the input does between samples; None gives G(i omega).
+            omega: frequencies (k,) [rad/s].
+            hold: hold of the input between samples; None gives G(i omega).
         """
         at, share = images(omega, hold)
         return np.sum(share * self.response(at), axis=1)
 
     def response(self, omega: Float[np.ndarray, "..."]) -> Complex[np.ndarray, "..."]:
-        """G(i omega).
+        """Return G(i omega).
 
         Args:
-            omega: any shape [rad/s]
+            omega: frequencies of any shape [rad/s].
         """
         s = 1j * omega
         tau = 0.0 if self.delay is None else self.delay.value
@@ -105,41 +112,41 @@ class TransferFit(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """One response to be fitted; arrays (k,)."""
+    """A measured response; arrays (k,)."""
 
     omega: np.ndarray
-    """[rad/s], rising"""
+    """Frequencies [rad/s], rising."""
     H: np.ndarray
-    """complex"""
+    """Response, complex."""
     sd: np.ndarray
-    """of its real and of its imaginary part"""
+    """Standard deviation of the real and of the imaginary part."""
     seconds: float
-    """length of the windows that it comes from"""
+    """Length of the windows [s]."""
     coherence: np.ndarray
     hold: "Hold | None" = None
-    """what the input does between samples; None for a response in continuous time"""
+    """Hold of the input between samples; None for a continuous-time response."""
     freedom: float = np.inf
-    """degrees of freedom of the variances"""
+    """Degrees of freedom of the variances."""
 
 
 class Hold(NamedTuple):
-    """An input between its samples."""
+    """Hold of an input between its samples."""
 
     kind: str
-    """"zero-order" or "linear" """
+    """"zero-order" or "linear"."""
     dt: float
-    """[s]"""
+    """Sample time [s]."""
 
 
 def images(omega: Float[np.ndarray, " k"], hold: Hold | None) -> tuple[np.ndarray, np.ndarray]:
-    """The frequencies (k, M) whose response a sampled record shows at omega, and the share of each.
+    """Return the frequencies (k, M) that a sampled record shows at omega, and the share of each.
 
-    Samples do not tell a frequency from its images; a held input has power at all of them, and
-    falls off with their distance.
+    Samples cannot distinguish a frequency from its images. A held input has power at all of them,
+    which falls with their distance.
 
     Args:
-        omega: (k,) [rad/s]
-        hold: of the input; None for a response in continuous time, which has no images.
+        omega: frequencies (k,) [rad/s].
+        hold: hold of the input; None for a continuous-time response, which has no images.
     """
     if hold is None:
         return omega[:, None], np.ones((omega.size, 1), complex)
@@ -153,31 +160,31 @@ def images(omega: Float[np.ndarray, " k"], hold: Hold | None) -> tuple[np.ndarra
 
 
 class _Scaled(NamedTuple):
-    """The response in a time unit in which coefficients are of one size."""
+    """The response in a time unit that scales all coefficients to similar size."""
 
     s: np.ndarray
-    """(k,) i omega over `speed`"""
+    """i omega over `speed` (k,)."""
     images: np.ndarray
-    """(k, M) likewise"""
+    """i times the image frequencies over `speed` (k, M)."""
     share: np.ndarray
-    """(k, M)"""
+    """Shares of the images (k, M)."""
     H: np.ndarray
     weight: np.ndarray
-    """(k,) of a complex error: root of the information of its real part"""
+    """Weight (k,) of a complex error: square root of the information of its real part."""
     speed: float
-    """[rad/s]"""
+    """Unit of frequency [rad/s]."""
 
 
 def fit_transfer(measured: Measured, zeros: int, poles: int, delay: bool = True) -> TransferFit:
-    """The transfer function of least squares.
+    """Fit a transfer function by least squares.
 
     Args:
-        measured: the response; frequencies whose numbers are not finite are left out.
+        measured: the response; frequencies with values that are not finite are left out.
         zeros: order m of the numerator, at most n.
         poles: order n of the denominator, from 1 to 8.
 
     Raises:
-        ValueError: orders out of range, or too few frequencies for so many coefficients.
+        ValueError: orders out of range, or too few frequencies for the number of coefficients.
     """
     if not (1 <= poles <= 8 and 0 <= zeros <= poles):
         raise ValueError(
@@ -192,7 +199,7 @@ def fit_transfer(measured: Measured, zeros: int, poles: int, delay: bool = True)
             "fewer zeros and poles, or a lower limit of coherence"
         )
     begun = [_begin(scaled, zeros, poles, tau) for tau in _first_delays(scaled, delay)]
-    # Those that begin nearest to the data: each search costs as much as all the starts.
+    # Only the best starts are optimised, since one search costs as much as all starts.
     begun.sort(key=lambda x: _cost(scaled, x, zeros))
     best = min((_search(scaled, x, zeros, delay) for x in begun[:_SEARCHES]), key=lambda r: r.cost)
     freedom = _freedom(measured, best.x.size)
@@ -201,7 +208,7 @@ def fit_transfer(measured: Measured, zeros: int, poles: int, delay: bool = True)
 
 
 def _shares(m: Measured) -> np.ndarray:
-    """Return by frequency (k,) the part of an independent frequency that it counts for."""
+    """Return the share (k,) of an independent frequency that each frequency has."""
     sound = np.isfinite(m.H) & np.isfinite(m.sd) & (m.sd > 0)
     return np.where(sound, independent_shares(m.omega, m.seconds), 0.0)
 
@@ -216,15 +223,17 @@ def _scaled(m: Measured) -> _Scaled:
 
 
 def _first_delays(scaled: _Scaled, delay: bool) -> np.ndarray:
-    # Up to one turn of the phase at the highest frequency. Below zero too: logs hold sticks that
-    # were written later than they acted.
+    # Up to one turn of the phase at the highest frequency. Negative delays too, since a log may
+    # record a stick after it acted.
     turns = np.linspace(-0.5, 1.0, _DELAYS)
     return turns * 2.0 * np.pi / np.abs(scaled.s[-1]) if delay else np.zeros(1)
 
 
 def _begin(scaled: _Scaled, zeros: int, poles: int, tau: float) -> np.ndarray:
-    """Coefficients by linear least squares, the denominator of the round before as a weight."""
-    # The frequency itself has nearly all of what its images share.
+    """Compute coefficients by linear least squares, weighted by the denominator of the round
+    before.
+    """
+    # The frequency itself has almost the whole share of its images.
     own = scaled.share[:, scaled.share.shape[1] // 2]
     s, H = scaled.s, scaled.H / own * np.exp(scaled.s * tau)
     up, down = np.vander(s, zeros + 1), np.vander(s, poles)
@@ -239,12 +248,12 @@ def _begin(scaled: _Scaled, zeros: int, poles: int, tau: float) -> np.ndarray:
 
 
 def _rows(v: np.ndarray) -> np.ndarray:
-    """Complex rows as twice as many real ones."""
+    """Stack complex rows as twice as many real ones."""
     return np.concatenate([np.real(v), np.imag(v)], axis=0)
 
 
 def _model(scaled: _Scaled, x: np.ndarray, zeros: int) -> tuple[np.ndarray, np.ndarray]:
-    """The response (k,) and its derivatives (k, unknowns); the last unknown is the delay."""
+    """Return the response (k,) and its derivatives (k, unknowns); the last unknown is the delay."""
     s, poles = scaled.images, x.size - zeros - 2
     powers = np.vander(s.ravel(), poles + 1).reshape(*s.shape, poles + 1)
     up, down = powers[..., poles - zeros :], powers[..., 1:]
@@ -257,7 +266,7 @@ def _model(scaled: _Scaled, x: np.ndarray, zeros: int) -> tuple[np.ndarray, np.n
 
 
 def _cost(scaled: _Scaled, x: np.ndarray, zeros: int) -> float:
-    """Sum of the squared rows; infinite where a start is no number."""
+    """Return the sum of squared rows; infinite for a start that is not finite."""
     with np.errstate(all="ignore"):
         error = scaled.weight * (_model(scaled, x, zeros)[0] - scaled.H)
         cost = float(np.sum(np.abs(error) ** 2))
@@ -266,7 +275,7 @@ def _cost(scaled: _Scaled, x: np.ndarray, zeros: int) -> float:
 
 # Any: SciPy's OptimizeResult has no types.
 def _search(scaled: _Scaled, x: np.ndarray, zeros: int, delay: bool):
-    # Here: a third of a second to load, for what few commands come to.
+    # Local import: SciPy's optimiser takes a third of a second, and few commands need it.
     from scipy.optimize import least_squares
 
     kept = x.size if delay else x.size - 1
@@ -293,15 +302,15 @@ def _search(scaled: _Scaled, x: np.ndarray, zeros: int, delay: bool):
 
 
 def _freedom(measured: Measured, unknowns: int) -> float:
-    """Degrees of freedom, at least 1."""
+    """Return the degrees of freedom, at least 1."""
     return max(2.0 * float(np.sum(_shares(measured))) - unknowns, 1.0)
 
 
 def _stable(scaled: _Scaled, best, zeros: int, freedom: float):
     """Reflect fast unstable poles of the optimum, unless the data prefer them.
 
-    In the band 1 / (p - s) is nearly 1 / (p + s) with a delay that is shorter by 2 / p, so a
-    vehicle has the stable pole unless there is much evidence. Slow poles in the band are left.
+    In the band, 1 / (p - s) is nearly 1 / (p + s) with a delay shorter by 2 / p. So the stable pole
+    is assumed without strong evidence. Slow poles in the band stay.
     """
     poles = _roots(best, zeros)
     growing = _fast_growing(poles)
@@ -319,7 +328,7 @@ def _stable(scaled: _Scaled, best, zeros: int, freedom: float):
 
 
 def _roots(optimum, zeros: int) -> np.ndarray:
-    """(n,) poles in units of the band's middle."""
+    """Return the poles (n,) in units of the mid-band frequency."""
     return np.roots(np.concatenate([[1.0], optimum.x[zeros + 1 : -1]]))
 
 
@@ -331,13 +340,13 @@ def _result(
     measured: Measured, scaled: _Scaled, optimum, zeros: int, delay: bool, freedom: float
 ) -> TransferFit:
     poles = optimum.x.size - zeros - 1 - delay
-    # Back to seconds: a power of s less in a coefficient is a power of the scale more.
+    # Convert to seconds: each power of s less in a coefficient is one power of the scale more.
     powers = np.concatenate(
         [poles - np.arange(zeros, -1, -1), poles - np.arange(poles - 1, -1, -1), [-1] * delay]
     )
     units = scaled.speed ** powers.astype(float)
     chi_squared = 2.0 * float(optimum.cost) / freedom
-    # What the order leaves unexplained is no smaller than what it was measured to.
+    # The unexplained error of the order is at least the measurement error.
     sd = _deviations(optimum.jac) * max(chi_squared, 1.0) ** 0.5
     size = np.ones(optimum.x.size)
     size[: zeros + 1] = np.max(np.abs(scaled.H))
@@ -372,10 +381,10 @@ def _deviations(J: np.ndarray) -> np.ndarray:
 
 
 def mismatch(measured: Measured, model: Complex[np.ndarray, " k"]) -> float:
-    """Tischler's cost J: 20 times the mean of squared errors in dB and in degrees, weighted by
-    coherence; NaN where nothing is measured.
+    """Return Tischler's cost J: 20 times the mean of squared errors in dB and in degrees, weighted
+    by coherence.
 
-    Source: Tischler and Remple (2012), section 11.2.
+    It is NaN where nothing is measured. Source: Tischler and Remple (2012), section 11.2.
     """
     seen = np.isfinite(measured.H) & (np.abs(measured.H) > 0) & np.isfinite(measured.coherence)
     if not seen.any():
@@ -384,5 +393,5 @@ def mismatch(measured: Measured, model: Complex[np.ndarray, " k"]) -> float:
     weight = (1.58 * (1.0 - np.exp(-measured.coherence[seen]))) ** 2
     decibels = 20.0 * np.log10(np.maximum(np.abs(quotient), 1e-300))
     degrees = np.degrees(np.angle(quotient))
-    # A degree counts as much as 0.1317 dB squared: 7.57 dB and a radian are as bad.
+    # A squared degree weighs as 0.01745 squared dB: 7.57 dB and one radian count the same.
     return float(20.0 * np.mean(weight * (decibels**2 + 0.01745 * degrees**2)))

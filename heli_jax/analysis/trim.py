@@ -1,6 +1,6 @@
-"""Trim: the state and the sticks at which a helicopter stays in a steady flight.
+"""Trim: the state and sticks of a helicopter in steady flight.
 
-The search begins at momentum theory in hover.
+The search starts from momentum theory in hover.
 """
 
 from collections.abc import Mapping
@@ -19,45 +19,45 @@ from heli_jax.dynamics.model import Model, SteadyFlight, require_constants
 from heli_jax.vehicle import of_helicopter
 
 STICKS = {"x_throttle": (0.0, 1.0), "x_yaw": (-1.0, 1.0), "x_collective": (-1.0, 1.0)}
-"""Where the sticks end, unless `trim` is told otherwise; the cyclic ones are lengths, and open."""
+"""Default limits of the sticks. Cyclic sticks are lengths without limits."""
 
-# Params, State and Inputs are classes of the user's, of numbers, arrays or tracers: `Any` below.
+# Params, State and Inputs are the user's classes of numbers, arrays or tracers, hence `Any` below.
 
 _TOLERANCE = 1e-10
-"""acceleration left, in m/s^2 or rad/s^2, below which a flight is steady"""
+"""Largest residual acceleration of a steady flight [m/s^2 or rad/s^2]."""
 _POLISH = 3
-"""steps of Newton's method, each doubling the digits"""
+"""Steps of Newton's method; each doubles the correct digits."""
 _TRIES = 12
-"""starts, the first from momentum theory and the others about it"""
+"""Number of starts: the first from momentum theory, the others around it."""
 _ROUNDING = 1e-9
 _LOWEST = -0.3
-"""collective stick above which the vehicle is the right way up"""
+"""Lowest collective stick of an upright vehicle."""
 _UPRIGHT = 1.5
-"""roll and pitch [rad] below which a vehicle is not on its back"""
+"""Largest roll and pitch of a vehicle that is not inverted [rad]."""
 
 
 class Condition(NamedTuple):
-    """A steady flight; speeds over the ground in m/s, along the heading and across it."""
+    """A steady flight."""
 
     forward_speed: Any = 0.0
-    """over the ground along the heading [m/s]"""
+    """Speed over the ground along the heading [m/s]."""
     lateral_speed: Any = 0.0
-    """to the right of it [m/s]"""
+    """Speed over the ground to the right of the heading [m/s]."""
     climb: Any = 0.0
-    """[m/s]"""
+    """Climb speed [m/s]."""
     heading: Any = 0.0
-    """psi [rad]"""
+    """Heading psi [rad]."""
 
 
 class Trim(NamedTuple):
-    """A steady flight that a vehicle can fly."""
+    """A steady flight that the vehicle can fly."""
 
     state: Any
-    """the model's State; x, y and z are zero"""
+    """The model's State; x, y and z are zero."""
     inputs: Any
-    """the model's Inputs"""
+    """The model's Inputs."""
     residual: Any
-    """the largest acceleration left, in m/s^2 or rad/s^2"""
+    """Largest residual acceleration [m/s^2 or rad/s^2]."""
 
 
 HOVER = Condition()
@@ -72,40 +72,40 @@ def trim(
     sticks: Mapping[str, tuple[float, float]] | None = None,
     power_off: bool = False,
 ) -> Trim:
-    """The steady flight of a helicopter model: hover, climb, forward and sideward flight.
+    """Return the trim of a helicopter model: hover, climb, forward and sideward flight.
 
-    All sticks, the attitude, the tip-path plane, the flybar and the rotor's speed are found
-    together; with a collective stick beside the throttle the rotor turns at the vehicle's Omega.
-    Concrete parameters only: `equilibrium` is what can be differentiated and batched.
+    It solves for all sticks, the attitude, the tip-path plane, the flybar and the rotor speed
+    together. With a collective stick in addition to the throttle, the rotor turns at the vehicle's
+    Omega. Parameters must be concrete; `equilibrium` can be differentiated and batched.
 
     Args:
-        wind: velocity of the air along x, y and z [m/s], for a model that has it.
-        sticks: the ends of the sticks' travel by name; those of `STICKS` unless given.
-        power_off: autorotation: the throttle is zero, and the climb, which is then negative, is
-            found in its place. For a model with a collective stick.
+        wind: velocity of the air along x, y and z [m/s], for a model with wind.
+        sticks: limits of the sticks by name; default: `STICKS`.
+        power_off: True for autorotation: the throttle is zero, and the (negative) climb is unknown
+            instead. Only for a model with a collective stick.
 
     Raises:
-        ValueError: no such flight exists (the residual is named), it needs more than a stick
-            gives, or it is outside the model's range.
+        ValueError: no such flight exists (the message gives the residual), a stick would exceed its
+            limits, or the flight is outside the model's range.
     """
     steady = _require(model, power_off)
     if sticks is None:
         sticks = {n: ends for n, ends in STICKS.items() if n in naming.names(model.Inputs)}
     require_constants(model, params)
     best: Trim | None = None
-    # Arrays of one kind, so that all vehicles are served by one compiled program.
+    # Arrays of one type, so that one compiled program serves all vehicles.
     params, condition, air = jax.tree.map(
         lambda v: jnp.asarray(v, jnp.result_type(float)), (params, condition, tuple(wind))
     )
-    # The same starts each time: a trim is a function of its arguments.
+    # A fixed seed makes the trim a function of its arguments.
     rng = np.random.default_rng(0)
     offset = np.zeros(len(steady.unknowns))
-    # A search ends at a root near its start: where that is no flight, another start helps.
+    # A search may end at a local minimum near its start, so several starts are tried.
     for _ in range(_TRIES):
         result = jax.device_get(
             _equilibrium(model, params, condition, air, jnp.asarray(offset), power_off)
         )
-        # The equations have more roots, such as inverted flight or blades that push downwards.
+        # The equations have other roots, such as inverted flight or downward lift.
         sound = plausible(result) and np.isfinite(result.residual)
         if sound and (best is None or result.residual < best.residual):
             best = result
@@ -127,13 +127,13 @@ def equilibrium(
     wind: tuple[Any, Any, Any] = (0.0, 0.0, 0.0),
     power_off: bool = False,
 ) -> Trim:
-    """Trim as `trim` does, from one start and without its errors: for jit, vmap and derivatives.
+    """Return the trim from one start, without the errors of `trim`: for jit, vmap and derivatives.
 
     Args:
         params: its constants, concrete or traced.
-        wind: velocity of the air along x, y and z [m/s], for a model that has it.
+        wind: velocity of the air along x, y and z [m/s], for a model with wind.
 
-    Look at `residual`: where it is not small (1e-10, say), there is no trim in the result.
+    Check `residual`: if it is not small (such as 1e-10), there is no trim.
     """
     steady = _require(model, power_off)
     return _equilibrium(model, params, condition, wind, jnp.zeros(len(steady.unknowns)), power_off)
@@ -148,10 +148,10 @@ def _equilibrium(
     offset: Float[Array, " k"],
     power_off: bool,
 ) -> Trim:
-    """Solve from the guess and half of `offset`, in the unknowns' sizes."""
+    """Solve from the guess plus half of `offset`, in scaled unknowns."""
     names, rates = _require(model, power_off)
     dtype = offset.dtype
-    # In units of their sizes: a rotor's speed is a thousand times a flapping angle.
+    # Unknowns are scaled, since a rotor speed is a thousand times a flapping angle.
     guess, scale = first_guess(model, params, condition.climb, power_off)
     start = jnp.stack([jnp.asarray(guess.get(n, 0.0), dtype) for n in names])
     scales = jnp.stack([jnp.asarray(scale.get(n, 0.1), dtype) for n in names])
@@ -159,11 +159,11 @@ def _equilibrium(
 
     def point(z: Array, parameters: Any) -> tuple[Any, Any]:
         values = dict(zip(names, z, strict=True))
-        # What is solved for replaces what is given: here a climb, there the rotor's speed.
+        # Unknowns replace given values: the climb in autorotation, else the rotor speed.
         fixed = {
             **ground,
             "dz": values.get("climb", condition.climb),
-            # An unknown only where one stick has to do for collective and throttle.
+            # Unknown only if one stick serves as collective and throttle.
             "Omega": parameters.Omega,
             "x_throttle": 0.0,
         }
@@ -184,19 +184,19 @@ def _equilibrium(
         fn,
         optx.LevenbergMarquardt(1e-12, 1e-12),
         start / scales + 0.5 * offset,
-        # Derivatives through the iterations would be those of its path, not of the root.
+        # Derivatives through the iterations would be those of the path, not of the root.
         args=jax.lax.stop_gradient(params),
         max_steps=200,
-        throw=False,  # in a batch one that fails must not end the others; `residual` tells
+        throw=False,  # one failure must not stop a batch; see `residual`
     )
-    # Newton's method takes it to the last digit, and gives it the derivatives of a root.
+    # Newton's method refines the root to the last digit and gives its derivatives.
     xi = jax.lax.stop_gradient(solution.value)
 
-    # One place has the model and its derivatives, so that it is compiled once: a step says what is
-    # left where it begins, and the last step says it of the root.
+    # Model and derivatives appear once, so that they are compiled once. Each step returns the
+    # residual at its start, so the last step returns that of the root.
     def polish(z: Array, _: Any) -> tuple[Array, tuple[Array, Array]]:
-        # Here `params` is not held back: a Newton step from a root has the derivative of the root
-        # by the parameters (implicit function), whatever way led there.
+        # `params` is not stopped here: a Newton step from a root has the root's derivative by the
+        # parameters (implicit function theorem).
         slopes, left = jax.jacfwd(lambda z: (fn(z, params),) * 2, has_aux=True)(z)
         return z - jnp.linalg.solve(slopes, left), (z, left)
 
@@ -206,8 +206,8 @@ def _equilibrium(
 
 
 def _along_the_ground(condition: Condition) -> dict[str, Any]:
-    """The heading and the velocities along the axes of the ground."""
-    # Speeds of a condition are along the heading.
+    """Return the heading and the velocities along the ground axes."""
+    # A condition's speeds are along the heading.
     cpsi, spsi = jnp.cos(jnp.asarray(condition.heading)), jnp.sin(jnp.asarray(condition.heading))
     return {
         "psi": condition.heading,
@@ -217,8 +217,10 @@ def _along_the_ground(condition: Condition) -> dict[str, Any]:
 
 
 def steady_flight(model: Model) -> SteadyFlight | None:
-    """Return the unknowns of trim: as the model states them, or by the names of its states and
-    inputs if these are those of the helicopter models here; None if it cannot be trimmed."""
+    """Return the unknowns of trim; None if the model cannot be trimmed.
+
+    They are those stated by the model, or found by names if these match the helicopter models here.
+    """
     if model.steady_flight is not None:
         return model.steady_flight
     states, inputs = naming.names(model.State), naming.names(model.Inputs)
@@ -228,12 +230,12 @@ def steady_flight(model: Model) -> SteadyFlight | None:
     solved_for += [] if "x_collective" in inputs else ["Omega"]
     unknowns = [n for n in states if n in solved_for]
     unknowns += [n for n in states if n.startswith("beta")]
-    # Wind and a measured rotor speed are given, not flown.
+    # Wind and a measured rotor speed are given, not solved for.
     unknowns += [n for n in inputs if not n.startswith("wind") and n != "Omega"]
-    # A state whose derivative is another state does not vanish by itself, it is that state.
+    # If a state's derivative is another state, its equation is not set to zero.
     no_equation = {"x", "y", "z", "phi", "theta", "psi"}
     equations = [n for n in states if n not in no_equation and f"d{n}" not in states]
-    # Another model by the same names: Newton's method needs as many of the one as of the other.
+    # A different model may use the same names. Newton's method needs as many equations as unknowns.
     if len(unknowns) != len(equations):
         return None
     return SteadyFlight(tuple(unknowns), tuple(equations))
@@ -248,8 +250,8 @@ def _require(model: Model, power_off: bool = False) -> SteadyFlight:
     """Return the unknowns of trim, or refuse the model.
 
     Raises:
-        ValueError: the model is not the full nonlinear model of a helicopter, or without power it
-            has no collective stick.
+        ValueError: the model is not the full nonlinear model of a helicopter, or lacks the
+            collective stick that autorotation needs.
     """
     check_model(model)
     steady = steady_flight(model)
@@ -271,13 +273,13 @@ def _require(model: Model, power_off: bool = False) -> SteadyFlight:
 
 
 def plausible(result: Trim) -> Bool[Array, "..."] | np.bool_ | bool:
-    """True if the rotor turns, the blades push upwards, and the helicopter is not inverted."""
+    """True if the rotor turns, the lift is upward, and the helicopter is not inverted."""
     state, inputs = result.state, result.inputs
-    # Absolute values and & in place of `and`: the same test serves numbers and batches of tracers.
+    # abs and & replace `and`, so that the test serves numbers and batches of tracers.
     level = (abs(state.phi) < _UPRIGHT) & (abs(state.theta) < _UPRIGHT)
     Omega = state.Omega if hasattr(state, "Omega") else inputs.Omega
     if hasattr(inputs, "x_collective"):
-        # Without power the blades may stand lower than flat.
+        # In autorotation the collective pitch may be negative.
         return level & (Omega > 0) & (inputs.x_collective > _LOWEST)
     return level & (Omega > 0) & (inputs.x_throttle > 0)
 
@@ -296,7 +298,7 @@ def _check_sticks(
                 f"{', '.join(naming.names(model.Inputs))}"
             )
         value = float(getattr(result.inputs, name))
-        # The governor's stick stands at its end, which rounding may pass.
+        # The governor's stick is at its limit, which rounding may exceed.
         if low - _ROUNDING <= value <= high + _ROUNDING:
             continue
         why = _why_heavy(model, params, result, name) if value > high else ""
@@ -307,7 +309,9 @@ def _check_sticks(
 
 
 def _why_heavy(model: Model, params: Any, result: Trim, stick: str) -> str:
-    """Reason why the stick that carries the weight is past its end; empty for other sticks."""
+    """Return the reason why the stick that carries the weight exceeds its limit; empty for other
+    sticks.
+    """
     if stick not in ("x_throttle", "x_collective"):
         return ""
     weight = float(params.m * params.g)
@@ -324,8 +328,8 @@ def _why_heavy(model: Model, params: Any, result: Trim, stick: str) -> str:
 def _check_range(model: Model, params: Any, result: Trim, condition: Condition) -> None:
     if model.limits is None:
         return
-    # A root of equations outside their range is a number without a vehicle, such as a flight with
-    # reversed flow over half of the rotor.
+    # A root outside the range of the equations is not physical, such as reversed flow over half the
+    # rotor.
     limits = model.limits(params, result.state, result.inputs)
     outside = [name for name, out in limits.items() if bool(out)]
     if outside:
@@ -344,24 +348,25 @@ def _words(condition: Condition) -> str:
     return " and ".join(sorted(speeds)) or "hover"
 
 
-# The constants are a class of the user's, of numbers, arrays or tracers: `Any` below.
+# The constants are a user's class of numbers, arrays or tracers, hence `Any` below.
 
 
 def first_guess(
     model: Model, p: Any, climb: Any, power_off: bool
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Start and size of the unknowns: the rotor at its nominal speed, carrying the weight.
+    """Return initial guess and scale of the unknowns: the rotor at nominal speed carries the
+    weight.
 
     Args:
-        climb: [m/s].
+        climb: climb speed [m/s].
     """
-    # Momentum theory in hover, then blade-element theory solved for the collective pitch.
+    # Momentum theory in hover, then collective pitch from blade-element theory.
     area = jnp.pi * p.R**2
     vi = jnp.sqrt(p.m * p.g / (2.0 * p.rho * area))
     tip = p.R * p.Omega
     sigma = 2.0 * p.c / (jnp.pi * p.R)
     loading = 2.0 * p.m * p.g / (p.rho * area * tip**2 * p.a * sigma)
-    # In autorotation hardly anything goes through the rotor.
+    # In autorotation almost no air flows through the rotor.
     inflow = 0.0 * tip if power_off else (vi + climb) / tip
     theta0 = 3.0 / p.B**3 * (loading + 0.5 * p.B**2 * inflow)
     stick = theta0 / p.K_theta0
@@ -375,8 +380,8 @@ def first_guess(
         "x_roll": 0.1 * p.L1, "x_pitch": 0.1 * p.L1,
     }  # fmt: skip
     if "x_collective" in naming.names(model.Inputs):
-        # The throttle that carries induced and half as much of other power; the governor's stick
-        # asks for the whole speed.
+        # Throttle for induced power plus half as much other power; the governor's stick commands
+        # full speed.
         power = 1.5 * p.m * p.g * vi / (p.Ir * p.K_throttle * p.Omega)
         governed = "governor" in naming.names(model.State)
         guess |= {"x_throttle": 1.0 if governed else power, "governor": power}

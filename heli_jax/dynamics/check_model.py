@@ -1,12 +1,13 @@
-"""Check that an object is a model that JAX can trace, before anything is computed.
+"""Checks that an object is a model that JAX can trace, before any computation.
 
-A model's functions are called with tracers, which stand for numbers that are not known yet. What
-works on numbers may not work on them: NumPy's functions, `if x > 0`, `float(x)`.
+A model's functions are called with tracers, which represent unknown numbers. NumPy's functions, `if
+x > 0` and `float(x)` fail on tracers.
 
-What a model states by name (delays, axes, positive parameters) has to be there: a wrong name is no
-error of Python, but an axis would be ignored, and a delay fail in the middle of a fit.
+Names in a model (delays, axes, positive parameters) must exist. Python does not check them: a wrong
+axis would be ignored, and a wrong delay would fail during a fit.
 
-`cannot_start` says whether a model can begin at its initial state, `starting_at` moves that.
+`cannot_start` checks that a model can start at its initial state, and `starting_at` changes that
+state.
 """
 
 import dataclasses
@@ -29,15 +30,14 @@ from heli_jax.naming import Record
 _RECORDS = ("Params", "State", "Inputs", "Outputs")
 
 
-# What is checked here is anyone's: the parameters annotated Any are whatever a user has passed, and
-# what their functions have returned.
+# Any: arguments and return values of users' functions can have any type.
 
 
 def check_params(params: type, vehicle: Any) -> None:
-    """Refuse what has not the parameters of a model.
+    """Refuse an object without the parameters of a model.
 
     Raises:
-        TypeError: saying what to pass.
+        TypeError: the object has other parameters; the message states what to pass.
     """
     if isinstance(vehicle, str | bytes) or hasattr(vehicle, "__fspath__"):
         raise TypeError(
@@ -52,17 +52,20 @@ def check_params(params: type, vehicle: Any) -> None:
 
 
 def check_model(model: Any, *, traceable: bool = True) -> None:
-    """Refuse what is no Model, and a Model whose functions cannot be traced or return something
-    else than is expected. A model is looked at once; later calls cost a look-up.
+    """Refuse objects that are no Model, and Models with functions that cannot be traced or return
+    unexpected types.
+
+    A model is checked once; later calls only look it up.
 
     Args:
-        traceable: whether parameters, states and inputs are all traced, as in a fit or a sweep.
-            Without it only the return values are checked: parameters that stay plain numbers may
-            be branched on.
+        traceable: True if parameters, states and inputs are all traced, as in a fit or a sweep.
+            Otherwise only return values are checked, since code may branch on parameters that stay
+            plain numbers.
 
     Raises:
         TypeError: it is no Model.
-        ValueError: naming the function, what was expected, what it did, and the remedy.
+        ValueError: a function fails; the message names it, what was expected, what it did, and the
+            remedy.
     """
     if isinstance(model, str):
         raise TypeError(
@@ -74,26 +77,25 @@ def check_model(model: Any, *, traceable: bool = True) -> None:
             f"model: expected a heli_jax.Model, as Model(name, vector_field, output, Params, "
             f"State, Inputs, Outputs) makes one, got {what_instead(model)}"
         )
-    # Ours are tested, and what they wrap was looked at when it was wrapped.
+    # Models of this package are tested, and wrapped functions were checked when they were wrapped.
     if str(getattr(_bare(model.vector_field), "__module__", "")).startswith("heli_jax."):
         return
     parts = _Parts(*(getattr(model, name) for name in _Parts._fields))
-    # The check traces every function: once for each set of functions and classes, not
-    # for each call of `simulate`.
+    # Each set of functions and classes is traced once, not in every call of `simulate`.
     try:
         hash(parts)
-    except TypeError:  # such as a function with arrays in it
+    except TypeError:  # such as a function that holds arrays
         _check(parts, traceable)
     else:
         _check_once(parts, traceable)
 
 
 def what_instead(value: Any) -> str:
-    """Describe an object that is no Model, for the end of a sentence."""
+    """Describe an object that is no Model, for the end of a message."""
     if isinstance(value, type):
         return f"the class {value.__name__}"
     function = _bare(value)
-    # Without a look at what it returns: a function of somebody's own may do anything when called.
+    # The function is not called, since a user's function may have side effects.
     if getattr(function, "__annotations__", {}).get("return") in (Model, "Model"):
         name = function.__name__
         return f"the function {name}, which makes one; expected what it returns, as {name}()"
@@ -101,7 +103,7 @@ def what_instead(value: Any) -> str:
 
 
 class _Parts(NamedTuple):
-    """Functions and classes of a Model, by which two models are compared."""
+    """Functions and classes of a Model, which identify it in the cache."""
 
     name: str
     vector_field: Any
@@ -126,16 +128,16 @@ def _check_once(parts: _Parts, traceable: bool) -> None:
 
 
 def explained[**P, R](function: Callable[P, R]) -> Callable[P, R]:
-    """A function of a model whose errors, where the model is their cause, are those of
-    `check_model`."""
+    """Decorate a function of a model, so that errors caused by the model are those of
+    `check_model`.
+    """
 
     @functools.wraps(function)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
         model = args[0] if args else kwargs.get("model")
         check_model(model, traceable=False)
-        # Whether all is traced is not known beforehand: parameters that are plain numbers may be
-        # branched on. So the full check is made only after a failure, and where it finds nothing
-        # the failure was not the model's.
+        # It is not known in advance whether all arguments are traced. So the full check runs only
+        # after a failure. If it finds nothing, the model did not cause the failure.
         try:
             return function(*args, **kwargs)
         except Exception:
@@ -146,7 +148,7 @@ def explained[**P, R](function: Callable[P, R]) -> Callable[P, R]:
 
 
 def _check(model: _Parts, traceable: bool) -> None:
-    # The classes first: functions are traced with records of them.
+    # Classes first, since functions are traced with their records.
     for role in _RECORDS:
         _check_record(model, role)
     check_names(model)
@@ -182,7 +184,7 @@ def _check_record(model: _Parts, role: str) -> None:
             f"model {model.name!r}: {role}: {expected}, got {record.__name__}, whose fields "
             f"cannot be told ({type(e).__name__}: {said})"
         ) from e
-    # A vehicle without inputs may fall; one without states has nothing to integrate.
+    # A vehicle without inputs may fall, but one without states has nothing to integrate.
     if not names and role != "Inputs":
         raise ValueError(f"model {model.name!r}: {role}: {expected}, got one without fields")
     if _is_leaf(record, names):
@@ -193,18 +195,18 @@ def _check_record(model: _Parts, role: str) -> None:
 
 
 def _is_leaf(record: type, names: tuple[str, ...]) -> bool:
-    """True if JAX takes a record for one value, and not for the values of its fields."""
+    """True if JAX treats a record as one value instead of the values of its fields."""
     try:
-        # A class that JAX does not know as a pytree would be one opaque value: every function of it
-        # would then fail within jit, with words about something else.
+        # A class that is no pytree is one opaque value, and every function would fail within jit
+        # with a misleading message.
         made = record(**dict.fromkeys(names, 1.0))
-    except Exception:  # a class that looks at its values has to do without this check
+    except Exception:  # a class that checks its values cannot be tested here
         return False
     return jax.tree_util.all_leaves([made])
 
 
 class _Function:
-    """One function of a model, as it is traced and spoken of."""
+    """One function of a model, with its names for messages."""
 
     def __init__(
         self, model: _Parts, role: str, arguments: tuple[str, ...], traceable: bool
@@ -221,12 +223,12 @@ class _Function:
         raise ValueError(f"{where}{_line(self.function, cause)}: {problem}") from cause
 
     def returns(self, role: str) -> None:
-        """Refuse a return value that is no record of that role, with one number a field."""
+        """Refuse a return value that is no record of that role with one number a field."""
         record = getattr(self.model, role)
         self.traced(lambda returned: self.check_fields(returned, record, role))
 
     def returns_by_name(self, known: tuple[str, ...] | None) -> None:
-        """Refuse a return value that is no dictionary of numbers, by some of the known names."""
+        """Refuse a return value that is no dictionary of numbers with known names."""
 
         def check(returned: Any) -> None:
             if not isinstance(returned, dict):
@@ -240,11 +242,11 @@ class _Function:
         self.traced(check)
 
     def check_fields(self, returned: Any, record: type, role: str) -> None:
-        """Refuse a return value that is no such record."""
+        """Refuse a return value that is not a matching record."""
         fields = ", ".join(f"{n}=..." for n in naming.names(record)[:4])
         more = ", ..." if len(naming.names(record)) > 4 else ""
         expected = f"expected the model's {role}, as `return {record.__name__}({fields}{more})`"
-        # Another class with the same fields serves for outputs; states are added to one another.
+        # Outputs may be another class with the same fields, but states are added to one another.
         alike = role == "Outputs" and all(hasattr(returned, n) for n in naming.names(record))
         if not (isinstance(returned, record) or alike):
             self.refuse(f"{expected}, got {_kind(returned)}")
@@ -265,15 +267,15 @@ class _Function:
         if not (
             jnp.issubdtype(array.dtype, jnp.floating)
             or jnp.issubdtype(array.dtype, jnp.integer)
-            # Limits are answers of yes or no.
+            # Limits are booleans.
             or self.role == "limits"
         ):
             self.refuse(f"expected a real number for {name!r}, got one of type {array.dtype}")
 
     def traced(self, check: Callable[[Any], None]) -> None:
-        """Call the function with tracers, and look at what it returns while they last."""
+        """Call the function with tracers, and check the result while they exist."""
         classes = [getattr(self.model, a.capitalize()) for a in self.arguments]
-        # Shapes and types alone: nothing is computed, so a model may take as long as it likes.
+        # Only shapes and types are evaluated, so a slow model costs no time.
         number = jax.ShapeDtypeStruct((), jnp.result_type(float))
 
         def call(numbers: list[list[Any]]) -> None:
@@ -282,7 +284,7 @@ class _Function:
                     record(**dict(zip(naming.names(record), values, strict=True)))
                     for record, values in zip(classes, numbers, strict=True)
                 ]
-            except Exception:  # a class that looks at its values has to do without this check
+            except Exception:  # a class that checks its values cannot be tested here
                 return
             try:
                 returned = self.function(*records)
@@ -295,9 +297,9 @@ class _Function:
         jax.eval_shape(call, [[number] * len(naming.names(record)) for record in classes])
 
 
-# Arguments in another order are the most common mistake, and show as a missing attribute.
+# Swapped arguments are the most common mistake, and appear as a missing attribute.
 def _words(e: Exception) -> str:
-    """Return the error of a function in words, with the remedy where it is known."""
+    """Return the error of a function in words, with a remedy if there is one."""
     if isinstance(e, jax.errors.TracerBoolConversionError):
         return (
             "branches on a value that is traced (if, while, and, or, min, max); expected "
@@ -328,7 +330,7 @@ def _is_named_tuple(value: Any) -> bool:
 
 
 def _kind(value: Any) -> str:
-    """`a tuple of 2`, `None`, `a dict`."""
+    """Return the kind of a value: `a tuple of 2`, `None`, `a dict`."""
     if value is None:
         return "None"
     if isinstance(value, core.Tracer | jax.Array):
@@ -340,7 +342,7 @@ def _kind(value: Any) -> str:
 
 
 def _bare(function: Any) -> Any:
-    """The function within partial applications and other wrappers."""
+    """Return the function within partial applications and other wrappers."""
     # functools.partial has `func`, jit and functools.wraps have `__wrapped__`.
     while True:
         inner = getattr(function, "func", None) or getattr(function, "__wrapped__", None)
@@ -350,7 +352,7 @@ def _bare(function: Any) -> Any:
 
 
 def _name(function: Any) -> str:
-    """`module.function`"""
+    """Return `module.function`."""
     function = _bare(function)
     name = getattr(function, "__qualname__", type(function).__name__)
     module = getattr(function, "__module__", "")
@@ -358,14 +360,13 @@ def _name(function: Any) -> str:
 
 
 def _line(function: Any, cause: BaseException | None) -> str:
-    """` (line 12)`: where in the function's file something went wrong; else where it begins."""
+    """Return ` (line 12)`: the line of an error in the function's file, or its first line."""
     code = getattr(_bare(function), "__code__", None)
     if code is None:
         return ""
     line = code.co_firstlineno
     if cause is not None:
-        # The deepest line in the function's own file: deeper ones are JAX's and tell the user
-        # nothing.
+        # The deepest line in the function's own file, since deeper lines are JAX's.
         inside = [
             frame.lineno
             for frame in traceback.extract_tb(cause.__traceback__)
@@ -375,18 +376,19 @@ def _line(function: Any, cause: BaseException | None) -> str:
     return f" (line {line})"
 
 
-# The model is anyone's, and its fields are whatever a user has passed.
+# A user's model may have any values in its fields.
 
 
 def check_names(model: Any) -> None:
-    """Refuse delays, axes and positive parameters that name what the model has not.
+    """Refuse delays, axes and positive parameters with names that the model lacks.
 
     Args:
-        model: whose classes `Params`, `State`, `Inputs` have been checked, with `name`, `delays`,
+        model: model with checked classes `Params`, `State`, `Inputs`, and with `name`, `delays`,
             `axes` and `positive`.
 
     Raises:
-        ValueError: naming the place, what was expected and what was got.
+        ValueError: a name is unknown; the message states the place, what was expected and what was
+            found.
     """
     _check_delays(model)
     for axis in _tuple(model, "axes", model.axes if model.axes is not None else ()):
@@ -406,13 +408,13 @@ def _check_delays(model: Any) -> None:
         stick, parameter = pair
         _known(model, "delays", "Inputs", stick)
         _known(model, f"delays of {stick}", "Params", parameter)
-        # A delay is taken as seconds, whatever its field says.
+        # A delay is used in seconds, whatever its unit.
         unit = naming.unit(model.Params, parameter)
         if unit is not None and not _is_second(unit):
             problem = f"expected {parameter} in s, got {unit!r}"
             _refuse(model, f"delays of {stick}", problem)
-        # Two would be two readings of one record at different times, and later code keeps them by
-        # input: the second would replace the first without a word.
+        # Two delays would read one record at different times. Later code stores them by input, so
+        # the second would silently replace the first.
         if stick in late:
             _refuse(model, "delays", f"expected one delay of {stick}, got two")
         late.add(stick)
@@ -420,15 +422,15 @@ def _check_delays(model: Any) -> None:
 
 def _is_second(unit: str) -> bool:
     try:
-        # Milliseconds are refused as well: the parameter's value would be taken for seconds as it
-        # stands, a delay a thousand times too long.
+        # Milliseconds are refused too, since the value would be used as seconds, a thousand times
+        # too long.
         return units.factor(unit, "s") == 1.0
     except ValueError:
         return False
 
 
 def _names_of(model: Any, axis: Axis) -> Iterator[tuple[str, str, Any]]:
-    """(field, role, name) of what an axis names."""
+    """Yield (field, role, name) for all names in an axis."""
     yield "rate", "State", axis.rate
     optional = (
         ("angle", "State"), ("inertia", "Params"), ("added_inertia", "Params"), ("stick", "Inputs"),
@@ -441,8 +443,10 @@ def _names_of(model: Any, axis: Axis) -> Iterator[tuple[str, str, Any]]:
 
 
 def _tuple(model: Any, place: str, value: Any) -> tuple[Any, ...]:
-    """The value, which has to be a tuple: a model is compiled, so nothing in it may change."""
-    # An Axis is a tuple itself: `axes=(Axis(...))` without its comma would pass for a tuple of
+    """Return the value, which must be a tuple: a model is compiled, so its parts must
+    not change.
+    """
+    # An Axis is itself a tuple: `axes=(Axis(...))` without its comma would look like a tuple of
     # names.
     if not isinstance(value, tuple) or isinstance(value, Axis):
         example = _EXAMPLES.get(place, '("c", "d")')
@@ -470,17 +474,17 @@ def _refuse(model: Any, place: str, problem: str) -> NoReturn:
 
 
 def starting_at(model: Model, values: Mapping[str, float]) -> Model:
-    """The model with an initial state that has the given values [SI] of some states.
+    """Return the model with given initial values [SI] of some states.
 
     Raises:
-        ValueError: a state that the model does not have.
+        ValueError: the model lacks a state.
     """
     for name in values:
         if name not in naming.names(model.State):
             raise ValueError(f"model {model.name} has no state {name!r}")
 
     def start(params: Record) -> Record:
-        # The values take the dtype of what they replace, or a float32 run would become a mixed one.
+        # The values take the dtype of the old ones, so that a float32 run stays float32.
         state = naming.asdict(model.initial_state(params))
         changed = {n: jnp.asarray(v, jnp.asarray(state[n]).dtype) for n, v in values.items()}
         return model.State(**{**state, **changed})
@@ -489,13 +493,14 @@ def starting_at(model: Model, values: Mapping[str, float]) -> Model:
 
 
 def cannot_start(model: Model, params: Record, inputs: Mapping[str, float] | None = None) -> str:
-    """Reason why a model cannot begin at its initial state, with the remedy; empty if it can.
+    """Return the reason why a model cannot start at its initial state, with the remedy; empty if it
+    can.
 
-    Rates and outputs have to be finite there, and their derivatives by the states.
+    Rates and outputs must be finite there, and so must the rates' derivatives by the states.
 
     Args:
         params: the model's Params, SI; concrete numbers.
-        inputs: at the first sample; zero where not given.
+        inputs: inputs at the first sample; default: zero.
     """
     params = plain(params)
     names = naming.names(model.State)
@@ -504,14 +509,13 @@ def cannot_start(model: Model, params: Record, inputs: Mapping[str, float] | Non
     u = model.Inputs(
         **{n: np.float64((inputs or {}).get(n, 0.0)) for n in naming.names(model.Inputs)}
     )
-    # In NumPy's numbers, outside of jit: a model is asked at one point, and compiling it would take
-    # longer.
+    # NumPy outside jit, since one evaluation is faster than compiling.
     bad = _not_finite(model, params, x, u)
     if not bad:
         return ""
-    # A model that divides by an airspeed cannot begin at rest, and what JAX says of it is an array
-    # of NaN. So each state at zero is moved to one, to see which of them is the cause: first alone,
-    # then all together, as where two of them make up a speed.
+    # A model that divides by an airspeed cannot start at rest, and JAX only returns NaN. To find
+    # the cause, each zero state is set to one: first alone, then all together, in case two form a
+    # speed.
     zero = [n for n in names if x[n] == 0.0]
     cause = [n for n in zero if len(_not_finite(model, params, {**x, n: _ONE}, u)) < len(bad)]
     if not cause and not _not_finite(model, params, {**x, **dict.fromkeys(zero, _ONE)}, u):
@@ -533,24 +537,27 @@ _ONE = np.float64(1.0)
 
 
 def _not_finite(model: Model, params: Record, x: dict[str, Any], u: Record) -> tuple[str, ...]:
-    """The rates and outputs that are not finite at a point, or whose derivatives are not."""
+    """Return the rates and outputs that are not finite at a point, or have derivatives that are
+    not.
+    """
     with np.errstate(all="ignore"):
         rates, outputs = field_and_output(model, params, model.State(**x), u)
     values = {f"the rate of {n}": v for n, v in naming.asdict(rates).items()}
     values |= {f"output {n}": v for n, v in naming.asdict(outputs).items()}
     bad = tuple(n for n, v in values.items() if not np.isfinite(float(v)))
-    # Derivatives only where the values are finite: those of a value that is none say nothing more.
+    # Derivatives matter only if the values are finite.
     return bad or _no_slope(model, params, x, u)
 
 
 def _no_slope(model: Model, params: Record, x: dict[str, Any], u: Record) -> tuple[str, ...]:
-    """The rates whose derivatives by the states are not finite, such as that of a root at zero."""
+    """Return the rates with derivatives by the states that are not finite, such as a
+    root at zero.
+    """
 
     def rates(x: Array) -> Array:
         return naming.ravel(model.vector_field(params, naming.unravel(model.State, x), u))
 
-    # By JAX, not by differences: sqrt(V2) at rest is finite and so are its differences, but a fit's
-    # gradient through it is not.
+    # Use JAX: at rest sqrt(V2) and its finite differences are finite, but a fit's gradient is not.
     slopes = jax.jacfwd(rates)(naming.ravel(model.State(**x), jnp.result_type(float)))
     finite = np.isfinite(np.asarray(slopes)).all(axis=1)
     names = naming.names(model.State)

@@ -1,6 +1,7 @@
-"""Disturbances as part of the model: random pushes on derivatives, each with a memory.
+"""Disturbances as part of the model: random accelerations with a correlation time.
 
-Noise of sensors before an on-board low-pass is not white in the log, but white on its state.
+Sensor noise before an on-board low-pass is not white in the log, but it is white on the filter's
+state.
 """
 
 import dataclasses
@@ -17,68 +18,67 @@ from heli_jax.naming import Record, Scalar
 
 
 def disturbable(model: Model) -> list[str]:
-    """The axes of a model that can be disturbed, by name."""
+    """Return the names of a model's axes that can be disturbed."""
     return [axis.name for axis in axes_of(model)]
 
 
 @functools.cache
 def disturbable_states(model: Model) -> tuple[str, ...]:
-    """The states whose derivative may be pushed: all but those of pure kinematics.
+    """Return the states that can be disturbed: all except those of pure kinematics.
 
-    Kinematics (phi' = p, z' = -w) hold whatever the air does: the derivative is another state, or
-    its negative, and nothing else. The rate of an axis may always be pushed.
+    Kinematics (phi' = p, z' = -w) do not depend on the air: the derivative is another state, or its
+    negative. The rate of an axis can always be disturbed.
     """
     names = naming.names(model.State)
     nan = np.float64(np.nan)
-    # Numbers that no formula makes of one another by chance.
+    # Random numbers that no formula maps to one another by chance.
     values = np.random.default_rng(7).uniform(0.5, 1.5, len(names))
     state = dict(zip(names, (np.float64(v) for v in values), strict=True))
     params = plain(model.Params(**dict.fromkeys(naming.names(model.Params), nan)))
     inputs = model.Inputs(**dict.fromkeys(naming.names(model.Inputs), nan))
-    # NaN goes through every operation that uses it: what is still a number uses neither. That alone
-    # does not make it kinematics: v' = -0.4 v + 9.81 phi is a force whose coefficients are written
-    # as numbers.
+    # NaN propagates through every operation, so a finite result uses neither parameters nor inputs.
+    # That alone is not kinematics: v' = -0.4 v + 9.81 phi is a force with constant coefficients.
     with np.errstate(all="ignore"):
         rates = naming.asdict(model.vector_field(params, model.State(**state), inputs))
     turning = {axis.rate for axis in axes_of(model)}
 
     def bare(name: str) -> bool:
         size = abs(float(rates[name]))
-        # To single precision, in which the model may have been evaluated.
+        # The tolerance allows for evaluation in single precision.
         return any(n != name and abs(size - v) < 1e-6 for n, v in state.items())
 
     return tuple(n for n in names if n in turning or not bare(n))
 
 
 def with_disturbance(model: Model, on: str | Sequence[str], poles: int = 1) -> Model:
-    r"""The model with an Ornstein-Uhlenbeck (Gauss-Markov) push on one or several derivatives.
+    r"""Return the model with Ornstein-Uhlenbeck (Gauss-Markov) disturbances on some derivatives.
 
-    $\dot w = -w/\tau_w + \sigma_w\sqrt{2/\tau_w}\,n$ with white noise n of unit intensity, so that
-    w, which adds to the derivative of a state, has the standard deviation sigma_w (in that state's
-    unit per second) and the correlation time tau_w [s]. With two poles w follows a second lag of
-    the same time constant, scaled to the same standard deviation. At the first sample w is what it
-    is at any other: all its states have the standard deviation sigma_w, and the two of two poles
-    the correlation 1/sqrt(2). An output that is that derivative by its equation, or its negative
-    (an acceleration as an accelerometer has it), has the push in it too.
+    $\dot w = -w/\tau_w + \sigma_w\sqrt{2/\tau_w}\,n$ with white noise n of unit intensity. w adds
+    to the derivative of a state. It has the standard deviation sigma_w (in that state's unit per
+    second) and the correlation time tau_w [s]. With two poles w follows a second lag of the same
+    time constant, scaled to the same standard deviation. w is stationary from the first sample:
+    all its states have the standard deviation sigma_w, and with two poles their correlation is
+    1/sqrt(2). An output that equals that derivative or its negative, as an accelerometer's,
+    includes the disturbance too.
 
-    With one the model gains the parameters `sigma_w` (default 0) and `tau_w` (default 1 s); with
-    several each has its own, named after what is disturbed: `sigma_w_p`, `tau_w_p`. A model's own
-    process noise stays as it is.
+    A single disturbance adds the parameters `sigma_w` (default 0) and `tau_w` (default 1 s). With
+    several, each has its own, named after the disturbed axis or state: `sigma_w_p`, `tau_w_p`. A
+    model's own process noise stays unchanged.
 
     Args:
-        on: what is disturbed: axes (`disturbable`: the push is an acceleration) or states
-            (`disturbable_states`), by name.
-        poles: 1 or 2, the order of the filter that colours the noise.
+        on: names of disturbed axes (`disturbable`; w is an acceleration) or states
+            (`disturbable_states`).
+        poles: 1 or 2, the order of the noise filter.
 
     Raises:
-        ValueError: the model has no such axis or state, it cannot be pushed or is named twice, or
-            `poles` is neither 1 nor 2.
+        ValueError: the model has no such axis or state, it cannot be disturbed or is named twice,
+            or `poles` is neither 1 nor 2.
     """
     on = (on,) if isinstance(on, str) else tuple(on)
     if model.within is not None:
         inner, around = model.within
-        # An accelerometer feels the push too, so it is put on what the accelerometer is made of.
-        # What only devices behind the sensors have (a low-pass) is pushed from outside.
+        # An accelerometer measures the disturbance too, so it acts on the inner model. States that
+        # only sensors' filters have are disturbed from outside.
         if set(on) <= {*disturbable(inner), *naming.names(inner.State)}:
             return _starting_as(model, around(_with_disturbances(inner, on, poles)))
     return _with_disturbances(model, on, poles)
@@ -86,7 +86,7 @@ def with_disturbance(model: Model, on: str | Sequence[str], poles: int = 1) -> M
 
 @functools.cache
 def _starting_as(model: Model, disturbed: Model) -> Model:
-    """The disturbed model, begun where the model is: an initial state may have been set on it."""
+    """Return the disturbed model with the initial state of `model`, which may have been changed."""
 
     def start(p: Record) -> Record:
         return naming.replace(disturbed.initial_state(p), **naming.asdict(model.initial_state(p)))
@@ -94,7 +94,7 @@ def _starting_as(model: Model, disturbed: Model) -> Model:
     return dataclasses.replace(disturbed, start=start)
 
 
-# Cached: a model is static to jit, and a second one of the same kind would be compiled again.
+# Cached, since a model is static to jit and a second equal one would be compiled again.
 @functools.cache
 def _with_disturbances(model: Model, on: tuple[str, ...], poles: int) -> Model:
     check_model(model)
@@ -115,13 +115,13 @@ def _with_disturbances(model: Model, on: tuple[str, ...], poles: int) -> Model:
         start=disturbed.start,
         noise_intensity=disturbed.noise_intensity,
         initial_sd=disturbed.initial_sd,
-        # With one pole each push has one state, and pushes do not depend on one another: there is
-        # nothing to correlate that the model does not correlate itself.
+        # With one pole each disturbance has one state, independent of the others, so it adds no
+        # correlation to the model's own.
         correlation=disturbed.correlation if poles == 2 or model.correlation else None,
         limits=None if model.limits is None else disturbed.limits,
         axes=model.axes,
         body_rates=model.body_rates,
-        # The pushes are given in a trim, at zero, as positions are.
+        # In a trim the disturbances are given as zero, as positions are.
         steady_flight=model.steady_flight,
         delays=model.delays,
         delay_lines=model.delay_lines,
@@ -133,10 +133,10 @@ def _with_disturbances(model: Model, on: tuple[str, ...], poles: int) -> Model:
 
 
 def disturbances_of(model: Model) -> tuple[Disturbance, ...]:
-    """The disturbances whose parameters filter error estimates by itself."""
+    """Return the disturbances whose parameters filter error estimates."""
     if model.disturbances or model.noise_intensity is None:
         return model.disturbances
-    # A model of one's own may have been given one by hand, under the names that it has here.
+    # A user's model may define a disturbance by hand, with the names used here.
     if {"sigma_w", "tau_w"} <= set(naming.names(model.Params)):
         return (Disturbance("w", "", "sigma_w", "tau_w"),)
     return ()
@@ -146,7 +146,7 @@ def only_disturbed(model: Model) -> bool:
     """True if all process noise comes from disturbances and none is the model's own."""
     if model.noise_intensity is None:
         return True
-    # With every sigma at zero what is left is the model's own, at any value of its parameters.
+    # With every sigma at zero, any remaining noise is the model's own, at any parameter values.
     params = dict.fromkeys(naming.names(model.Params), 1.0)
     params |= {d.sigma: 0.0 for d in disturbances_of(model)}
     own = naming.asdict(model.noise_intensity(model.Params(**params)))
@@ -154,7 +154,7 @@ def only_disturbed(model: Model) -> bool:
 
 
 def _disturbances(model: Model, on: tuple[str, ...], poles: int) -> tuple[Disturbance, ...]:
-    """Return the disturbances to add, by name; ValueError if one is not possible."""
+    """Return the disturbances to add, by name; raise ValueError if one is not possible."""
     if not on:
         raise ValueError("a disturbance needs an axis or a state to act on, got none")
     rates = {axis.name: axis.rate for axis in axes_of(model)}
@@ -166,12 +166,12 @@ def _disturbances(model: Model, on: tuple[str, ...], poles: int) -> tuple[Distur
             if other.state == state:
                 same = "twice" if other.name == name else f"by {other.name!r} as well"
                 raise ValueError(f"{name!r} names state {state!r}, which is disturbed {same}")
-        # A disturbance that is alone has the plain names, which `disturbances_of` knows in a model
-        # of one's own as well. A second one needs names that say what it acts on.
+        # A single disturbance has the plain names, which `disturbances_of` also finds in a user's
+        # model. Further ones need a suffix.
         ending = f"_{name}" if len(on) > 1 or model.disturbances else ""
         lags = tuple(f"w{i + 1}_{name}" for i in range(poles))
         added.append(Disturbance(name, state, f"sigma_w{ending}", f"tau_w{ending}", lags))
-    # A clash would hide the model's own field: its equations would read the disturbance.
+    # With equal names, the model's equations would read the disturbance instead of their own field.
     taken = {*naming.names(model.Params), *naming.names(model.State)}
     for d in added:
         for clash in sorted(taken & {d.sigma, d.tau, *d.lags}):
@@ -183,7 +183,7 @@ def _disturbances(model: Model, on: tuple[str, ...], poles: int) -> tuple[Distur
 
 
 def _check_pushed(model: Model, name: str, state: str, rates: dict[str, str]) -> None:
-    """Refuse what is neither an axis nor a state that can be pushed."""
+    """Refuse a name that is neither an axis nor a state that can be disturbed."""
     allowed = disturbable_states(model)
     known = list(dict.fromkeys([*rates, *allowed]))
     expected = f"expected one of {', '.join(known)}" if known else "which has none to disturb"
@@ -198,17 +198,17 @@ def _check_pushed(model: Model, name: str, state: str, rates: dict[str, str]) ->
 
 
 def _pushed_unit(model: Model, state: str) -> str:
-    """The unit of a state's derivative: heave is no rotation."""
+    """Return the unit of a state's derivative; heave is not a rotation."""
     unit = naming.unit(model.State, state) or "rad/s"
     return f"{unit}^2" if unit.endswith("/s") else f"{unit}/s"
 
 
 def _felt(model: Model, added: tuple[Disturbance, ...]) -> tuple[tuple[str, str, float], ...]:
-    """The outputs that are the derivative of a pushed state, or its negative: their names, the lag
-    that pushes, and the sign.
+    """Return the outputs that equal the derivative of a disturbed state, or its negative: name,
+    disturbing lag, sign.
 
-    Found by two evaluations, as `disturbable_states` finds kinematics. The unit has to be that of
-    the derivative: an output that is a state may have the number of one.
+    They are found by two evaluations, as kinematics in `disturbable_states`. Units are compared
+    too, since an output that is a state may have the same value.
     """
     pairs = [
         (d, name)
@@ -220,7 +220,7 @@ def _felt(model: Model, added: tuple[Disturbance, ...]) -> tuple[tuple[str, str,
         return ()
     rng = np.random.default_rng(8)
     at = [_anywhere(model, rng) for _ in range(2)]
-    # To single precision, in which the model may have been evaluated.
+    # The tolerance allows for evaluation in single precision.
     return tuple(
         (name, d.lags[-1], sign)
         for d, name in pairs
@@ -236,7 +236,7 @@ def _same_kind(unit: str | None, other: str) -> bool:
 
 
 def _anywhere(model: Model, rng: np.random.Generator) -> tuple[dict[str, float], dict[str, float]]:
-    """A model's rates and outputs at numbers that no formula makes of one another."""
+    """Return a model's rates and outputs at random numbers that no formula maps to one another."""
     p, s, u = (
         record(**{n: np.float64(rng.uniform(0.5, 1.5)) for n in naming.names(record)})
         for record in (model.Params, model.State, model.Inputs)
@@ -249,11 +249,11 @@ def _anywhere(model: Model, rng: np.random.Generator) -> tuple[dict[str, float],
 
 
 def _records(model: Model, added: tuple[Disturbance, ...]) -> tuple[type, type]:
-    """The classes of parameters and states with those of the disturbances."""
+    """Return the classes of parameters and states, extended by the disturbances."""
     parameters, states = {}, {}
     for d in added:
         unit, of = _pushed_unit(model, d.state), f" on {d.name}" if len(added) > 1 else ""
-        # Zero by default: without a value for it the model flies as the undisturbed one does.
+        # A default of zero leaves the model undisturbed.
         parameters[d.sigma] = (
             Annotated[Scalar, unit, f"disturbance standard deviation{of}"],
             0.0,
@@ -268,23 +268,23 @@ def _records(model: Model, added: tuple[Disturbance, ...]) -> tuple[type, type]:
 
 
 class _Disturbed(NamedTuple):
-    """The functions of a disturbed model, around those of the model itself."""
+    """Functions of a disturbed model, which wrap those of the original."""
 
     model: Model
     added: tuple[Disturbance, ...]
     State: type
     felt: tuple[tuple[str, str, float], ...]
-    """outputs that are the derivative of a pushed state: name, lag that pushes, sign"""
+    """Outputs that equal the derivative of a disturbed state: name, disturbing lag, sign."""
 
     def undisturbed(self, state: Record) -> Record:
-        """The State of the model itself."""
+        """Return the State of the original model."""
         states = naming.names(self.model.State)
         return self.model.State(**{n: getattr(state, n) for n in states})
 
     def vector_field(self, p: Record, s: Record, u: Record) -> Record:
-        """The model's derivatives with the pushes on them, and those of the pushes."""
-        # It adds to the derivative, as a gust's moment over the inertia would: a disturbance of
-        # the angle itself would jump, and one of the output would not act back through the flybar.
+        """Return the model's derivatives with disturbances added, and those of the disturbances."""
+        # A gust's moment over inertia adds to the derivative. A disturbance of the angle would
+        # jump, and one of the output would not act through the flybar.
         rates = naming.asdict(self.model.vector_field(p, self.undisturbed(s), u))
         for d in self.added:
             rates[d.state] = rates[d.state] + getattr(s, d.lags[-1])
@@ -292,30 +292,30 @@ class _Disturbed(NamedTuple):
         return self.State(**rates)
 
     def output(self, p: Record, s: Record, u: Record) -> Record:
-        """The model's outputs: a push shows in them by the motion, and in those that are the
-        derivative that it adds to.
+        """Return the model's outputs. A disturbance acts on them through the motion, and directly
+        on outputs that equal the disturbed derivative.
         """
         outputs = self.model.output(p, self.undisturbed(s), u)
-        # Left out of an accelerometer's reading, a gust would be taken for noise that has a memory,
-        # and the filter for one of another size and time.
+        # Without the disturbance in an accelerometer's output, a gust would look like
+        # autocorrelated noise, and the filter would estimate a wrong size and time.
         pushed = {
             name: getattr(outputs, name) + sign * getattr(s, lag) for name, lag, sign in self.felt
         }
         return naming.replace(outputs, **pushed) if pushed else outputs
 
     def limits(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """The model's limits, by name."""
+        """Return the model's limits, by name."""
         assert self.model.limits is not None
         return self.model.limits(p, self.undisturbed(s), u)
 
     def noise_intensity(self, p: Record) -> Record:
         own = self.model.noise_intensity
-        # Zeros made of a parameter have its type and its batch axis.
+        # Zeros computed from a parameter have its type and batch axis.
         zero = 0.0 * getattr(p, self.added[0].sigma)
         intensity = dict.fromkeys(naming.names(self.State), zero)
         intensity |= naming.asdict(own(p)) if own is not None else {}
         for d in self.added:
-            # A first-order lag driven by q has the variance q^2 tau/2: q is chosen for sigma_w^2.
+            # A first-order lag driven by q has the variance q^2 tau/2; q is chosen for sigma_w^2.
             intensity[d.lags[0]] = getattr(p, d.sigma) * (2.0 / getattr(p, d.tau)) ** 0.5
         return self.State(**intensity)
 
@@ -329,16 +329,15 @@ class _Disturbed(NamedTuple):
         own = self.model.initial_sd
         sds = dict(own(p)) if own is not None else {}
         for d in self.added:
-            # The gusts blew before the record began, so w has its stationary spread at the first
-            # sample. Zero there would call the first tau_w seconds calm, and a filter would trust
-            # them too much.
+            # Gusts exist before the record starts, so w has its stationary sd at the first sample.
+            # Zero would make the first tau_w seconds calm, and a filter would trust them too much.
             sds |= dict.fromkeys(d.lags, getattr(p, d.sigma))
         return sds
 
     def correlation(self, p: Record) -> dict[tuple[str, str], Any]:
         own = self.model.correlation
         pairs = dict(own(p)) if own is not None else {}
-        # The Lyapunov equation of two equal lags: E[w1 w2] = gain/2 E[w1^2], whatever tau_w is.
+        # Lyapunov equation of two equal lags: E[w1 w2] = gain/2 E[w1^2], for any tau_w.
         for d in self.added:
             if len(d.lags) == 2:
                 pairs[d.lags[0], d.lags[1]] = 0.5 * _gain(d) + 0.0 * getattr(p, d.sigma)
@@ -346,40 +345,40 @@ class _Disturbed(NamedTuple):
 
 
 def _gain(d: Disturbance) -> float:
-    # Two equal lags halve the variance of the first; the gain brings it back.
+    # The second equal lag halves the variance; the gain restores it.
     return 2.0**0.5 if len(d.lags) == 2 else 1.0
 
 
 def _filtered(d: Disturbance, p: Record, s: Record) -> dict[str, Scalar]:
-    """The derivatives of a disturbance's own states."""
+    """Return the derivatives of a disturbance's own states."""
     rates: dict[str, Scalar] = {}
     before: Scalar | None = None
-    # The first lag is driven by white noise alone, which is not in the field: `noise_intensity` has
-    # it. Each further one follows the one before.
+    # White noise drives the first lag; it is in `noise_intensity`, not in the field. Each further
+    # lag follows the previous one.
     for name in d.lags:
         w = getattr(s, name)
         pull = -w if before is None else _gain(d) * before - w
-        # The same time constant for both lags: with one more of its own, a fit could not tell which
-        # is which.
+        # Both lags share one time constant, since a fit could not distinguish two.
         rates[name], before = pull / getattr(p, d.tau), w
     return rates
 
 
 def sensor_noise(output: str) -> str:
-    """The parameter that is the sd of an output's noise from before its filters, as it is behind
-    them."""
+    """Return the name of the parameter for the sd of an output's sensor noise, after
+    the filters.
+    """
     return f"sigma_n_{output}"
 
 
 @functools.cache
 def with_sensor_noise(model: Model, outputs: tuple[str, ...]) -> Model:
-    """The model with white noise of the sensors of some outputs before their low-passes.
+    """Return the model with white sensor noise before the low-passes of some outputs.
 
-    Each brings a parameter `sigma_n_OUTPUT`, the standard deviation behind the filters, in the
+    Each adds a parameter `sigma_n_OUTPUT`, the standard deviation after the filters, in the
     output's unit. Noise that is white at the filter's input is process noise on the filter's state.
 
     Args:
-        model: with `Model.low_passes` for these outputs.
+        model: a model with `low_passes` for these outputs.
     """
     if not outputs:
         return model
@@ -398,14 +397,14 @@ def with_sensor_noise(model: Model, outputs: tuple[str, ...]) -> Model:
 
 
 class _Noisy(NamedTuple):
-    """A model with the noise of sensors beside its own process noise."""
+    """A model with sensor noise in addition to its own process noise."""
 
     model: Model
     added: tuple[LowPass, ...]
 
     def noise_intensity(self, p: Record) -> Record:
         own = self.model.noise_intensity
-        # Zeros made of a parameter have its type and its batch axis.
+        # Zeros computed from a parameter have its type and batch axis.
         zero = 0.0 * getattr(p, sensor_noise(self.added[0].output))
         intensity = dict.fromkeys(naming.names(self.model.State), zero)
         intensity |= naming.asdict(own(p)) if own is not None else {}

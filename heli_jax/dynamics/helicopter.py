@@ -1,16 +1,14 @@
-r"""The whole helicopter: eqs 2-20 as printed, with each correction that makes them physics, and
-with what a helicopter has beyond them.
+r"""The whole helicopter: eqs 2-20 as printed, with physical corrections and extensions.
 
-Frames: x forward, y right, z up; phi is positive right side down, theta nose up, psi nose right:
-the ordinary yaw-pitch-roll angles of a body with axes forward, right and down. The states dphi,
-dtheta and dpsi are the angles' derivatives, in every variant. The rotor turns in -psi: counter-
-clockwise seen from above.
+Frames: x forward, y right, z up; positive phi is right side down, theta nose up, psi nose right.
+These are the usual yaw-pitch-roll angles of a body with axes forward, right and down. The states
+dphi, dtheta and dpsi are the angles' derivatives, in every variant. The rotor turns in -psi:
+anticlockwise seen from above.
 
-`helicopter("paper")` is the paper to the letter; `helicopter("consistent")` has its equations with
-all corrections, and `helicopter()`, the variant "full", a rotor that flaps, a tail rotor with side
-force and power, and a governor as well. `helicopter("paper", tail=True)` has
-one of them. `Corrections` says what each is. Drag is a disturbance in the paper, so the paper
-variant has none.
+`helicopter("paper")` has the paper's equations; `helicopter("consistent")` adds all corrections.
+`helicopter()`, the variant "full", adds a flapping rotor, a tail rotor with side force and power,
+and a governor. `helicopter("paper", tail=True)` has a single correction. `Corrections` describes
+each. Drag is a disturbance in the paper, so the paper variant has none.
 """
 
 import functools
@@ -52,8 +50,8 @@ from heli_jax.vehicle import Helicopter
 
 _BEYOND = ("flapping", "speed_stability", "tip_loss", "tail_force", "tail_power")
 _OWN_MOTOR = ("collective", "governor")
-# Dynamic inflow has a variant of its own: eqs 8-10 have inflow in equilibrium, and a state more
-# makes a record harder to fit. A bar and a measured rotor speed a vehicle has or has not.
+# Dynamic inflow is off in all variants, since eqs 8-10 have inflow in equilibrium, and another
+# state makes a fit harder. A flybar and a measured rotor speed depend on the vehicle.
 _CHOICES = ("dynamic_inflow", "measured_speed", "flybarless")
 _FULL = Corrections(*[True] * len(Corrections._fields))._replace(**dict.fromkeys(_CHOICES, False))
 _VARIANTS = {
@@ -63,8 +61,8 @@ _VARIANTS = {
 }
 
 
-# Cached, since a model is static to jit: a second one of the same switches has other partials, and
-# would be compiled again.
+# Cached, since a model is static to jit. A second one with the same switches would be compiled
+# again.
 @functools.cache
 def helicopter(
     variant: Literal["paper", "consistent", "full"] = "full",
@@ -72,16 +70,17 @@ def helicopter(
     wind: bool = False,
     **switches: bool,
 ) -> Model:
-    """The nonlinear helicopter with flybar, rotor speed and tail rotor, eqs 2-20 and beyond.
+    """Return the nonlinear helicopter with flybar, rotor speed and tail rotor, eqs 2-20 and
+    extensions.
 
     Args:
-        variant: which switches are on: none, the corrections of the paper, or all.
+        variant: active switches: none, the corrections of the paper, or all.
         wind: adds the inputs wind_x, wind_y, wind_z [m/s], the velocity of the air over the ground.
-        switches: those of `Corrections` by name, on or off in place of the variant's. A governor is
-            off where the rotor's speed is measured.
+        switches: fields of `Corrections` by name, which override the variant's. With a measured
+            rotor speed the governor is off.
 
     Raises:
-        ValueError: no such variant or switch.
+        ValueError: unknown variant or switch.
     """
     if variant not in _VARIANTS:
         raise ValueError(f"variant: expected one of {', '.join(_VARIANTS)}, got {variant!r}")
@@ -99,7 +98,8 @@ def helicopter(
             )
         corrections = corrections._replace(governor=False)
     State, Inputs = _state_class(corrections), _inputs_class(corrections, wind)
-    # The name says what differs from its variant: fit.json and figures know a model by it.
+    # The name shows differences from the variant, since fit.json and figures identify a model by
+    # it.
     changed = [
         f"{'+' if on else '-'}{n}"
         for n, on in corrections._asdict().items()
@@ -128,7 +128,7 @@ def _axes(corrections: Corrections) -> tuple[Axis, ...]:
 
     def with_rotor(axis: Axis) -> Axis:
         bar = () if corrections.flybarless else axis.flybar
-        # A flybar averaged over a turn has no rate among the states.
+        # A flybar averaged over a turn has no rate state.
         bar = bar[:1] if corrections.first_order_bar else bar
         return axis._replace(flybar=bar, tilt=axis.tilt if corrections.flapping else ())
 
@@ -136,10 +136,10 @@ def _axes(corrections: Corrections) -> tuple[Axis, ...]:
 
 
 def _steady_flight(corrections: Corrections, Inputs: type) -> SteadyFlight:
-    """Attitude, rotor, inflow, flybar and sticks, of which none is chosen in a steady flight;
-    position, heading and velocity are given, and the angles do not turn.
+    """Return the unknowns of trim: attitude, rotor, inflow, flybar and sticks.
 
-    A rotor that has a motor of its own turns at the vehicle's speed, which is given too.
+    Position, heading and velocity are given, and the angles are constant. With a separate motor,
+    the rotor speed is the vehicle's and is also given.
     """
     bar = () if corrections.flybarless else ("beta_roll", "beta_pitch")
     turning = bar if corrections.first_order_bar else tuple(f"d{n}" for n in bar)
@@ -147,7 +147,7 @@ def _steady_flight(corrections: Corrections, Inputs: type) -> SteadyFlight:
     further += ["governor"] if corrections.governor else []
     further += ["vi"] if corrections.dynamic_inflow else []
     sticks = [n for n in naming.names(Inputs) if n.startswith("x_")]
-    # A stick more, for the throttle alone, or a speed that is no state.
+    # A separate throttle stick, or a speed that is no state.
     speed_given = corrections.collective or corrections.measured_speed
     speed = () if speed_given else ("Omega",)
     rotor = () if corrections.measured_speed else ("Omega",)
@@ -163,15 +163,15 @@ def _inputs_class(corrections: Corrections, wind: bool) -> type:
         throttle = sticks.pop("x_throttle")
         sticks |= {"x_collective": COLLECTIVE, "x_throttle": throttle}
     if corrections.measured_speed:
-        # Nothing reads a throttle that is apart from the collective pitch.
+        # Nothing reads a throttle that is separate from the collective pitch.
         if corrections.collective:
             del sticks["x_throttle"]
         sticks["Omega"] = ROTOR_SPEED
     if wind:
         for axis in "xyz":
             sticks[f"wind_{axis}"] = Annotated[Scalar, "m/s", f"wind along {axis}"]
-    # The class itself where nothing differs: a model's classes are static to jit, and equal fields
-    # in another class would be another program.
+    # Return the class itself if nothing differs. Classes are static to jit, so another class with
+    # the same fields would be another program.
     if tuple(sticks) == HelicopterInputs._fields:
         return HelicopterInputs
     made: Any = NamedTuple("HelicopterInputs", list(sticks.items()))  # type: ignore[misc]
@@ -180,7 +180,7 @@ def _inputs_class(corrections: Corrections, wind: bool) -> type:
 
 
 def _state_class(corrections: Corrections) -> type:
-    # A state that no equation drives would stay zero, and make A singular for trim and modes.
+    # A state without an equation would stay zero, and make A singular for trim and modes.
     hints = naming.fields(HelicopterState)
     if corrections.first_order_bar:
         hints = {n: h for n, h in hints.items() if not n.startswith("dbeta")}
@@ -202,15 +202,15 @@ def _state_class(corrections: Corrections) -> type:
 
 
 def _start(State: type, p: Helicopter) -> Record:
-    """At rest at the origin, the rotor at the speed of the vehicle file."""
-    # Zeros made of a parameter have its type and its batch axis.
+    """Return the state at rest at the origin, with the rotor at the vehicle's speed."""
+    # Zeros computed from a parameter have its type and batch axis.
     zero = 0.0 * p.Omega
     state = State(**dict.fromkeys(naming.names(State), zero))
     return naming.replace(state, Omega=p.Omega) if hasattr(state, "Omega") else state
 
 
 class _WithSpeed(NamedTuple):
-    """A state whose rotor speed is an input."""
+    """A state with the rotor speed from an input."""
 
     state: Record
     Omega: Scalar
@@ -220,20 +220,20 @@ class _WithSpeed(NamedTuple):
 
 
 def _turning(corrections: Corrections, s: Record, u: Record) -> Record:
-    """The state with the rotor's speed in it, wherever that comes from."""
+    """Return the state with the rotor speed, from state or input."""
     return _WithSpeed(s, u.Omega) if corrections.measured_speed else s
 
 
-# A solver asks for the rates some twenty times: under jit they are traced once.
+# A solver calls the rates some twenty times; under jit they are traced once.
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _field(corrections: Corrections, State: type, p: Helicopter, s: Record, u: Record) -> Record:
-    # In the order of what needs what: the motion gives the flow, the flow the thrust with its
-    # inflow, and these the torque, the forces and the moments. The only loop among them, thrust and
-    # inflow, is closed in `aero.thrust`.
+    # In order of dependence: the motion gives the flow, the flow gives thrust and inflow, and these
+    # give torque, forces and moments. The only loop, between thrust and inflow, is solved in
+    # `aero.thrust`.
     s = _turning(corrections, s, u)
     m = motion(corrections, s, u)
-    # The flow is that of the body's motion alone, without the rotor's own induced velocity: this
-    # comes with the thrust, which depends on it.
+    # The flow comes from the body's motion, without the induced velocity, which depends on the
+    # thrust.
     air = once(flow(corrections, p, s, u, m))
     force = main_rotor(p, s, u, air)
     tail = tail_rotor(corrections, p, u, m, s.Omega)
@@ -262,12 +262,14 @@ def _field(corrections: Corrections, State: type, p: Helicopter, s: Record, u: R
 def _hub(
     corrections: Corrections, p: Helicopter, s: Record, u: Record, m: Motion, rotors: Rotors
 ) -> tuple[Moments, tuple[Scalar, Scalar] | None]:
-    """The moments of the main rotor, and the rotors' forces forward and to the right [N]; None
-    where there are none but the thrust along the mast."""
+    """Return the main rotor's moments, and the rotors' forces forward and to the right [N].
+
+    The forces are None if there is only the thrust along the mast.
+    """
     left = rotors.tail.T if corrections.tail_force else None
     if corrections.flapping:
-        # A rotor that flaps acts on the body by its tilt alone: eqs 14-15, which let the cyclic
-        # pitch turn the body at once, are replaced and not added to.
+        # A flapping rotor acts on the body only through its tilt. It replaces eqs 14-15, in which
+        # cyclic pitch turns the body at once.
         loads = hub_loads(p, rotors.main.T, Tilt(s.a1, s.b1))
         right = loads.right if left is None else loads.right - left
         return Moments(loads.roll, loads.pitch, loads.yaw), (loads.forward, right)
@@ -278,10 +280,10 @@ def _hub(
 def _bar(
     corrections: Corrections, p: Helicopter, s: Record, u: Record, m: Motion
 ) -> dict[str, Scalar]:
-    """The flybar's rates, eq. 12 or the first-order bar."""
+    """Return the flybar's rates, from eq. 12 or the first-order flybar."""
     if corrections.flybarless:
         return {}
-    # One bar for roll and one for pitch, each with the body's rate about its own axis.
+    # One flybar state for roll and one for pitch, each with the body rate about its own axis.
     if corrections.first_order_bar:
         return {
             "beta_roll": flybar.flybar_rate(p, s.Omega, u.x_roll, s.beta_roll, m.p),
@@ -298,7 +300,7 @@ def _bar(
 
 
 def _output(corrections: Corrections, p: Helicopter, s: Record, u: Record) -> HelicopterOutputs:
-    """Angles, body rates (as gyros measure them), position and velocity, rotor speed."""
+    """Return angles, body rates (as gyros measure them), position, velocity and rotor speed."""
     s = _turning(corrections, s, u)
     m = motion(corrections, s, u)
     rates, place = (m.p, m.q, m.r), (s.x, s.y, s.z, s.dx, s.dy, s.dz)
@@ -306,11 +308,11 @@ def _output(corrections: Corrections, p: Helicopter, s: Record, u: Record) -> He
 
 
 _SLOWEST = 0.2
-"""of the vehicle's rotor speed"""
+"""Lowest rotor speed [fraction of the vehicle's]."""
 _FASTEST = 0.5
-"""advance ratio: above, reversed flow and stall, of which eq. 13's bracket knows nothing"""
+"""Largest advance ratio; beyond it, reversed flow and stall are not in eq. 13's bracket."""
 _UPRIGHT = 0.1
-"""cosine of the pitch angle: the yaw rate is divided by it"""
+"""Smallest cosine of the pitch angle, by which the yaw rate is divided."""
 
 
 def _limits(corrections: Corrections, p: Helicopter, s: Record, u: Record) -> dict[str, Any]:
@@ -318,13 +320,13 @@ def _limits(corrections: Corrections, p: Helicopter, s: Record, u: Record) -> di
     s = _turning(corrections, s, u)
     air = flow(corrections, p, s, u, motion(corrections, s, u))
     outside = {
-        # Limits are told and not enforced: a solver that steps across one goes on smoothly, and the
-        # run is marked from there.
+        # Limits are reported, not enforced. A solver that crosses one continues, and the run is
+        # marked from there.
         "slow rotor": s.Omega < _SLOWEST * p.Omega,
-        # The advance ratio without the division: at rest a rotor has none, and V2 needs no root.
+        # Advance ratio without division: it is undefined for a rotor at rest, and V2 needs no root.
         "fast flight": (_FASTEST * p.R * s.Omega) ** 2 < air.V2,
     }
-    # Without `rigid_body` nothing is divided by cos theta.
+    # Without `rigid_body` there is no division by cos theta.
     if corrections.rigid_body:
         outside["nose up or down"] = jnp.abs(jnp.cos(s.theta)) < _UPRIGHT
     return outside

@@ -1,7 +1,7 @@
-"""Derivatives of a model about a point: the matrices that nobody writes by hand.
+"""Derivatives of a model at a point, as matrices.
 
-`linearised` makes of any model the linear one of small motion about a point. The point is part of
-its parameters, so that it may be traced, moved and differentiated.
+`linearised` converts any model to the linear model of small motion about a point. The point is part
+of its parameters, so that it can be traced, changed and differentiated.
 """
 
 import dataclasses
@@ -33,17 +33,18 @@ class StateSpace(NamedTuple):
 def jacobians(
     model: Model, params: Record, state: Record | None = None, inputs: Record | None = None
 ) -> StateSpace:
-    """The model's A, B, C, D at a state and inputs.
+    """Return the model's A, B, C, D at a state and inputs.
 
     Args:
-        model: of one vehicle, with n states, m inputs and p outputs.
-        state: where to differentiate; the model's initial state unless given.
-        inputs: likewise; zero unless given.
+        model: model of one vehicle, with n states, m inputs and p outputs.
+        state: state of the point; default: the model's initial state.
+        inputs: inputs of the point; default: zero.
 
     Raises:
         ValueError: the model's functions cannot be traced; TypeError: it is no Model.
     """
-    # The dtype of the parameters: a float32 vehicle has float32 matrices, in a float64 session too.
+    # The dtype is that of the parameters, so a float32 vehicle has float32 matrices in a float64
+    # session.
     dtype = jnp.result_type(*(jnp.asarray(v).dtype for v in jax.tree.leaves(params)))
     dtype = dtype if jnp.issubdtype(dtype, jnp.inexact) else jnp.result_type(float)
     x = model.initial_state(params) if state is None else state
@@ -54,24 +55,24 @@ def jacobians(
         rates, outputs = field_and_output(model, params, state, inputs)
         return naming.ravel(rates, dtype), naming.ravel(outputs, dtype)
 
-    # Forward mode: as many columns as states and inputs, and no graph of the model is kept. Rates
-    # and outputs in one pass, since they share most of what they compute.
+    # Forward mode needs one column per state and input, and stores no graph. Rates and outputs
+    # share most computations, so they are differentiated together.
     at_state, at_inputs = naming.ravel(x, dtype), naming.ravel(u, dtype)
     (A, B), (C, D) = jax.jacfwd(rates_and_outputs, argnums=(0, 1))(at_state, at_inputs)
     return StateSpace(A, B, C, D)
 
 
 _STATE, _INPUT = "about_state_", "about_input_"
-"""how the point's numbers are called among the parameters"""
+"""Prefixes of the point's values among the parameters."""
 
 
-# Cached, since a new Model is a new program to every function that is compiled for one.
+# Cached, since each new Model causes compilations.
 @functools.cache
 def linearised(model: Model) -> Model:
-    """The model whose states, inputs and outputs are small deviations from a point.
+    """Return the model whose states, inputs and outputs are small deviations from a point.
 
-    Its Params (`about`) have the model's own fields and the point's. Delays, disturbances and what
-    else is named by parameters stay as they are.
+    Its Params (`about`) have the model's own fields and the point's. Delays, disturbances and other
+    references to parameters stay.
     """
     more = {_STATE + n: naming.fields(model.State)[n] for n in naming.names(model.State)}
     more |= {_INPUT + n: naming.fields(model.Inputs)[n] for n in naming.names(model.Inputs)}
@@ -83,11 +84,11 @@ def linearised(model: Model) -> Model:
         return model.Params(**{n: getattr(p, n) for n in naming.names(model.Params)})
 
     def vector_field(p: Record, x: Record, u: Record) -> Record:
-        """The derivatives' deviation, to first order."""
+        """Return the deviation of the derivatives, to first order."""
         return _slope(lambda s, v: model.vector_field(own(p), s, v), point(model, p), (x, u))
 
     def output(p: Record, x: Record, u: Record) -> Record:
-        """The outputs' deviation, to first order."""
+        """Return the deviation of the outputs, to first order."""
         return _slope(lambda s, v: model.output(own(p), s, v), point(model, p), (x, u))
 
     return dataclasses.replace(
@@ -106,14 +107,14 @@ def linearised(model: Model) -> Model:
 
 
 def about(model: Model, params: Record, state: Record, inputs: Record) -> Record:
-    """The Params of `linearised(model)` at a point."""
+    """Return the Params of `linearised(model)` at a point."""
     values = {_STATE + n: v for n, v in naming.asdict(state).items()}
     values |= {_INPUT + n: v for n, v in naming.asdict(inputs).items()}
     return linearised(model).Params(**naming.asdict(params), **values)
 
 
 def point(model: Model, params: Record) -> tuple[Record, Record]:
-    """State and Inputs of the point that Params of `linearised(model)` hold."""
+    """Return State and Inputs of the point in the Params of `linearised(model)`."""
     return (
         model.State(**{n: getattr(params, _STATE + n) for n in naming.names(model.State)}),
         model.Inputs(**{n: getattr(params, _INPUT + n) for n in naming.names(model.Inputs)}),

@@ -1,16 +1,15 @@
-r"""Rigid-body kinematics from logged rates and specific forces: do the sensors of a log agree?
+r"""Rigid-body kinematics from logged rates and specific forces, to check a log's sensors.
 
-The inputs are what gyros and accelerometers showed, the outputs angles, velocities and positions;
-the parameters are the sensors' errors. No mass, no thrust: what does not fit is the sensors'
-(Klein and Morelli, Aircraft System Identification, 2006, chapter 10). Each sensor shows
+Inputs are the readings of gyros and accelerometers; outputs are angles, velocities and positions.
+Parameters are the sensors' errors. Without mass and thrust, any misfit comes from the sensors
+(Klein and Morelli, Aircraft System Identification, 2006, chapter 10). Each sensor reads
 
 $$z = (1 + \lambda)\,y + b + noise$$
 
 Two choices differ from the book's equations and give the same trajectories. Velocities are states
-along north, east and down: there the noise of the gyros enters through the angles alone, which a
-filter has to know. And they are those of the IMU: its lever arm then appears in the outputs, as
-$\omega \times r$, and nothing needs the angular acceleration, which a log has only as a derivative
-of noise.
+along north, east and down. Gyro noise then enters only through the angles, which a filter must
+account for. Velocities are also those of the IMU. Its lever arm then appears in the outputs as
+$\omega \times r$, without the angular acceleration, which a log has only as a derivative of noise.
 """
 
 from typing import Annotated, Any, NamedTuple
@@ -26,11 +25,11 @@ type Vector = tuple[Any, Any, Any]
 RATES, FORCES, ANGLES = ("p", "q", "r"), ("ax", "ay", "az"), ("phi", "theta", "psi")
 GROUND, BODY, POSITION = ("vn", "ve", "vd"), ("u", "v", "w"), ("N", "E", "D")
 STEEPEST = 1.4
-"""pitch angle [rad] beyond which roll and yaw are one turn, and Euler angles none"""
+"""Pitch angle beyond which roll and yaw coincide and Euler angles fail [rad]."""
 
 
 class AttitudeErrors(NamedTuple):
-    """Errors of gyros, where a log has angles alone beside them."""
+    """Gyro errors, for logs with only angles besides."""
 
     b_p: Annotated[Scalar, "rad/s", "bias, gyro roll"] = 0.0
     b_q: Annotated[Scalar, "rad/s", "bias, gyro pitch"] = 0.0
@@ -43,7 +42,7 @@ class AttitudeErrors(NamedTuple):
 
 
 class KinematicErrors(NamedTuple):
-    """Errors of gyros and accelerometers, and the wind where an airspeed is measured."""
+    """Errors of gyros and accelerometers, and the wind if an airspeed is measured."""
 
     b_p: Annotated[Scalar, "rad/s", "bias, gyro roll"] = 0.0
     b_q: Annotated[Scalar, "rad/s", "bias, gyro pitch"] = 0.0
@@ -148,7 +147,7 @@ def corrected(p: Record, u: Record, names: tuple[str, str, str]) -> Vector:
 
     Args:
         p: the errors, SI.
-        u: what they showed, SI.
+        u: the readings, SI.
     """
     first, second, third = (
         (getattr(u, n) - getattr(p, f"b_{n}")) / (1.0 + getattr(p, f"lambda_{n}")) for n in names
@@ -157,10 +156,10 @@ def corrected(p: Record, u: Record, names: tuple[str, str, str]) -> Vector:
 
 
 def euler_rates(s: Record, omega: Vector) -> dict[str, Any]:
-    """The derivatives of the Euler angles [rad/s] (Klein and Morelli, 2006, eqs 3.20).
+    """Return the derivatives of the Euler angles [rad/s] (Klein and Morelli, 2006, eqs 3.20).
 
     Args:
-        s: with phi, theta [rad].
+        s: state with phi, theta [rad].
         omega: rates about the body's axes [rad/s].
     """
     p, q, r = omega
@@ -173,10 +172,10 @@ def euler_rates(s: Record, omega: Vector) -> dict[str, Any]:
 
 
 def to_ground(s: Record, body: Vector) -> Vector:
-    """A vector along the body's axes, along north, east and down: roll, pitch, then yaw.
+    """Convert a vector from body axes to north, east and down: roll, pitch, then yaw.
 
     Args:
-        s: with phi, theta, psi [rad].
+        s: state with phi, theta, psi [rad].
     """
     x, y, z = body
     y, z = jnp.cos(s.phi) * y - jnp.sin(s.phi) * z, jnp.sin(s.phi) * y + jnp.cos(s.phi) * z
@@ -189,10 +188,10 @@ def to_ground(s: Record, body: Vector) -> Vector:
 
 
 def to_body(s: Record, ground: Vector) -> Vector:
-    """The reverse of `to_ground`.
+    """Convert a vector to body axes; the inverse of `to_ground`.
 
     Args:
-        s: with phi, theta, psi [rad].
+        s: state with phi, theta, psi [rad].
     """
     x, y, z = ground
     x, y = jnp.cos(s.psi) * x + jnp.sin(s.psi) * y, jnp.cos(s.psi) * y - jnp.sin(s.psi) * x
@@ -209,7 +208,9 @@ def _attitude_output(p: AttitudeErrors, s: Attitude, u: Rates) -> Attitude:
 
 
 def _velocity_rates(p: KinematicErrors, s: Record, u: RatesAndForces) -> dict[str, Any]:
-    """Angles and velocities: an accelerometer shows all forces but weight."""
+    """Return the rates of angles and velocities; an accelerometer measures all forces except
+    weight.
+    """
     north, east, down = to_ground(s, corrected(p, u, FORCES))
     angles = euler_rates(s, corrected(p, u, RATES))
     return {**angles, "vn": north, "ve": east, "vd": down + p.g}
@@ -230,13 +231,13 @@ def _arm(p: KinematicErrors) -> Vector:
 
 def _velocities(p: KinematicErrors, s: Record, u: RatesAndForces) -> dict[str, Any]:
     (wx, wy, wz), (x, y, z) = corrected(p, u, RATES), _arm(p)
-    # omega x r, of the logged rates: their noise times a lever arm is far below that of any
-    # velocity sensor.
+    # omega x r with logged rates: their noise times a lever arm is far below that of any velocity
+    # sensor.
     turning = to_ground(s, (wy * z - wz * y, wz * x - wx * z, wx * y - wy * x))
     vn, ve, vd = s.vn + turning[0], s.ve + turning[1], s.vd + turning[2]
     ahead, right, below = to_body(s, (vn, ve, vd))
     squares = (vn - p.wind_n) ** 2 + (ve - p.wind_e) ** 2 + (vd - p.wind_d) ** 2
-    # Of zero the root has no derivative, and a flight may begin at rest.
+    # The root has no derivative at zero, and a flight may start at rest.
     airspeed = jnp.sqrt(squares + 1e-12)
     angles = {"phi": s.phi, "theta": s.theta, "psi": s.psi}
     return {**angles, "vn": vn, "ve": ve, "vd": vd, "u": ahead, "v": right, "w": below} | {
@@ -254,9 +255,9 @@ def _position_output(p: KinematicErrors, s: PositionState, u: RatesAndForces) ->
 
 
 def _angle_noise(p: Record) -> Vector:
-    # A random walk's sd after one second is, in other units, the root of its spectral density. As
-    # at level flight, where the angles turn about the gyros' axes; equal on all three sensors, and
-    # corrected as their readings are.
+    # The sd of a random walk after one second equals the root of its spectral density. As in level
+    # flight, where the angles turn about the gyros' axes. All three sensors have equal noise,
+    # corrected like their readings.
     over = (1.0 + p.lambda_p, 1.0 + p.lambda_q, 1.0 + p.lambda_r)
     return p.noise_gyro / over[0], p.noise_gyro / over[1], p.noise_gyro / over[2]
 
@@ -266,8 +267,8 @@ def _attitude_noise(p: AttitudeErrors) -> Attitude:
 
 
 def _velocity_noise(p: KinematicErrors) -> VelocityState:
-    # Equal on all axes of the accelerometer, it is so along the ground's axes too, but for the
-    # scales: level, and ahead and right at any heading alike.
+    # Equal noise on all accelerometer axes is equal on the ground axes too, except for the scales.
+    # Horizontal noise is equal at any heading.
     level = p.noise_accel / jnp.sqrt(jnp.abs((1.0 + p.lambda_ax) * (1.0 + p.lambda_ay)))
     return VelocityState(*_angle_noise(p), level, level, p.noise_accel / (1.0 + p.lambda_az))
 
@@ -297,7 +298,7 @@ attitude = Model(
     positive=("noise_gyro",),
     explicit=True,
 )
-"""Rates against angles."""
+"""Model of rates against angles."""
 
 velocity = Model(
     "kinematics-velocity",
@@ -314,7 +315,7 @@ velocity = Model(
     positive=("noise_gyro", "noise_accel", "g"),
     explicit=True,
 )
-"""Rates and specific forces against angles, velocities and airspeed."""
+"""Model of rates and specific forces against angles, velocities and airspeed."""
 
 position = Model(
     "kinematics-position",
@@ -335,7 +336,7 @@ position = Model(
 
 
 def kinematics(inputs: set[str], outputs: set[str]) -> Model:
-    """The kinematic model that a log's signals allow.
+    """Return the kinematic model for a log's signals.
 
     Raises:
         ValueError: accelerometers without a velocity or position, or the reverse.
@@ -359,5 +360,5 @@ def kinematics(inputs: set[str], outputs: set[str]) -> Model:
 
 
 def is_kinematic(model: Model) -> bool:
-    """True if a model is one of these, bare or with devices around it."""
+    """True if a model is kinematic, with or without devices around it."""
     return model.name.startswith("kinematics-")

@@ -1,4 +1,4 @@
-"""Model: how dynamics, ours or anyone's, reach simulation, identification and report."""
+"""Model: the interface between dynamics and simulation, identification and report."""
 
 import copy
 from collections.abc import Callable, Collection
@@ -17,85 +17,86 @@ from heli_jax.naming import Record
 from heli_jax.pickled import by_value
 
 _LINEAR = 1e-6
-"""relative misfit above which a model is not linear: rounding leaves less"""
+"""Largest relative deviation of a linear model; rounding gives less."""
 
 
 class Axis(NamedTuple):
-    """An axis that a vehicle turns about, by the names of what a model has of it."""
+    """A rotation axis of a vehicle, by the names of its parts in the model."""
 
     name: str
-    """such as 'roll'"""
+    """Name, such as 'roll'."""
     rate: str
-    """the state whose derivative is the angular acceleration; a disturbance adds to it"""
+    """State whose derivative is the angular acceleration; a disturbance adds to it."""
     angle: str | None = None
-    """the state whose derivative is the rate"""
+    """State whose derivative is the rate."""
     inertia: str | None = None
-    """the parameter, kg m^2"""
+    """Parameter for the inertia [kg m^2]."""
     added_inertia: str | None = None
-    """the parameter that is known and added to it, kg m^2"""
+    """Parameter for a known inertia that is added [kg m^2]."""
     stick: str | None = None
-    """the input that turns the vehicle about this axis"""
+    """Input that turns the vehicle about this axis."""
     flybar: tuple[str, ...] = ()
-    """the states of the flybar that belong to it"""
+    """States of the flybar for this axis."""
     tilt: tuple[str, ...] = ()
-    """the states of the main rotor's tip-path plane that belong to it"""
+    """States of the main rotor's tip-path plane for this axis."""
 
 
 class Disturbance(NamedTuple):
-    """A random push on the derivative of one state, by the names of what a model has of it."""
+    """A random disturbance of one state's derivative, by the names of its parts in the model."""
 
     name: str
-    """as it was asked for: an axis or a state"""
+    """Requested name: an axis or a state."""
     state: str
-    """whose derivative it adds to"""
+    """State whose derivative is disturbed."""
     sigma: str
-    """the parameter that is its standard deviation"""
+    """Parameter for its standard deviation."""
     tau: str
-    """the parameter that is its correlation time [s]"""
+    """Parameter for its correlation time [s]."""
     lags: tuple[str, ...] = ()
-    """its own states, the one that is driven by white noise first"""
+    """Its own states; white noise drives the first."""
 
 
 class LowPass(NamedTuple):
-    """Sensor noise at the input of the low-passes that have filtered an output."""
+    """Sensor noise at the input of the low-passes of an output."""
 
     output: str
-    """whose filters they are"""
+    """Filtered output."""
     state: str
-    """on whose derivative white noise before the first of them acts"""
+    """State whose derivative the white noise before the first filter drives."""
     intensity: float
-    """square root of its spectral density there, per unit of its standard deviation behind all of
-    them [1/sqrt(s), for a rate's state 1/s more]"""
+    """Square root of its spectral density there, per unit of sd after all filters [1/sqrt(s); for a
+    rate's state, times 1/s].
+    """
     hz: float
-    """where they are 3 dB down together"""
+    """Joint -3 dB frequency of the filters [Hz]."""
 
 
 class SteadyFlight(NamedTuple):
-    """Unknowns and equations of trim by name, as many of the one as of the other."""
+    """Unknowns and equations of trim by name, in equal number."""
 
     unknowns: tuple[str, ...]
-    """states, then inputs"""
+    """Unknown states, then unknown inputs."""
     equations: tuple[str, ...]
-    """states whose derivatives have to be zero"""
+    """States whose derivatives must be zero."""
 
 
 class Model(eqx.Module):
-    r"""Pure dynamics $\dot x = f(p, x, u)$, $y = h(p, x, u)$ of one vehicle, with named parts.
+    r"""Dynamics $\dot x = f(p, x, u)$, $y = h(p, x, u)$ of one vehicle, with named parts.
 
     `Params`, `State`, `Inputs` and `Outputs` are classes built by keyword with one scalar a field
     (an `eqx.Module` or a `NamedTuple`; see `heli_jax.naming` for units). `vector_field` returns a
-    `State` of derivatives per second. Nothing here knows about batches: use `jax.vmap`.
+    `State` of derivatives per second. For batches use `jax.vmap`.
 
-    `linear=True` says that `vector_field` and `output` are linear in (state, inputs) and vanish
-    where both do; the exact zero-order-hold discretisation may then be used, with matrices taken
-    by differentiation.
+    `linear=True` states that `vector_field` and `output` are linear in (state, inputs) and zero at
+    zero. The exact zero-order-hold discretisation is then possible, with matrices from
+    differentiation.
 
-    `axes`, `steady_flight` and `without_stand` are what a model knows of itself beside its
-    equations. A model that leaves them out has what its names say: see `axes_of`.
+    `axes`, `steady_flight` and `without_stand` are optional. By default they follow from the names
+    of states and inputs: see `axes_of`.
     """
 
-    # All static: a model is what is compiled, and its numbers are parameters. Two models are the
-    # same program where they have the same functions and classes, so these are made once and kept.
+    # All fields are static, since a model is compiled and its numbers are parameters. Models with
+    # the same functions and classes are the same program, so these are created once.
     name: str = eqx.field(static=True)
     vector_field: Callable[[Any, Any, Any], Any] = eqx.field(static=True)
     output: Callable[[Any, Any, Any], Any] = eqx.field(static=True)
@@ -106,58 +107,65 @@ class Model(eqx.Module):
     linear: bool = eqx.field(static=True, default=False)
     start: Callable[[Any], Any] | None = eqx.field(static=True, default=None)
     noise_intensity: Callable[[Any], Any] | None = eqx.field(static=True, default=None)
-    """noise_intensity(params): a State of the square roots of the process noise's spectral
-    densities, in units of the state's rate times sqrt(s)"""
+    """noise_intensity(params): a State with the square roots of the process noise's spectral
+    densities, in units of the state's rate times sqrt(s).
+    """
     initial_sd: Callable[[Any], dict[str, Any]] | None = eqx.field(static=True, default=None)
-    """initial_sd(params): standard deviation at the first sample (the square roots of the diagonal
-    of P0) of the states that are random there, by name; the others begin where `start` puts them"""
+    """initial_sd(params): standard deviations of random initial states by name (square roots of the
+    diagonal of P0). Other states start at `start`.
+    """
     correlation: Callable[[Any], dict[tuple[str, str], Any]] | None = eqx.field(
         static=True, default=None
     )
-    """correlation(params): at the first sample, between two of the states that `initial_sd` names,
-    by pair of names; what is not named is uncorrelated"""
+    """correlation(params): correlations of initial states in `initial_sd`, by pair of names; other
+    pairs are uncorrelated.
+    """
     limits: Callable[[Any, Any, Any], dict[str, Any]] | None = eqx.field(static=True, default=None)
-    """limits(params, state, inputs): by name, whether the range of validity is left there"""
+    """limits(params, state, inputs): by name, True outside the range of validity."""
     axes: tuple[Axis, ...] | None = eqx.field(static=True, default=None)
-    """the axes it turns about; None: by the names of its states"""
+    """Axes of rotation; None: from the names of the states."""
     steady_flight: SteadyFlight | None = eqx.field(static=True, default=None)
-    """what trim solves for; None: by the names of its states and inputs, where it can fly"""
+    """Unknowns and equations of trim; None: from the names of states and inputs, if it can fly."""
     without_stand: "Model | None" = eqx.field(static=True, default=None)
-    """of a vehicle on a stand, the same vehicle in free flight"""
+    """For a vehicle on a stand, the same vehicle in free flight."""
     within: "tuple[Model, Callable[[Model], Model]] | None" = eqx.field(static=True, default=None)
-    """of a model with sensors that show derivatives (`with_motion_sensors`), the model within, and
-    what puts its devices around another one"""
+    """For a model with sensors of derivatives (`with_motion_sensors`): the inner model, and the
+    function that adds its devices to another model.
+    """
     delays: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
-    """inputs that act late, each with the parameter that is its delay [s]"""
+    """Delayed inputs, each with the parameter of its delay [s]."""
     delay_lines: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
-    """inputs and outputs that are late by states of the model (`with_delays`), each with the
-    parameter that is its delay [s]"""
+    """Inputs and outputs delayed by states of the model (`with_delays`), each with the parameter of
+    its delay [s].
+    """
     positive: tuple[str, ...] = eqx.field(static=True, default=())
-    """the parameters that are above zero whatever else may change its sign"""
+    """Parameters that are always above zero."""
     fastest: float = eqx.field(static=True, default=0.0, kw_only=True)
-    """of a model with filters of fixed constants the rate of the fastest [rad/s], which fixed steps
-    have to follow"""
+    """Rate of the fastest filter with fixed constants [rad/s], which fixed steps must resolve."""
     explicit: bool = eqx.field(static=True, default=False, kw_only=True)
-    """whether no mode of it is fast against the samples of a log, as of kinematics: a filter may
-    then go by explicit steps"""
+    """True if no mode is fast compared with the samples, as in kinematics. A filter may then take
+    explicit steps.
+    """
     input_scales: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
-    """the scale errors of sensors whose readings are inputs, of which the noise is process noise:
-    `noise_intensity` is that of the readings over 1 + scale. Filter error keeps them unbiased"""
+    """Scale errors of sensors whose readings are inputs with process noise. `noise_intensity` is
+    that of the readings over 1 + scale. Filter error estimates them without bias.
+    """
     disturbances: tuple[Disturbance, ...] = eqx.field(static=True, default=(), kw_only=True)
-    """what `with_disturbance` added; filter error estimates its parameters by itself"""
+    """Disturbances added by `with_disturbance`; filter error estimates their parameters."""
     low_passes: tuple[LowPass, ...] = eqx.field(static=True, default=(), kw_only=True)
-    """of the outputs that `with_filters` low-passes where their sensors' noise comes in"""
+    """For outputs with low-passes from `with_filters`: the inputs of sensor noise."""
     body_rates: Callable[[Any], dict[str, Any]] | None = eqx.field(
         static=True, default=None, kw_only=True
     )
-    """body_rates(state): the rates p, q and r of the body [rad/s] by name, where the axes' rates
-    are derivatives of Euler angles; None: the axes' rates are those of the body"""
+    """body_rates(state): body rates p, q and r [rad/s] by name, if the axes' rates are derivatives
+    of Euler angles; None: the axes' rates are body rates.
+    """
 
     def __reduce__(self) -> tuple[Any, ...]:
         return by_value(self)
 
     def __repr__(self) -> str:
-        """One line: its functions say nothing that their names do not."""
+        """Return one line with the names of inputs, states and outputs."""
         kinds = (("inputs", self.Inputs), ("states", self.State), ("outputs", self.Outputs))
         return f"Model {self.name}: " + "; ".join(
             f"{kind} {', '.join(naming.names(record))}" for kind, record in kinds
@@ -165,28 +173,27 @@ class Model(eqx.Module):
 
     @property
     def delay_parameters(self) -> tuple[str, ...]:
-        """The parameters that are delays of inputs or outputs."""
-        # Several inputs may share a delay, as all sticks share the radio: it is one unknown, named
-        # once.
+        """Return the parameters that are delays of inputs or outputs."""
+        # Several inputs may share a delay, as all sticks share the radio. It is then one unknown.
         return tuple(dict.fromkeys(name for _, name in (*self.delays, *self.delay_lines)))
 
     @property
     def random_states(self) -> tuple[str, ...]:
-        """The states that are random at the first sample."""
+        """Return the states that are random at the first sample."""
         if self.initial_sd is None:
             return ()
-        # Names alone are asked for, and they may not depend on parameters: any numbers will do.
+        # The names do not depend on parameters, so any values serve.
         return tuple(self.initial_sd(self.Params(**dict.fromkeys(naming.names(self.Params), 1.0))))
 
     def initial_state(self, params: Record) -> Record:
-        """The state at the first sample: `start(params)`, or all zeros."""
+        """Return the state at the first sample: `start(params)`, or zeros."""
         if self.start is not None:
             return self.start(params)
         return zeros(self.State)
 
 
 def zeros(record: type, dtype: DTypeLike | None = None) -> Record:
-    """A record of scalar zeros of the default float type (or `dtype`)."""
+    """Return a record of scalar zeros of the default float type (or `dtype`)."""
     dtype = jnp.result_type(float) if dtype is None else dtype
     return record(**{name: jnp.zeros((), dtype) for name in naming.names(record)})
 
@@ -204,18 +211,18 @@ PITCH = Axis(
     ("beta_pitch", "dbeta_pitch"),
     ("a1",),
 )
-# Yaw has no added inertia: the stand has springs and weights about roll and pitch alone.
+# Yaw has no added inertia, since the stand acts only on roll and pitch.
 YAW = Axis("yaw", "dpsi", "psi", "Izz", None, "x_yaw")
-"""The axes under the names that they have in the models here."""
+"""Axes, with the names used in this package's models."""
 
 
 def axes_of(model: Model) -> tuple[Axis, ...]:
-    """The axes that a model turns about: those that it states, else those of roll, pitch and yaw
-    whose rate is among its states under the name that it has in the models here."""
+    """Return the axes of a model: those that it states, else those of roll, pitch and yaw with a
+    rate among its states under the name used here.
+    """
     if model.axes is not None:
         return model.axes
-    # A model of one's own that names its states as here gets disturbances and the stand for
-    # nothing; one with other names states its axes.
+    # A user's model with the same state names needs no axes to have disturbances and the stand.
     states = naming.names(model.State)
     return tuple(
         axis._replace(
@@ -229,16 +236,16 @@ def axes_of(model: Model) -> tuple[Axis, ...]:
 
 
 def initial_sd_of(model: Model, params: Record, dtype: DTypeLike) -> Float[Array, " n"]:
-    """The standard deviations (n,) of all states at the first sample; zero where not random."""
-    # Zero where a state is not named: its first value is then known, or an unknown of the fit, and
-    # not something that the filter may correct.
+    """Return the standard deviations (n,) of all states at the first sample; zero if not random."""
+    # Zero for other states: their first value is known or estimated, and the filter must not
+    # correct it.
     random = model.initial_sd(params) if model.initial_sd is not None else {}
     states = naming.names(model.State)
     return naming.ravel(model.State(**{n: random.get(n, 0.0) for n in states}), dtype)
 
 
 def correlation_of(model: Model, params: Record, dtype: DTypeLike) -> Array:
-    """The correlation matrix (n, n) of all states at the first sample.
+    """Return the correlation matrix (n, n) of all states at the first sample.
 
     Raises:
         ValueError: the model correlates a state that is not random there.
@@ -247,7 +254,7 @@ def correlation_of(model: Model, params: Record, dtype: DTypeLike) -> Array:
     matrix = jnp.eye(len(names), dtype=dtype)
     pairs = model.correlation(params) if model.correlation is not None else {}
     for pair, value in pairs.items():
-        # A correlation with a state that is known would be lost without a word: its sd is zero.
+        # A correlation with a known state would silently have no effect, since its sd is zero.
         if not set(pair) <= set(random):
             raise ValueError(
                 f"model {model.name}: correlation of {' and '.join(pair)}: expected two of the "
@@ -260,13 +267,13 @@ def correlation_of(model: Model, params: Record, dtype: DTypeLike) -> Array:
 
 
 def linear_misfit(model: Model, params: Record) -> float:
-    """Return the distance of a model from `linear=True`: 0 if f(x, u) and h(x, u) are linear, else
+    """Return the deviation of a model from linearity: 0 if f(x, u) and h(x, u) are linear, else
     about 1.
 
-    Compares f and h at two states with the sum of both, relative to their size. Concrete
-    parameters only.
+    It compares the sum of f and h at two states with their values at the sum, relative to their
+    size. Parameters must be concrete.
     """
-    # A seed of its own: the answer must not depend on who drew before.
+    # A fixed seed makes the result reproducible.
     rng = np.random.default_rng(7)
 
     def draw(record: type) -> Record:
@@ -280,17 +287,17 @@ def linear_misfit(model: Model, params: Record) -> float:
     params = plain(params)
     x1, x2, u1, u2 = draw(model.State), draw(model.State), draw(model.Inputs), draw(model.Inputs)
     with np.errstate(all="ignore"):
-        # Superposition at one random pair, which hardly any nonlinear formula passes by chance.
+        # Superposition at one random pair, which a nonlinear formula hardly satisfies by chance.
         summed = both(jax.tree.map(np.add, x1, x2), jax.tree.map(np.add, u1, u2))
         parts = both(x1, u1) + both(x2, u2)
         size = np.max(np.abs(summed)) + np.max(np.abs(parts))
-        # The sum of the parts is compared, so an offset (gravity, say) shows as well as a curve.
+        # The sum of the parts is compared, so an offset such as gravity shows as well as curvature.
         return float(np.max(np.abs(summed - parts)) / max(size, 1e-300))
 
 
 def require_linear(model: Model, params: Record) -> None:
-    """Refuse a model that says it is linear and is not: it would be discretised exactly, and be
-    wrong without any sign of it.
+    """Refuse a model with `linear=True` that is nonlinear: its exact discretisation would be wrong
+    without a message.
 
     Args:
         params: the model's Params, SI, concrete.
@@ -308,7 +315,7 @@ def require_linear(model: Model, params: Record) -> None:
 def field_and_output(
     model: Model, params: Record, state: Record, inputs: Record
 ) -> tuple[Any, Any]:
-    """The model's rates and outputs at one point."""
+    """Return the model's rates and outputs at one point."""
     return (
         model.vector_field(params, state, inputs),
         model.output(params, state, inputs),
@@ -316,12 +323,13 @@ def field_and_output(
 
 
 def plain(record: Record, **changes: Any) -> Record:
-    """A record of concrete numbers, some of them changed, as NumPy scalars: quicker than JAX
-    outside jit."""
+    """Return a record as NumPy scalars, with some fields changed; this is faster than JAX outside
+    jit.
+    """
     values = {n: np.float64(v) for n, v in {**naming.asdict(record), **changes}.items()}
     if isinstance(record, tuple):
         return type(record)(**values)
-    # Past the class, which may make arrays of them (Helicopter does).
+    # Bypass the class, which may convert values to arrays (Helicopter does).
     made = copy.copy(record)
     for name, value in values.items():
         object.__setattr__(made, name, value)
@@ -329,21 +337,20 @@ def plain(record: Record, **changes: Any) -> Record:
 
 
 def needed_but_missing(model: Model, params: Record) -> list[str]:
-    """The parameters that are NaN (not given) and that the model reads, in field order."""
-    # NaN goes through every operation that uses it: what the model reads shows at the end. One that
-    # may be left out (c_paddle) has another in its place by jnp.where, and does not show.
+    """Return the parameters that the model reads and that are NaN (not given), in field order."""
+    # NaN propagates through every operation, so it marks the parameters that are read. An optional
+    # one (c_paddle) is replaced by jnp.where and does not show.
     params = plain(params)
-    # Each missing one by itself, with the others at one: several NaN at a time would not say which
-    # of them was read.
+    # Test each missing parameter alone, with the others at one. With several NaN the source would
+    # be unclear.
     missing = [n for n, v in naming.asdict(params).items() if np.isnan(v)]
-    # The delay of an input is in no equation, since it acts on the record: no NaN comes through,
-    # and it is known to be read by its name.
+    # An input's delay is in no equation, so NaN does not reveal it. It is found by name.
     late = dict(model.delays).values()
     return [n for n in missing if n in late or np.isnan(_at_one(model, params, n, np.nan)).any()]
 
 
 def require_constants(model: Model, params: Record, given: Collection[str] = ()) -> None:
-    """Refuse parameters that lack what the model reads.
+    """Refuse parameters that lack values the model reads.
 
     Args:
         params: the model's Params; concrete numbers, NaN where not given.
@@ -358,8 +365,8 @@ def require_constants(model: Model, params: Record, given: Collection[str] = ())
 
 
 def reads(model: Model, params: Record, name: str) -> bool:
-    """True if the rates or the outputs depend on a parameter, at states and inputs of one, or an
-    input is delayed by it.
+    """True if rates or outputs depend on a parameter, at states and inputs of one, or if it delays
+    an input.
 
     Args:
         params: the model's Params; concrete numbers.
@@ -368,15 +375,16 @@ def reads(model: Model, params: Record, name: str) -> bool:
         return True
     if np.isnan(_at_one(model, params, name, np.nan)).any():
         return True
-    # One that may be left out has another in its place where it is NaN.
+    # An optional parameter is replaced by another if it is NaN.
     at_one, at_two = (_at_one(model, params, name, value) for value in (1.0, 2.0))
     return not np.array_equal(at_one, at_two, equal_nan=True)
 
 
 def _at_one(model: Model, params: Record, name: str, value: float) -> np.ndarray:
-    """Rates and outputs where states, inputs and what is not given are one, and a parameter is
-    `value`."""
-    # One and not zero: a parameter that multiplies a state or another parameter must show.
+    """Return rates and outputs with a parameter at `value`, and states, inputs and missing
+    parameters at one.
+    """
+    # One instead of zero, so that a parameter that multiplies a state or another parameter shows.
     one = np.float64(1.0)
     others = {n: one for n, v in naming.asdict(params).items() if np.isnan(v)}
     filled = plain(params, **{**others, name: value})

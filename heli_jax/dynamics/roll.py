@@ -1,8 +1,8 @@
-"""The reduced model of one axis (eqs 21-22), its transfer function (eq. 23), and the stand.
+"""Reduced model of one axis (eqs 21-22), its transfer function (eq. 23), and the stand.
 
-Roll and pitch share the functions; they differ in the inertia and in the names of the states.
-`Ixx` and `If` found with these equations are numbers of this model: see `cyclic_moment` and the
-README on where the paper and physics part.
+Roll and pitch share the functions; they differ in the inertia and the names of the states. `Ixx`
+and `If` estimated with these equations are valid only in this model: see `cyclic_moment`, and the
+README for differences between paper and physics.
 """
 
 import dataclasses
@@ -57,17 +57,17 @@ class PitchOutputs(NamedTuple):
 
 
 def roll_inertia(p: Helicopter) -> Scalar:
-    """Ixx and what is fixed to the fuselage [kg m^2]."""
+    """Return Ixx plus the added inertia [kg m^2]."""
     return p.Ixx + p.Ixx_added
 
 
 def pitch_inertia(p: Helicopter) -> Scalar:
-    """Iyy and what is fixed to the fuselage [kg m^2]."""
+    """Return Iyy plus the added inertia [kg m^2]."""
     return p.Iyy + p.Iyy_added
 
 
 def roll_acceleration(p: Helicopter, x_roll: Scalar, beta: Scalar) -> Scalar:
-    r"""Roll acceleration [rad/s^2], eq. 22: eqs 5, 11 and 14.
+    r"""Return the roll acceleration [rad/s^2], eq. 22: eqs 5, 11 and 14.
 
     $$\ddot\phi = \frac{\rho\Omega^2 a c R^4}{2 I_{xx} L_1 (L_2+L_3)}
       (L_3 x_{roll} + L_2 L_4 \beta)$$
@@ -76,24 +76,24 @@ def roll_acceleration(p: Helicopter, x_roll: Scalar, beta: Scalar) -> Scalar:
         x_roll: cyclic input displacement [m].
         beta: flapping angle of the flybar about the same axis [rad].
     """
-    # `a` enters eqs 21-22 as a/If and a/Ixx alone: Ixx, If and a times one number change nothing.
-    # Roll data therefore give two ratios; the third number takes a prior or an added inertia.
+    # `a` enters eqs 21-22 only as a/If and a/Ixx, so a common factor of Ixx, If and a has no
+    # effect. Roll data give two ratios; the third number needs a prior or an added inertia.
     return (1.0 / roll_inertia(p)) * cyclic_moment(p, p.Omega, cyclic_pitch(p, x_roll, beta))
 
 
 def pitch_acceleration(p: Helicopter, x_pitch: Scalar, beta: Scalar) -> Scalar:
-    """Pitch acceleration [rad/s^2]: eqs 6, 11 and 15 as eq. 22 has them for roll.
+    """Return the pitch acceleration [rad/s^2]: eqs 6, 11 and 15, as in eq. 22 for roll.
 
     Args:
         x_pitch: cyclic input displacement [m].
         beta: flapping angle of the flybar about the same axis [rad].
     """
-    # Without eq. 6's -T lr: in hover trim balances it, and this is the motion about trim.
+    # Without -T lr of eq. 6: trim balances it in hover, and this is the motion about trim.
     return (1.0 / pitch_inertia(p)) * cyclic_moment(p, p.Omega, cyclic_pitch(p, x_pitch, beta))
 
 
 def _roll_field(p: Helicopter, s: RollState, u: RollInputs) -> RollState:
-    """Eqs 21 and 22."""
+    """Return the rates of eqs 21 and 22."""
     return RollState(
         phi=s.dphi,
         dphi=roll_acceleration(p, u.x_roll, s.beta_roll),
@@ -103,7 +103,7 @@ def _roll_field(p: Helicopter, s: RollState, u: RollInputs) -> RollState:
 
 
 def _pitch_field(p: Helicopter, s: PitchState, u: PitchInputs) -> PitchState:
-    """Eqs 21 and 22 for the pitch axis."""
+    """Return the rates of eqs 21 and 22 for the pitch axis."""
     return PitchState(
         theta=s.dtheta,
         dtheta=pitch_acceleration(p, u.x_pitch, s.beta_pitch),
@@ -152,30 +152,29 @@ pitch = Model(
 
 @functools.cache
 def on_stand(model: Model) -> Model:
-    r"""The model with the stand's stiffness and damping on its roll (and pitch) axis.
+    r"""Return the model with the stand's stiffness and damping on its roll (and pitch) axis.
 
     $$\ddot\phi \mathrel{-}= (\kappa\phi + \zeta\dot\phi)\,I_{xx}/(I_{xx} + I_{xx,added})$$
 
-    `kappa` [1/s^2] and `zeta` [1/s] belong to the vehicle without added inertia, so that the
-    stand's stiffness kappa Ixx [N m/rad] and damping zeta Ixx are the same in all runs.
+    `kappa` [1/s^2] and `zeta` [1/s] refer to the vehicle without added inertia. So the stand's
+    stiffness kappa Ixx [N m/rad] and damping zeta Ixx are the same in all runs.
 
     Raises:
         ValueError: the model has no axis with an angle, an inertia and an added inertia.
     """
     check_model(model)
-    # The stand has springs about roll and pitch; yaw, without an added inertia, stays free.
+    # The stand has springs only about roll and pitch, so yaw stays free.
     axes = [a for a in axes_of(model) if a.angle and a.inertia and a.added_inertia]
     if not axes:
         raise ValueError(f"model {model.name!r} has no roll or pitch axis to put on a stand")
 
     def vector_field(p: Record, s: Record, u: Record) -> Record:
-        """The model's derivatives, slowed by the stand."""
+        """Return the model's derivatives with the stand's moments."""
         rates = model.vector_field(p, s, u)
         for axis in axes:
             inertia, added = _inertias(p, axis)
-            # kappa and zeta are per unit of the vehicle's own inertia: the stand is a spring, and a
-            # known inertia that is bolted on slows it. So runs with and without it share them,
-            # which is what tells a from Ixx.
+            # kappa and zeta are per unit of the vehicle's own inertia, and an added known inertia
+            # reduces their effect. Runs with and without it share them, which separates a from Ixx.
             pull = p.kappa * getattr(s, str(axis.angle)) + p.zeta * getattr(s, axis.rate)
             slowed = getattr(rates, axis.rate) - (inertia / (inertia + added)) * pull
             rates = naming.replace(rates, **{axis.rate: slowed})
@@ -187,7 +186,7 @@ def on_stand(model: Model) -> Model:
 
 
 def _inertias(p: Record, axis: Axis) -> tuple[Scalar, Scalar]:
-    """An axis's own inertia and what is added to it [kg m^2]."""
+    """Return an axis's own inertia and its added inertia [kg m^2]."""
     return getattr(p, str(axis.inertia)), getattr(p, str(axis.added_inertia))
 
 
@@ -199,24 +198,24 @@ class TransferFunction(NamedTuple):
 
 
 def roll_transfer_function(p: Helicopter, *, stand: bool = False) -> TransferFunction:
-    r"""$H(s) = \phi/x_{roll}$ in closed form, eq. 23, with the stand where asked.
+    r"""Return $H(s) = \phi/x_{roll}$ in closed form, eq. 23, optionally with the stand.
 
     $$H = \frac{d_1 s^2 + d_2 s + d_3}{s(s^3 + c_1 s^2 + c_2 s + c_3)}$$
 
-    On the stand the denominator is $(s^2 + \zeta s + \kappa)(s^2 + c_1 s + c_2) + c_3 s$.
-    num has 3, den 5 numbers.
+    On the stand the denominator is $(s^2 + \zeta s + \kappa)(s^2 + c_1 s + c_2) + c_3 s$. num has
+    3 and den 5 coefficients.
     """
-    # Written out by hand beside the model that `linearize` differentiates: a test compares the two.
+    # Written by hand; a test compares it with `linearize`, which differentiates the model.
     k1 = flapping_rate_gain(p)
-    # The moment is linear in the cyclic pitch: k2 is that of a bracket (L3 x + L2 L4 beta) of one.
+    # The moment is linear in the cyclic pitch; k2 is that of a bracket (L3 x + L2 L4 beta) of one.
     k2 = cyclic_moment(p, p.Omega, 1.0 / (p.L1 * (p.L2 + p.L3))) / roll_inertia(p)
     # The stand's constants are per unit of the vehicle's own inertia, as in `on_stand`.
     share = p.Ixx / roll_inertia(p)
     c1, c2, c3 = k1 / p.Omega, p.Omega**2, k1 * k2 * p.L2 * p.L4 / p.Omega
-    # Zeros and ones made of k1 have its type and its batch axis.
+    # Zeros and ones computed from k1 have its type and batch axis.
     kappa, zeta = (share * p.kappa, share * p.zeta) if stand else (0.0 * k1, 0.0 * k1)
-    # The last is d3 = k2 (L3 Omega^2 + L2 L4 k1/L5). Stable, beside the pole at the origin, if and
-    # only if Omega^2 > k2 L2 L4 (Routh).
+    # The last is d3 = k2 (L3 Omega^2 + L2 L4 k1/L5). Apart from the pole at the origin, the system
+    # is stable if and only if Omega^2 > k2 L2 L4 (Routh).
     num = (k2 * p.L3, k1 * k2 * p.L3 / p.Omega, k2 * (p.L3 * c2 + p.L2 * p.L4 * k1 / p.L5))
     one = k1 / k1
     den = (one, c1 + zeta, c2 + zeta * c1 + kappa, zeta * c2 + kappa * c1 + c3, kappa * c2)
@@ -224,30 +223,29 @@ def roll_transfer_function(p: Helicopter, *, stand: bool = False) -> TransferFun
 
 
 class Ratios(NamedTuple):
-    """Ratios of the physical parameters that a fourth-order denominator determines."""
+    """Ratios of physical parameters that a fourth-order denominator determines."""
 
     values: dict[str, Scalar]
-    """a over the inertia of the axis, and a/If (a_paddle/If where a_paddle is given)"""
+    """a over the inertia of the axis, and a/If (a_paddle/If if a_paddle is given)."""
     p2: Scalar
     p2_expected: Scalar
-    """the coefficient of s^2 that the other coefficients and Omega ask for"""
+    """Coefficient of s^2 expected from the other coefficients and Omega."""
 
 
 def ratios_from_denominator(
     p: Helicopter, den: Sequence[Scalar] | np.ndarray | Array, angle: str = "roll"
 ) -> Ratios:
-    r"""a/Ixx and a/If from the denominator of an identified fourth-order H(s), eq. 23.
+    r"""Return a/Ixx and a/If from the denominator of an identified fourth-order H(s), eq. 23.
 
-    With $c_1 = p_1 - \zeta$ and $c_3 = p_3 - \zeta c_2 - \kappa c_1$, k1 and k2 follow. Where
-    `a_paddle` is given (concrete), the paddle's lift slope is not `a` and k1 is a_paddle/If.
+    With $c_1 = p_1 - \zeta$ and $c_3 = p_3 - \zeta c_2 - \kappa c_1$, k1 and k2 follow. If
+    `a_paddle` is given (concrete), the paddle's lift slope is not `a`, and k1 gives a_paddle/If.
 
     Args:
-        p: vehicle, SI, of which the stand's zeta, the geometry and Omega are taken.
+        p: vehicle, SI; the stand's zeta, the geometry and Omega are used.
         den: (1, p1, p2, p3, p4), highest power of s first.
     """
-    # Five unknowns are not in four coefficients: zeta is taken as known, kappa is read from
-    # p4 = kappa c2, and Omega is measured. What p2 = c2 + zeta c1 + kappa should be is then left
-    # over as a check: an identified model that misses it by far is not this model.
+    # Four coefficients cannot give five unknowns: zeta is assumed known, kappa is p4/c2, and Omega
+    # is measured. The expected p2 = c2 + zeta c1 + kappa is then a check of the model.
     axis = {"roll": ROLL, "pitch": PITCH}[angle]
     inertia, added = _inertias(p, axis)
     zeta, c2 = p.zeta * inertia / (inertia + added), p.Omega**2
@@ -257,16 +255,17 @@ def ratios_from_denominator(
     k1 = c1 * p.Omega
     k2 = c3 * p.Omega / (k1 * p.L2 * p.L4)
     slope = "a_paddle" if _is_given(p.a_paddle) else "a"
-    # Moment and k1 are proportional to a and to 1/If: at one they are the factors of the ratios.
+    # Moment and k1 are proportional to a and to 1/If, so their values at one are the factors of the
+    # ratios.
     unit_a = naming.replace(p, **{"a": 1.0, "If": 1.0, slope: 1.0})
     moment_per_a = cyclic_moment(unit_a, p.Omega, 1.0 / (p.L1 * (p.L2 + p.L3)))
     over = f"a/{axis.inertia}"
-    total = k2 / moment_per_a  # a over the whole inertia, what is added included
+    total = k2 / moment_per_a  # a over the inertia including the added one
     k1_per_ratio = flapping_rate_gain(unit_a)
     ratios = {over: total * (inertia + added) / inertia, f"{slope}/If": k1 / k1_per_ratio}
     return Ratios(ratios, p2, c2 + zeta * c1 + kappa)
 
 
 def _is_given(value: Scalar) -> bool:
-    """True if an optional constant is given; False if it is traced, where nobody can tell."""
+    """True if an optional constant is given; False if it is traced, where that is unknown."""
     return not isinstance(value, core.Tracer) and not bool(jnp.isnan(value))

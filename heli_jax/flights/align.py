@@ -121,14 +121,13 @@ def _coarse(a: np.ndarray, b: np.ndarray) -> tuple[int, float]:
                 "sign, or `reverse: true`"
             )
         raise NotAligned(
-            f"they hardly agree (correlation {r[best]:.2f} at the best lag), expected at least "
-            f"{LEAST}"
+            f"they are hardly correlated ({r[best]:.2f} at the best lag), expected at least {LEAST}"
         )
     rival = other_peak(r, best)
     if rival is not None and 1.0 - r[rival] ** 2 < _RIVAL * (1.0 - r[best] ** 2):
         raise NotAligned(
-            f"{abs(int(shifts[best] - shifts[rival]))} samples apart two lags explain nearly the "
-            f"same (correlations {r[best]:.4f} and {r[rival]:.4f}); expected a signal that does "
+            f"{abs(int(shifts[best] - shifts[rival]))} samples apart two lags fit nearly equally "
+            f"well (correlations {r[best]:.4f} and {r[rival]:.4f}); expected a signal that does "
             "not repeat itself"
         )
     return int(shifts[best]), float(r[best])
@@ -230,7 +229,7 @@ def _refined(
     left, slope = linearised(lag)
     curvature = float(slope @ slope)
     if abs(found.x[0]) > 0.999 * _REACH or not curvature > 0:
-        raise NotAligned("the lag is not told by the sum of squares, which has no minimum near")
+        raise NotAligned("the sum of squares has no minimum near the best lag")
     return lag, float(np.sqrt(t.size * _long_run(slope * left)) / curvature)
 
 

@@ -66,7 +66,7 @@ def as_logged(request: Request, signals: Mapping[Key, Timed]) -> AsLogged:
         if (at := at_marks(numbers)).any():
             if key[1] == "input":
                 problem = f"has {mark_words(numbers, at)}, first at {seconds[np.argmax(at)]:.6g} s"
-                remedy = "expected an input that is known all the time; give a window without them"
+                remedy = "an input needs a value at every sample: choose a window without them"
                 raise wrong(request.path, f"{problem}; {remedy}", column(signal.name))
             notes.append(marks_note(name, numbers, at, _MISSING, key[0]))
             values = np.where(at, np.nan, values)
@@ -106,7 +106,7 @@ def _without(values: np.ndarray, at: np.ndarray, kind: str) -> tuple[np.ndarray,
         return values, words
     # An input acts all the time: a stick keeps its previous value.
     last = known[np.maximum(np.searchsorted(known, np.arange(at.size), side="right") - 1, 0)]
-    return values[last], f"{words}: taken as it was before"
+    return values[last], f"{words}: the value before it is used"
 
 
 def measured(signal: Signal, values: np.ndarray) -> np.ndarray:
@@ -154,7 +154,5 @@ def unwrapped(values: np.ndarray, turn: float, name: str) -> tuple[np.ndarray, F
     moved = np.diff(made[seen]) - np.diff(values[seen])
     n = int(np.count_nonzero(np.abs(moved) > 0.5 * turn))
     often = "once" if n == 1 else f"{n} times"
-    words = (
-        f"{name} jumps by a turn {often}, at the ends of its range: taken as going on (unwrapped)"
-    )
+    words = f"{name} jumps by a turn {often}, at the ends of its range: unwrapped"
     return made, note("angles.unwrapped", words, value=n)

@@ -281,7 +281,7 @@ def unit_notes(time: Signal, stated: str | None) -> tuple[Finding, ...]:
     if stated:
         words = f"taken in {stated}, as the file says, and not in {time.unit}"
     else:
-        words = f"taken in {time.unit}, though its name says {named}: if that is right, state"
+        words = f"taken in {time.unit}, though its name says {named}; if the name is right, state"
         words += f" unit: {named} beside it"
     return (note("units.contradicted", f"time: {shown(time.name)} is {words}"),)
 
@@ -296,12 +296,12 @@ def require_increasing(table: Table, name: str, stamps: np.ndarray) -> None:
     problem = f"the time {fault}, got {now} after {after}, expected increasing times"
     # The times increase without the previous row, so that row is the wrong one.
     if row > 1 and stamps[row - 2] < stamps[row] < stamps[row - 1]:
-        remedy = f"{table.place(row - 1)} is out of order with those around it: leave it out"
+        remedy = f"{table.place(row - 1)} is out of order: delete it"
     elif (starts := restarts(stamps)).size:
         runs = f"{starts.size + 1} runs in one file"
         remedy = f"there are {runs}: gaps: split beside log: makes a flight of each"
     else:
-        remedy = shared_stamps(stamps) or "sort the rows by time, or leave out those that go back"
+        remedy = shared_stamps(stamps) or "sort the rows by time, or delete those that go back"
     raise wrong(table.path, f"{problem}; {remedy}", table.place(row), column(name))
 
 
@@ -318,7 +318,7 @@ def require_likely(path: str, time: Signal, stamps: np.ndarray) -> None:
     why = f", as its name says {named}" if named == likely else ""
     remedy = f"expected its unit: {{signal: {time.name}, unit: {likely}}}"
     if named != likely:
-        remedy += ", or unit: s where it is so slow"
+        remedy += ", or unit: s if it is that slow"
     raise wrong(path, f"{problem}{why}; {remedy}", column(time.name))
 
 
@@ -386,8 +386,5 @@ def with_runs(
         apart[start:] += apart[start - 1] - apart[start] + _BETWEEN / scale
     places = listed(table.place(int(start)) for start in starts)
     why = f"{shown(runs)} is another" if runs else "the time begins anew"
-    words = (
-        f"{why} in {places}: {starts.size + 1} runs, put one after another with "
-        f"{_BETWEEN:g} s between"
-    )
+    words = f"{why} in {places}: {starts.size + 1} runs, joined with {_BETWEEN:g} s between"
     return {**columns, clock: apart}, (note("clock.runs", words, value=starts.size + 1),)

@@ -165,7 +165,7 @@ def _names(log: DerivedLog, patterns: Sequence[str]) -> list[str]:
     # After the patterns, several of which may match the same channel.
     require_few_columns(log.path, len(names))
     if TIME in names:
-        problem = f"{TIME!r} is the name of the clock that is written, expected other signals"
+        problem = f"{TIME!r} is the name of the written clock, expected other signals"
         raise wrong(log.path, problem)
     return names
 

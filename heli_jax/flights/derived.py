@@ -79,7 +79,7 @@ class Swashplate:
         scaled = mixing_matrix(self) / np.array([1.0, *(np.mean(self.radius),) * 2])
         if np.linalg.cond(scaled) > _MOST_CONDITION:
             raise ValueError(
-                f"angles: {list(self.angles)} deg do not tell collective from cyclic, expected "
+                f"angles: {list(self.angles)} deg do not separate collective and cyclic, expected "
                 "three servos that are not on one line"
             )
 

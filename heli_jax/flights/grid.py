@@ -74,8 +74,8 @@ def shared_stamps(stamps: np.ndarray) -> str:
     if still <= _MANY * stamps.size:
         return ""
     return (
-        f"{still} of {stamps.size} rows have the time of the row before: the stamps have too few "
-        "digits (log them with more), or rows were written twice (leave those out)"
+        f"{still} of {stamps.size} rows have the time of the row before: log time with more "
+        "digits, or delete rows that were written twice"
     )
 
 

@@ -289,7 +289,7 @@ class ChannelLog:
         topic = self.topic_of(name)
         # `info` shows such rows; only a request for times fails.
         if not topic.clock:
-            problem = "its rows have an order and no times, so nothing can be fitted to them"
+            problem = "its rows have no times, so nothing can be fitted"
             raise wrong(self.path, problem, f"channel {shown(name)}")
         return Channel(topic.times, as_floats(topic.columns[name]))
 

@@ -177,7 +177,7 @@ def strays(seconds: np.ndarray, numbers: np.ndarray, kind: str) -> tuple[Strays,
     They are isolated samples that no motion reaches, or samples larger than any measurement.
     """
     absurd, (alone, far) = is_absurd(numbers), _unreached(seconds, numbers, kind)
-    off = f"which no motion leads to: more than {far:g} times the range of all others away"
+    off = f"unreachable by motion: more than {far:g} times the range of all others away"
     kinds = ((absurd, "larger than any measurement"), (alone & ~absurd, off))
     return tuple(Strays(seconds[at], numbers[at], words) for at, words in kinds if at.any())
 
@@ -313,15 +313,15 @@ def repeats_removed(
         if stated[name] == "auto" and not moving:
             # No other signal shows that the vehicle moved while this one was constant.
             words = (
-                f"{name} keeps each value for {usual} samples; if it was measured so slowly, state "
+                f"{name} keeps each value for {usual} samples; if the sensor is that slow, state "
                 "`repeats: missing`"
             )
             notes.append(note("repeats.kept", words, name, value=usual))
             continue
         made[name] = without_repeats(y, usual)
         words = (
-            f"{name} keeps each value for {usual} samples: taken as measured at the first of them "
-            "and missing at the others (`repeats: keep` leaves them)"
+            f"{name} keeps each value for {usual} samples: the first is used and the others are missing "
+            "(`repeats: keep` keeps them)"
         )
         notes.append(note("repeats.missing", words, name, value=usual))
     return made, notes

@@ -55,7 +55,9 @@ _SAME = 1e-6
 """Largest difference between two stamps that count as equal [steps]."""
 _MOST_GAPS = 20
 """Largest ratio of grid instants to samples."""
-_AN_INPUT = "; an input acts all the time: fill it in, or take windows without that part"
+_AN_INPUT = (
+    "; an input needs a value at every sample: fill it in, or choose windows without that part"
+)
 
 
 # Clocks of a log's topics, and the signals on them.
@@ -451,8 +453,8 @@ def at_times(
                 outputs = ", ".join(alike[key])
                 follow = "follow" if len(alike[key]) > 1 else "follows"
                 words = (
-                    f"{key} is low-passed as well and linear between samples, since {outputs} "
-                    f"{follow} it within a sample: filtered alike, both keep what is between them"
+                    f"{key} is low-passed too and linear between samples, because {outputs} "
+                    f"{follow} it within a sample and is low-passed"
                 )
                 notes.append(note(LOW_PASSED, words, key))
             else:
@@ -464,7 +466,7 @@ def at_times(
             words = (
                 f"{shown(request.signals[key, kind].name)} at about "
                 f"{1 / usual_step(own_clock(signal).seconds):.4g} Hz is slower than the grid of "
-                f"{rate:.6g} Hz: {count} samples at the instants nearest to their own; between "
+                f"{rate:.6g} Hz: {count} samples, each at the nearest instant; between "
                 "them it is missing"
             )
             notes.append(note("resampling.slower", words, key, value=count))

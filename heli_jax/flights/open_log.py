@@ -134,7 +134,9 @@ def _reader(path: Path) -> _Reader:
     _refuse_foreign(path, head)
     if csv_text.is_gzipped(path):
         if csv_text.inner_ending(path) not in _TEXTS:
-            problem = f"is packed by gzip, which is read of texts alone ({', '.join(_TEXTS[:3])})"
+            problem = (
+                f"is packed by gzip, which is read for text files only ({', '.join(_TEXTS[:3])})"
+            )
             raise wrong(str(path), f"{problem}; expected it unpacked")
         return csv_text.open_csv
     # The ending decides where it is reliable, so that a damaged Parquet file is not read as text.
@@ -168,13 +170,13 @@ def _by_content(head: bytes, is_table: bool) -> _Reader | None:
 
 _SHEET = "is a spreadsheet; save its sheet as CSV, one table with its names above"
 _PICKLE = (
-    "is a pickle of Python, which may run anything; save a table, frame.to_parquet(FILE), or "
+    "is a Python pickle, which may run any code; save a table, frame.to_parquet(FILE), or "
     "arrays, numpy.savez(FILE, t=t, p=p)"
 )
 _TOPICS = "export its topics to CSV (PlotJuggler does)"
 _ARCHIVE = "is an archive; unpack it and name the log in it"
 _TELEMETRY = (
-    "is telemetry of MAVLink, thinned out on its way to the ground; take the autopilot's own log "
+    "is MAVLink telemetry with a reduced rate; use the autopilot's own log "
     "(.bin, .ulg), or export messages: mavlogdump.py --format csv --types ATTITUDE FILE"
 )
 _BY_ENDING = {
@@ -184,7 +186,7 @@ _BY_ENDING = {
     **dict.fromkeys((".pkl", ".pickle", ".joblib"), _PICKLE),
     **dict.fromkeys((".zip", ".7z", ".rar", ".tar", ".tgz", ".xz", ".bz2", ".zst"), _ARCHIVE),
     **dict.fromkeys((".mf4", ".mdf", ".tdms", ".c3d"), "is a measurement; export it to CSV"),
-    **dict.fromkeys((".slx", ".fig"), "is no data of MATLAB; save the signals as arrays in .mat"),
+    **dict.fromkeys((".slx", ".fig"), "is no MATLAB data file; save the signals as arrays in .mat"),
 }
 _BY_MARK = (
     (b"\x89MCAP0\r\n", _BY_ENDING[".mcap"]),

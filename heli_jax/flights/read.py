@@ -368,7 +368,7 @@ def _aligned(
         raise wrong(also.path, f"cannot be aligned by {what}: {e}") from e
     words = (
         f"{name}: {lag.lag:.6g} s (sd {1e3 * lag.sd:.2g} ms) were added to its times, counted from "
-        f"its beginning, by which {shown(also.to)} agrees best with {also.same} (correlation "
+        f"its start: {shown(also.to)} agrees best with {also.same} (correlation "
         f"{lag.correlation:.3f} over {lag.overlap:.4g} s)"
     )
     return lag.lag, Finding(
@@ -389,12 +389,12 @@ def _as_one(
         raise wrong(
             also.path,
             f"its times go from {theirs[0]:.6g} s to {theirs[1]:.6g} s and those of {first} from "
-            f"{ours[0]:.6g} s to {ours[1]:.6g} s, so that they are no one clock; state a motion "
-            "that both hold, align: {with: ..., to: ...}",
+            f"{ours[0]:.6g} s to {ours[1]:.6g} s, so they have different clocks; state a "
+            "motion that both logs have, align: {with: ..., to: ...}",
         )
     words = (
-        f"{name}: its times are taken as those of {first}, with which it shares {shared:.4g} s; if "
-        "each counts from a beginning of its own, state align"
+        f"{name}: its times are taken as those of {first} ({shared:.4g} s in common); if "
+        "each log counts from its own start, state align"
     )
     return note("clock.taken-as-one", words, value=shared)
 
@@ -424,7 +424,7 @@ def require_some_time(flight: Flight) -> None:
         return
     path = flight.source.path if flight.source else flight.name or "flight"
     problem = f"{flight.n_samples} samples in {flight.duration:.3g} s, expected {_SHORTEST:g} s"
-    raise wrong(path, f"{problem} at least: look at the window, and at the time's unit")
+    raise wrong(path, f"{problem} at least: check the window and the unit of time")
 
 
 def require_moving_outputs(flight: Flight) -> None:
@@ -436,4 +436,4 @@ def require_moving_outputs(flight: Flight) -> None:
     path = flight.source.path if flight.source else flight.name or "flight"
     values = ", ".join(f"{n} at {value:.6g}" for n, value in still.items())
     problem = f"every output stays at one value (SI: {values}) for all of {flight.duration:.6g} s"
-    raise wrong(path, f"{problem}; expected one that moves: look whether the sensor was logged")
+    raise wrong(path, f"{problem}; expected an output that moves: check that the sensor was logged")

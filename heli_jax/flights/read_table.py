@@ -135,13 +135,15 @@ def guessed_log(table: Table, time: str | None, unit: str | None, rate: float | 
         why = clock.problem if clock else "no column looks like a clock"
         remedy = "expected --time NAME, a column of increasing times, or "
         remedy += (
-            "a file without the rows that go back" if clock else "--time-rate HZ, samples a second"
+            "a file without rows that go back in time"
+            if clock
+            else "--time-rate HZ, samples a second"
         )
         if not clock and texts:
             why += f" ({shown(texts[0].name)} is text{texts[0].strays and ': ' + texts[0].strays})"
         raise wrong(table.path, f"{why}, {remedy}")
     if clock.guessed:
-        words = f"column {shown(clock.column)} is taken for a clock in {clock.unit}"
+        words = f"column {shown(clock.column)} is taken as the clock in {clock.unit}"
         notes.append(note("clock.guessed", words, clock.column))
     rows = next((c.count for c in info.columns if c.name == clock.column), info.n_rows)
     # Arrays may have different lengths; rows of a table with empty cells have one length.
@@ -253,8 +255,8 @@ def without_joins(log: ChannelLog, joined: bool = False) -> ChannelLog:
         known = (t for t in parts if t.times.size > 1)
         rates = listed(f"{t.name} at about {1 / usual_step(t.times):.4g} Hz" for t in known)
         words = (
-            f"its rows hold one topic each and leave other cells empty: each column is taken at "
-            f"the rows that hold it ({rates})"
+            f"each row holds one topic and leaves other cells empty: each column is read at "
+            f"its own rows ({rates})"
         )
         notes.append(note("channels.joined", words, value=len(parts)))
         topics += parts

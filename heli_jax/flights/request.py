@@ -206,7 +206,7 @@ def _with_file_unit(log: ChannelLog, signal: Signal, name: str) -> Signal:
     except ValueError as e:
         same = not known
         if signal.assumed and known:
-            problem = f"{name} has no unit stated, and the file's is another: {e}"
+            problem = f"{name} has no stated unit, and the file states another: {e}"
             remedy = "state unit, with scale and offset where numbers have to be converted"
             raise wrong(log.path, f"{problem}; {remedy}", column(signal.name)) from e
     if same:

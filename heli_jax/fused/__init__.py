@@ -1,5 +1,5 @@
-"""A loop over time as one program: what JAX traced, translated to LLVM, vehicles side by side.
+"""Loops over time as one program: JAX traces, translated to LLVM, with vehicles in vector lanes.
 
-XLA makes a kernel of each step and goes to memory between them; here the states of some vehicles
-stay in registers from the first sample to the last, as in C that is written by hand.
+XLA makes a kernel of each step and stores states in memory between them. Here the states of some
+vehicles stay in registers from the first sample to the last, as in hand-written C.
 """

@@ -1,7 +1,7 @@
-"""The primitives that move, join, look up and sum the elements of arrays.
+"""Primitives that move, join, look up and sum elements of arrays.
 
-An operation that only moves elements is computed by JAX itself now, of the elements' numbers: that
-says which element goes where. Long arrays stay in memory, and a part of one is a view.
+JAX computes an operation that only moves elements now, on the elements' indices, which shows where
+each goes. Long arrays stay in memory, and parts of them are views.
 """
 
 import math
@@ -38,18 +38,19 @@ MOVED: dict[str, tuple[int, ...] | None] = {
     "dynamic_update_slice": (0, 1),
     "scatter": (0, 2),
 }
-"""operations that move elements; the places of the operands that have these, where others are
-indices"""
+"""Operations that move elements, and the operands with these elements; other operands
+are indices.
+"""
 
 
 def moved(code: Code, equation: Any, name: str, inputs: list[Operand]) -> list[Operand]:
-    """The results of an operation that only moves elements."""
+    """Return the results of an operation that only moves elements."""
     params, shape = equation.params, equation.outvars[0].aval.shape
     places = MOVED[name] or range(len(inputs))
     indices = [v for i, v in enumerate(inputs) if i not in places]
     computed = any(isinstance(v, Stored) or v.dtype == object for v in indices)
     stays = any(isinstance(v, Stored) for v in inputs)
-    # One number along a record is that number wherever it is read.
+    # A number repeated along a record is the same wherever it is read.
     along = name == "broadcast_in_dim" and math.prod(inputs[0].shape) == 1
     long = math.prod(shape) > (LONG if along else MOST)
     if name in _VIEWS and (stays or long or computed):
@@ -74,7 +75,7 @@ def moved(code: Code, equation: Any, name: str, inputs: list[Operand]) -> list[O
 
 
 def at_compile_time(equation: Any, inputs: Sequence[Any]) -> list[Any]:
-    """Compute an operation of operands that are known now."""
+    """Compute an operation with known operands."""
     with jax.ensure_compile_time_eval():
         results = equation.primitive.bind(*inputs, **equation.params)
     results = results if equation.primitive.multiple_results else [results]
@@ -89,8 +90,11 @@ def _view(
     starts: Sequence[Value] = (),
     strides: Sequence[int] = (),
 ) -> Stored:
-    """A part of an array: for each of its axes the view's axis that runs along it (None: it has
-    length 1 or stands still), from where on, and in which steps."""
+    """Return a part of an array as a view.
+
+    Each axis of the array has the view's axis along it (None: length 1 or fixed), a start and a
+    stride.
+    """
     zero = constant(0, INDEX)
 
     def element(at: tuple[Value, ...]) -> Value:
@@ -128,7 +132,7 @@ def _sliced(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Stored
 
 
 def _taken(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Stored:
-    """dynamic_slice: within the array whatever is asked for, as JAX has it."""
+    """Return a view for dynamic_slice, clipped to the array as in JAX."""
     operand, sizes = inputs[0], params["slice_sizes"]
     starts = [
         _within(code, scalar(v), length - size)
@@ -146,9 +150,9 @@ _VIEWS = {
 
 
 def _within(code: Code, index: Value, most: int) -> Value:
-    """An index (int32) between 0 and the most, whatever it was."""
-    # In its own type first, of which the largest numbers, made of what is infinite, are others in
-    # a shorter one. A short type may not have the most; then none of its numbers is beyond.
+    """Return an index (int32) clipped to 0 and the maximum."""
+    # Clip in its own type first: large numbers, from infinity, would wrap in a shorter type. A
+    # short type may not reach the maximum, and then needs no upper clip.
     high = constant(min(most, int(np.iinfo(index.dtype).max)), index.dtype)
     inside = OPERATIONS["clamp"](code, constant(0, index.dtype), index, high)
     return converted(code, inside, new_dtype=INDEX)
@@ -174,12 +178,12 @@ def _reduction(operation: str) -> _Shaped:
 
 
 def _product(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
-    """dot_general, of small arrays: sums of products written out."""
+    """Translate dot_general of small arrays as sums of products."""
     (of_a, of_b), (batch_a, batch_b) = params["dimension_numbers"]
     dtype = params.get("preferred_element_type") or dtype_of(inputs[0])
 
     def rows(operand: Operand, summed: Sequence[int], batch: Sequence[int]) -> Elements:
-        """(batches, free axes, summed axes) as (batch..., free, summed)."""
+        """Reshape (batches, free axes, summed axes) to (batch..., free, summed)."""
         v = applied(partial(converted, code), elements(operand), new_dtype=dtype)
         free = [d for d in range(v.ndim) if d not in (*summed, *batch)]
         shape = [v.shape[d] for d in (*batch, *free)]

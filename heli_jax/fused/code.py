@@ -1,6 +1,6 @@
-"""LLVM assembly, line by line: scalars that all vehicles share, and vectors over vehicles.
+"""Writer of LLVM assembly: scalars that all vehicles share, and vectors over vehicles.
 
-Small arrays are taken apart, long ones left in memory (`Stored`).
+Small arrays are split into elements; long ones stay in memory (`Stored`).
 """
 
 import struct
@@ -13,10 +13,10 @@ import numpy as np
 
 
 class UnsupportedError(Exception):
-    """An operation that has no translation; in words what it is."""
+    """An operation without a translation; the text names it."""
 
     place: str | None = None
-    """where it comes from, as `fused.place` has it"""
+    """Origin in the source, from `translate.place_of`."""
 
     def __str__(self) -> str:
         words = super().__str__()
@@ -25,13 +25,13 @@ class UnsupportedError(Exception):
 
 @contextmanager
 def translating() -> Iterator[None]:
-    """Turn any error while translating into one that leaves the program untranslated.
+    """Convert any error during translation into UnsupportedError, which leaves the work to XLA.
 
-    XLA computes the same: no failure here may end what somebody asked for. An error of the model's
-    own is raised there again.
+    XLA gives the same result, so a failure here must not end the run. It raises the model's own
+    errors again.
 
     Raises:
-        UnsupportedError: in place of any other error.
+        UnsupportedError: for any other error.
     """
     try:
         yield
@@ -49,13 +49,13 @@ def said(error: Exception) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """A number of the program."""
+    """A number in the program."""
 
     operand: str
-    """a register such as %7, or a constant"""
+    """Register such as %7, or constant."""
     dtype: np.dtype
     shared: bool
-    """the same for all vehicles: a scalar, no vector"""
+    """True if all vehicles share it: a scalar instead of a vector."""
 
 
 _TYPES = {
@@ -71,10 +71,10 @@ _TYPES = {
 
 
 def type_of(dtype: np.dtype) -> str:
-    """LLVM's name of a type.
+    """Return LLVM's name of a type.
 
     Raises:
-        UnsupportedError: it has none here, as a complex number.
+        UnsupportedError: the type is not supported, such as a complex number.
     """
     if str(dtype) not in _TYPES:
         raise UnsupportedError(f"numbers of type {dtype}")
@@ -82,29 +82,28 @@ def type_of(dtype: np.dtype) -> str:
 
 
 def constant(value: float | bool | np.generic, dtype: np.dtype) -> Value:
-    """A number that is known when the program is written."""
+    """Return a number known when the program is written."""
     dtype = np.dtype(dtype)
     if dtype == np.bool_:
         return Value("true" if value else "false", dtype, True)
     if dtype.kind in "iu":
         return Value(str(int(value)), dtype, True)
     type_of(dtype)
-    # In hexadecimal digits of a double for both precisions: no digit is lost, and what is not
-    # finite has them too.
+    # Hexadecimal digits of a double for both precisions: exact, also for infinity and NaN.
     (bits,) = struct.unpack("<Q", struct.pack("<d", float(np.asarray(value, dtype))))
     return Value(f"0x{bits:016X}", dtype, True)
 
 
 class Code:
-    """Lines of one function, in the order in which they are run.
+    """Lines of one function, in order of execution.
 
-    Every loop is entered at least once and left at its end alone, so that what was written before
-    stands for all that comes after.
+    Every loop runs at least once and ends only at its end, so earlier values are defined in all
+    later lines.
     """
 
     def __init__(self, lanes: int) -> None:
         self.lanes = lanes
-        """vehicles in flight at once in one thread: vectors of so many; with one, plain numbers"""
+        """Vehicles per vector in one thread; with 1, plain numbers."""
         self.lines: list[str] = []
         self.block = "entry"
         self.declared: dict[str, str] = {}
@@ -114,56 +113,56 @@ class Code:
         self._whole: dict[str, Value] = {}
 
     def register(self) -> str:
-        """A name that is new."""
+        """Return a new register name."""
         self._count += 1
         return f"%v{self._count}"
 
     def mark(self) -> tuple[int, str, dict[tuple[str, str], str]]:
-        """A place to come back to."""
+        """Return the current position, for `back_to`."""
         return len(self.lines), self.block, dict(self._spread)
 
     def back_to(self, mark: tuple[int, str, dict[tuple[str, str], str]]) -> None:
-        """Take back what was written since."""
+        """Remove all lines written since a mark."""
         del self.lines[mark[0] :]
         self.block, self._spread = mark[1], dict(mark[2])
 
     def write(self, line: str) -> None:
-        """A line as it is."""
+        """Append a line."""
         self.lines.append(f"  {line}")
 
     def pointer(self, table: str, i: int) -> str:
-        """The i-th of a table of pointers."""
+        """Return the i-th pointer of a table."""
         place, pointer = self.register(), self.register()
         self.write(f"{place} = getelementptr ptr, ptr {table}, i64 {i}")
         self.write(f"{pointer} = load ptr, ptr {place}")
         return pointer
 
     def made(self, right: str, dtype: np.dtype, shared: bool) -> Value:
-        """The value of an instruction."""
+        """Return the value of an instruction."""
         name = self.register()
         self.write(f"{name} = {right}")
         return Value(name, np.dtype(dtype), shared)
 
     def new_label(self, kind: str) -> str:
-        """The name of a block that is yet to be written."""
+        """Return the name of a block to be written later."""
         self._count += 1
         return f"{kind}{self._count}"
 
     def label(self, name: str) -> None:
-        """Here begins a block."""
+        """Begin a block."""
         self.block = name
         self.lines.append(f"{name}:")
 
     def typed(self, dtype: np.dtype, shared: bool) -> str:
-        """The type of a number, or of one a vehicle."""
+        """Return the type of a shared number, or of one per vehicle."""
         return self.vector(type_of(np.dtype(dtype)), shared)
 
     def vector(self, kind: str, shared: bool = False) -> str:
-        """LLVM's type of one number, or of one a vehicle."""
+        """Return LLVM's type of a shared number, or of one per vehicle."""
         return kind if shared or self.lanes == 1 else f"<{self.lanes} x {kind}>"
 
     def of(self, value: Value, shared: bool) -> str:
-        """The operand for a shared number or, spread over the vehicles, for one each."""
+        """Return the operand as a shared number, or spread over the vehicles."""
         if shared or not value.shared or self.lanes == 1:
             return value.operand
         kind = type_of(value.dtype)
@@ -181,19 +180,22 @@ class Code:
         return self._spread[key]
 
     def operation(self, name: str, *values: Value) -> Value:
-        """An instruction of operands of one type, such as `fadd contract`."""
+        """Write an instruction with operands of one type, such as `fadd contract`."""
         shared = all(v.shared for v in values)
         kind = self.typed(values[0].dtype, shared)
         operands = ", ".join(self.of(v, shared) for v in values)
         return self.made(f"{name} {kind} {operands}", values[0].dtype, shared)
 
     def compare(self, name: str, a: Value, b: Value) -> Value:
-        """A truth value, by `fcmp olt` and the like."""
+        """Write a comparison, such as `fcmp olt`."""
         return replace(self.operation(name, a, b), dtype=np.dtype(bool))
 
     def intrinsic(self, name: str, *values: Value) -> Value:
-        """A function that LLVM knows, such as `sqrt`; of vectors it makes the processor's own, or
-        calls the C library's for each vehicle."""
+        """Write a call of an LLVM intrinsic, such as `sqrt`.
+
+        For vectors it becomes the processor's instruction, or a call of the C library for each
+        vehicle.
+        """
         shared = all(v.shared for v in values)
         kind = self.typed(values[0].dtype, shared)
         suffix = {"double": "f64", "float": "f32"}.get(type_of(values[0].dtype))
@@ -204,7 +206,7 @@ class Code:
         return self.made(f"call {kind} {full}({operands})", values[0].dtype, shared)
 
     def by_lane(self, function: Callable[..., Value], dtype: np.dtype, *values: Value) -> Value:
-        """A function of scalars for each vehicle; once where all values are shared."""
+        """Apply a scalar function for each vehicle; once if all values are shared."""
         shared = all(v.shared for v in values)
         if shared or self.lanes == 1:
             return replace(function(*values), shared=shared)
@@ -233,30 +235,32 @@ class Code:
         return "" if shared or self.lanes == 1 else f"v{self.lanes}"
 
     def choose(self, which: Value, yes: Value, no: Value) -> Value:
-        """One of two."""
+        """Write a selection between two values."""
         shared = which.shared and yes.shared and no.shared
         kind = self.typed(yes.dtype, shared)
-        # One truth value for whole vectors is a scalar to LLVM too.
+        # A shared condition is a scalar in LLVM, even for vectors.
         of_which = f"{self.vector('i1', which.shared)} {which.operand}"
         operands = f"{kind} {self.of(yes, shared)}, {kind} {self.of(no, shared)}"
         return self.made(f"select {of_which}, {operands}", yes.dtype, shared)
 
     def cast(self, name: str, value: Value, dtype: np.dtype) -> Value:
-        """Another type, by `sitofp` and the like."""
+        """Write a conversion to another type, such as `sitofp`."""
         source = self.typed(value.dtype, value.shared)
         target = self.typed(dtype, value.shared)
         return self.made(f"{name} {source} {value.operand} to {target}", dtype, value.shared)
 
     def remember_whole(self, value: Value, integer: Value) -> None:
-        """Remember that a floating-point number was made of an integer."""
+        """Store the integer from which a floating-point number was converted."""
         self._whole[value.operand] = integer
 
     def whole(self, value: Value) -> Value | None:
-        """The integer that a number was made of, so that its way back costs nothing."""
+        """Return the integer from which a number was converted, so that converting back is free."""
         return self._whole.get(value.operand)
 
     def load(self, pointer: str, index: Value, dtype: np.dtype) -> Value:
-        """The element of an array that all vehicles share; of each another where the index is."""
+        """Load an element of an array that all vehicles share; the index may differ between
+        vehicles.
+        """
         dtype, kind = np.dtype(dtype), type_of(np.dtype(dtype))
         stored = "i8" if kind == "i1" else kind
 
@@ -272,7 +276,7 @@ class Code:
         return self.by_lane(element, dtype, index)
 
     def table(self, values: np.ndarray) -> str:
-        """A pointer to numbers that are known when the program is written."""
+        """Return a pointer to numbers known when the program is written."""
         kind = type_of(values.dtype)
         if kind == "i1":
             kind, values = "i8", values.astype(np.uint8)
@@ -286,30 +290,31 @@ class Code:
 
 
 MOST = 4096
-"""Elements of an array that is taken apart; more would take minutes to compile."""
+"""Most elements of an array that is split; more would take minutes to compile."""
 LONG = 64
-"""elements above which an array that repeats one number is not taken apart, and up to which one
-may be looked for among all"""
+"""Number of elements above which an array of one repeated number is not split, and up to which all
+elements may be searched.
+"""
 INDEX = np.dtype(np.int32)
-"""of indices into arrays, and of passes of a loop"""
+"""Type of indices into arrays, and of loop counters."""
 
 
 class Stored(NamedTuple):
-    """An array (N, ...) in memory, or what is computed of such, by the element."""
+    """An array (N, ...) in memory, or an expression of such, computed by element."""
 
     shape: tuple[int, ...]
     dtype: np.dtype
     element: Callable[[tuple[Value, ...]], Value]
-    """the element at int32 indices, one for each dimension"""
+    """Function of int32 indices, one for each dimension, that returns the element."""
 
 
 type Elements = np.ndarray[Any, Any]
-"""an array of Values, or of dtype other than object: of numbers that are known by now"""
+"""Array of Values (dtype object), or of known numbers."""
 type Operand = Elements | Stored
 
 
 def elements(operand: Operand) -> Elements:
-    """An operand as an array of Values."""
+    """Return an operand as an array of Values."""
     if isinstance(operand, Stored):
         if int(np.prod(operand.shape)) > MOST:
             raise UnsupportedError(f"an array of {operand.shape} as a whole")
@@ -321,25 +326,25 @@ def elements(operand: Operand) -> Elements:
 
 
 def applied(function: Callable[..., Any], *arrays: Elements, **others: Any) -> Elements:
-    """A function of Values, element by element of arrays that NumPy broadcasts."""
+    """Apply a function of Values by element to arrays that NumPy broadcasts."""
     mapped = np.frompyfunc(lambda *v: function(*v, **others), len(arrays), 1)
     return np.asarray(mapped(*arrays), object)
 
 
 def scalar(operand: Operand) -> Value:
-    """The Value of an operand that is one number."""
+    """Return the Value of an operand with one number."""
     return elements(operand).item()
 
 
 def dtype_of(operand: Operand) -> np.dtype:
-    """The type of an operand's numbers."""
+    """Return the type of an operand's numbers."""
     if isinstance(operand, Stored) or operand.dtype != object:
         return operand.dtype
     return operand.ravel()[0].dtype
 
 
 def at_place(code: Code, operand: Operand, at: tuple[Value, ...]) -> Value:
-    """One element of an operand at indices that the program computes."""
+    """Return an element of an operand at computed indices."""
     if isinstance(operand, Stored):
         return operand.element(at)
     if operand.shape == ():
@@ -352,7 +357,7 @@ def at_place(code: Code, operand: Operand, at: tuple[Value, ...]) -> Value:
         raise UnsupportedError(
             f"an element at a computed place of a computed array {operand.shape}"
         )
-    # Every element is at hand in a register: the one that is meant is chosen among all.
+    # Every element is in a register, so the right one is selected among all.
     place, chosen = flat(code, operand.shape, at), operand.ravel()[-1]
     for k in range(operand.size - 2, -1, -1):
         here = code.compare("icmp eq", place, constant(k, place.dtype))
@@ -361,7 +366,7 @@ def at_place(code: Code, operand: Operand, at: tuple[Value, ...]) -> Value:
 
 
 def flat(code: Code, shape: tuple[int, ...], at: tuple[Value, ...]) -> Value:
-    """Return the position of an element in an array that is stored row by row."""
+    """Return the position of an element in a row-major array."""
     flat = at[0]
     for length, index in zip(shape[1:], at[1:], strict=True):
         flat = code.operation("mul", flat, constant(length, INDEX))

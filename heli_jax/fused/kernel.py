@@ -1,4 +1,4 @@
-"""A program for whole runs on the processor at hand, compiled and called."""
+"""A program for whole runs on this processor, compiled and called."""
 
 import ctypes
 import functools
@@ -26,39 +26,39 @@ from heli_jax.fused.translate import loop, translate
 
 
 class Argument(NamedTuple):
-    """An array that the program is given: one for all vehicles, or a row of each vehicle's own."""
+    """An array passed to the program: one for all vehicles, or a row for each."""
 
     shape: tuple[int, ...]
-    """without the vehicles"""
+    """Shape without the vehicles."""
     dtype: np.dtype
     shared: bool
 
 
 class Run(NamedTuple):
-    """Program to compile; jaxprs as `jax.make_jaxpr` gives them."""
+    """Program to compile, with jaxprs from `jax.make_jaxpr`."""
 
     step: Any
-    """of (what stays, what is stored, carry, k, int32): the carry after the k-th step"""
+    """step(constants, records, carry, k: int32) returns the carry after the k-th step."""
     last: Any
-    """of (what stays, what is stored, carry): the results"""
+    """last(constants, records, carry) returns the results."""
     stays: tuple[Argument, ...]
-    """what does not change over the steps"""
+    """Constants over the steps."""
     stored: tuple[Argument, ...]
-    """arrays (N, ...), read by the sample; of those that are not shared each vehicle has its own"""
+    """Records (N, ...), read by sample; each vehicle has its own unless they are shared."""
     carry: tuple[Argument, ...]
     steps: int
-    """one at least"""
+    """Number of steps, at least one."""
 
 
 def write(run: Run, lanes: int) -> tuple[str, list[Argument]]:
-    """A run in LLVM's language, of one function, `run`; and the results.
+    """Return a run as LLVM assembly with one function, `run`, and the kinds of its results.
 
-    Its arguments are four tables of pointers (what stays, what is stored, the carry, the results:
-    one for each array that is shared or stored, one for each row of the others, where a row has a
-    number of each vehicle), between which vehicles it is to compute, and how many there are.
+    Its arguments are four tables of pointers, the first and last vehicle, and the number of
+    vehicles. The tables are constants, records, carry and results. They have one pointer for each
+    shared array or record, and one for each row of others; a row has a number per vehicle.
 
     Raises:
-        UnsupportedError: an operation that has no translation.
+        UnsupportedError: an operation without a translation.
     """
     code = Code(lanes)
     stored = _stored(code, run.stored)
@@ -98,15 +98,15 @@ def write(run: Run, lanes: int) -> tuple[str, list[Argument]]:
     tables = ", ".join(f"ptr %{n}" for n in ("stays", "stored", "carry", "results"))
     arguments = f"{tables}, i64 %begin, i64 %end, i64 %count"
     body = "\n".join(code.lines)
-    # Without the attributes LLVM would take half of AVX-512's width, and what does not stay in
-    # registers would lie across lines of the cache: a quarter of the time of an exact step.
+    # Without the attributes LLVM would use half the width of AVX-512, and spilled registers would
+    # cross cache lines. That costs a quarter of an exact step's time.
     attributes = 'alignstack(64) "prefer-vector-width"="512" "min-legal-vector-width"="512"'
     function = f"define void @run({arguments}) nounwind {attributes} {{\nentry:\n{body}\n}}"
     return "\n".join([*head, function, ""]), kinds
 
 
 def _stored(code: Code, arguments: Sequence[Argument]) -> list[Stored]:
-    """Records, read by the sample."""
+    """Return the records, read by sample."""
 
     def read(pointer: str, argument: Argument) -> Stored:
         if len(argument.shape) != 1:
@@ -119,7 +119,7 @@ def _stored(code: Code, arguments: Sequence[Argument]) -> list[Stored]:
 
 
 def _own(code: Code, pointer: str, index: Value, dtype: np.dtype) -> Value:
-    """The vehicles' own numbers at one sample of arrays (N, vehicles)."""
+    """Return the vehicles' own numbers at one sample of arrays (N, vehicles)."""
     if not index.shared:
         raise UnsupportedError("an index that is not the same for all vehicles")
     wide, first, place = (code.register() for _ in range(3))
@@ -130,7 +130,10 @@ def _own(code: Code, pointer: str, index: Value, dtype: np.dtype) -> Value:
 
 
 def _read(code: Code, name: str, arguments: Sequence[Argument]) -> Callable[[], list[Operand]]:
-    """Arrays of a table of pointers: what is shared is read now, the vehicles' own when called."""
+    """Return a reader of arrays in a table of pointers.
+
+    Shared arrays are read now, and the vehicles' own when it is called.
+    """
     made: list[Callable[[], Operand]] = []
     place = 0
     for argument in arguments:
@@ -146,19 +149,19 @@ def _read(code: Code, name: str, arguments: Sequence[Argument]) -> Callable[[], 
 
 
 def _shared(code: Code, pointer: str, argument: Argument) -> Operand:
-    """An array that all vehicles share."""
+    """Return an array that all vehicles share."""
 
     def element(at: tuple[Value, ...]) -> Value:
         place = flat(code, argument.shape, at) if at else constant(0, INDEX)
         return code.load(pointer, place, argument.dtype)
 
     table = Stored(argument.shape, argument.dtype, element)
-    # A long one, such as a model's table, stays in memory: it can be looked something up in.
+    # A long array, such as a model's table, stays in memory for look-ups.
     return table if int(np.prod(argument.shape)) > LONG else elements(table)
 
 
 def _of_row(code: Code, argument: Argument, pointers: list[str]) -> Elements:
-    """The vehicles' own numbers, a vector each."""
+    """Return the vehicles' own numbers, each as a vector."""
     values = np.empty(argument.shape, object)
     for pointer, at in zip(pointers, np.ndindex(argument.shape), strict=True):
         values[at] = _vector(code, pointer, "%b", argument.dtype)
@@ -166,7 +169,7 @@ def _of_row(code: Code, argument: Argument, pointers: list[str]) -> Elements:
 
 
 def _vector(code: Code, pointer: str, first: str, dtype: np.dtype) -> Value:
-    """A number of each vehicle, from the first on."""
+    """Return a number per vehicle, from the given vehicle on."""
     kind = type_of(dtype)
     kept, size = ("i8", 1) if kind == "i1" else (kind, dtype.itemsize)
     place = code.register()
@@ -196,12 +199,12 @@ def lanes_for(dtype: np.dtype, linear: bool = False) -> int:
     """Return the number of vehicles that one thread computes at once.
 
     Args:
-        linear: whether a step is a product of matrices, whose sums wait for each other little.
+        linear: True if a step is a product of matrices, whose sums depend little on each other.
     """
-    # Two of the widest vectors there are: each operation waits for the one before it, and a second
-    # vector fills the wait; with more, the states no longer stay in registers. Narrower ones wait
-    # longer than they miss registers (RK4 of the roll model, AVX2: 16 vehicles take 0.77 of the
-    # time of 8), but for products of matrices (1.2 of it).
+    # Twice the widest vector: each operation waits for the previous one, and a second vector fills
+    # the wait. With more, states no longer fit in registers. On narrower vectors waiting costs more
+    # than spilling (RK4 of the roll model with AVX2: 16 vehicles take 0.77 of the time of 8),
+    # except for products of matrices (1.2 of it).
     wide = not linear or "avx512f" in _features() or "avx" not in _features()
     return (128 if wide else 64) // np.dtype(dtype).itemsize
 
@@ -213,10 +216,10 @@ class Kernel:
         """Translate and compile.
 
         Args:
-            lanes: vehicles in flight at once; their number has to be a multiple of it.
+            lanes: vehicles per vector; their number must be a multiple of it.
 
         Raises:
-            UnsupportedError: an operation that has no translation.
+            UnsupportedError: an operation without a translation.
         """
         self._run, self.lanes = run, lanes
         self.assembly, self._results = write(run, lanes)
@@ -232,24 +235,24 @@ class Kernel:
         carry: Sequence[np.ndarray],
         threads: int,
     ) -> list[np.ndarray]:
-        """All vehicles' runs.
+        """Compute the runs of all vehicles.
 
         Args:
-            stays: as the run has them; those that are not shared with the vehicles as their last
+            stays: constants of the run; arrays that are not shared have the vehicles as last
                 dimension.
-            stored: arrays (N, ...), or (N, vehicles) where each vehicle has its own.
-            carry: before the first sample, with the vehicles as the last dimension.
+            stored: arrays (N, ...), or (N, vehicles) if each vehicle has its own.
+            carry: carry before the first sample, with the vehicles as last dimension.
 
         Returns:
-            The results, with the vehicles as the last dimension.
+            The results, with the vehicles as last dimension.
         """
         count = carry[0].shape[-1]
         assert count % self.lanes == 0
         assert self._run.steps >= 1
-        # Kept until the call is over: the program has pointers to them.
+        # Keep references during the call, since the program has pointers to the arrays.
         arguments = [[np.ascontiguousarray(v) for v in part] for part in (stays, stored, carry)]
         results = [np.empty((*r.shape, count), r.dtype) for r in self._results]
-        # Those of vehicles' own are read sample by sample too: one pointer each.
+        # The vehicles' own records are also read by sample, so each has one pointer.
         stored_kinds = [argument._replace(shared=True) for argument in self._run.stored]
         kinds = (self._run.stays, stored_kinds, self._run.carry)
         tables = [_pointers(v, count, kind) for v, kind in zip(arguments, kinds, strict=True)]
@@ -260,7 +263,7 @@ class Kernel:
         def part(k: int) -> None:
             self._call(*tables, ends, int(shares[k]), int(shares[k + 1]), count)
 
-        # Threads of Python: the call gives its lock away.
+        # Python threads suffice, since the call releases the interpreter lock.
         if len(shares) == 2:
             part(0)
         else:
@@ -270,7 +273,7 @@ class Kernel:
 
 
 def _pointers(arrays: Sequence[np.ndarray], count: int, arguments: Sequence[Argument]) -> Any:
-    """A table of pointers: one for each array that is shared, one for each row of the others."""
+    """Return a table of pointers: one for each shared array, one for each row of others."""
     table = []
     for array, argument in zip(arrays, arguments, strict=True):
         row = 0 if argument.shared else count * array.itemsize
@@ -279,9 +282,9 @@ def _pointers(arrays: Sequence[np.ndarray], count: int, arguments: Sequence[Argu
     return (ctypes.c_void_p * max(1, len(table)))(*table)
 
 
-# Any: llvmlite is an extra, and has no types.
+# Any: llvmlite is an extra without types.
 def _llvm() -> Any:
-    """llvmlite's binding of LLVM.
+    """Return llvmlite's binding of LLVM.
 
     Raises:
         UnsupportedError: it is not installed.
@@ -301,7 +304,7 @@ def _features() -> frozenset[str]:
 
 
 def _machine() -> Any:
-    """The processor at hand, for LLVM."""
+    """Return this processor as an LLVM target."""
     llvm = _llvm()
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
@@ -311,13 +314,13 @@ def _machine() -> Any:
 
 
 def _compiled(assembly: str) -> Any:
-    """The engine that holds the machine code, which goes with it."""
+    """Return the engine, which owns the machine code."""
     llvm, target = _llvm(), _machine()
     module = llvm.parse_assembly(assembly)
     module.verify()
     builder = llvm.create_pass_builder(target, llvm.create_pipeline_tuning_options(speed_level=3))
     builder.getModulePassManager().run(module, builder)
-    # One of its own: the engine takes it over.
+    # A second target, since the engine takes ownership of it.
     engine = llvm.create_mcjit_compiler(module, _machine())
     engine.finalize_object()
     return engine

@@ -1,4 +1,4 @@
-"""JAX primitives in LLVM, for one number of each vehicle at a time."""
+"""JAX primitives in LLVM, for one number per vehicle."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -8,12 +8,12 @@ import numpy as np
 
 from heli_jax.fused.code import Code, UnsupportedError, Value, constant, type_of
 
-# A product and a sum may become one instruction, as XLA and every C compiler for these machines has
-# it; nothing else is allowed that would change a digit or lose what is not a number.
+# A product and a sum may be fused, as XLA and C compilers do. No other optimisation may change
+# digits or lose NaN.
 _F = "contract"
 
 type Operation = Callable[..., Value]
-"""(code, values, the primitive's parameters) -> value"""
+"""Function of code, values and the primitive's parameters that returns a value."""
 
 
 def _arithmetic(of_floats: str, of_integers: str) -> Operation:
@@ -31,7 +31,7 @@ def _quotient(code: Code, a: Value, b: Value, **_: Any) -> Value:
         return code.operation(f"fdiv {_F}", a, b)
     if a.dtype.kind != "u":
         raise UnsupportedError("a quotient of signed integers")
-    # The processor stops at a quotient by zero, of which XLA makes the largest number.
+    # The processor traps on division by zero, where XLA returns the largest number.
     none = code.compare("icmp eq", b, constant(0, b.dtype))
     result = code.operation("udiv", a, code.choose(none, constant(1, b.dtype), b))
     return code.choose(none, constant(-1, b.dtype), result)
@@ -45,7 +45,7 @@ def _remainder(code: Code, a: Value, b: Value, **_: Any) -> Value:
 
 
 def _extreme(of_floats: str, signed: str, unsigned: str) -> Operation:
-    # `maximum` gives what is not a number on, as JAX does; `maxnum` would lose it.
+    # `maximum` propagates NaN as JAX does; `maxnum` would lose it.
     def made(code: Code, a: Value, b: Value, **_: Any) -> Value:
         names = {"f": of_floats, "i": signed, "u": unsigned}
         if a.dtype.kind == "b":
@@ -137,7 +137,7 @@ def _sign(code: Code, a: Value, **_: Any) -> Value:
     if a.dtype.kind != "f":
         positive = code.choose(code.compare("icmp sgt", a, zero), one, zero)
         return code.choose(code.compare("icmp slt", a, zero), constant(-1, a.dtype), positive)
-    # Zero and what is not a number are their own sign.
+    # Zero and NaN are their own sign.
     unit = code.intrinsic("copysign", one, a)
     nonzero = code.compare("fcmp one", a, zero)
     return code.choose(nonzero, unit, a)
@@ -148,7 +148,7 @@ def _finite(code: Code, a: Value, **_: Any) -> Value:
 
 
 def _less_in_order(code: Code, a: Value, b: Value, **_: Any) -> Value:
-    """a < b, where what is not a number is greater than all others."""
+    """Return a < b, with NaN greater than all numbers."""
     if a.dtype.kind != "f":
         return OPERATIONS["lt"](code, a, b)
     return code.operation("and", code.compare("fcmp ult", a, b), code.compare("fcmp ord", a, a))
@@ -168,7 +168,7 @@ def _not(code: Code, a: Value, **_: Any) -> Value:
 
 
 def _same_bits(code: Code, a: Value, *, new_dtype: Any, **_: Any) -> Value:
-    """The same bits read as a number of another type."""
+    """Reinterpret the bits as another type."""
     target = np.dtype(new_dtype)
     if target.itemsize != a.dtype.itemsize or "b" in (target.kind, a.dtype.kind):
         raise UnsupportedError(f"the bits of {a.dtype} as {target}")
@@ -193,7 +193,7 @@ def _clamped(code: Code, low: Value, a: Value, high: Value, **_: Any) -> Value:
 
 
 def converted(code: Code, a: Value, *, new_dtype: Any, **_: Any) -> Value:
-    """A number in another type."""
+    """Convert a number to another type."""
     target = np.dtype(new_dtype)
     if target == a.dtype:
         return a
@@ -208,12 +208,12 @@ def converted(code: Code, a: Value, *, new_dtype: Any, **_: Any) -> Value:
     if integer is not None and to == "i" and target.itemsize >= integer.dtype.itemsize:
         return converted(code, integer, new_dtype=target)
     if source == "f":
-        # Saturating, as XLA has it: `fptosi` of a number past the type's range is anything.
+        # Saturate as XLA does, since `fptosi` outside the type's range is undefined.
         return _saturated(code, a, target)
     if to == "f":
         made = code.cast("sitofp" if source == "i" else "uitofp", a, target)
         if source == "i" and a.shared:
-            # The sample's number, which the simulation takes for a time and rounds to an index.
+            # The simulation uses the sample number as a time and rounds it back to an index.
             code.remember_whole(made, a)
         return made
     if source == "b":
@@ -290,4 +290,4 @@ OPERATIONS: dict[str, Operation] = {
     "bitcast_convert_type": _same_bits,
     "convert_element_type": converted,
 }
-"""by the primitive's name; numbers of equal shape, element by element"""
+"""Operations by name of the primitive, applied by element to numbers of equal shape."""

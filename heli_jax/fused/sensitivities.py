@@ -1,4 +1,4 @@
-"""A run that carries its derivatives along, and sums the products of its rows and columns."""
+"""A run that carries its derivatives, and sums products of its rows and columns."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -7,33 +7,34 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-# `Any` below: trees of arrays, of which JAX exports no type.
+# `Any` below: trees of arrays, for which JAX exports no type.
 
 
 class Sensitive(NamedTuple):
-    """Function that is differentiated."""
+    """The function to differentiate."""
 
     run: Callable[[Any], Any]
-    """of the unknowns (q,): a run of one step a sample, as `simulation.accumulate.Steps`"""
+    """run(unknowns (q,)) returns a run with one step a sample, as `simulation.accumulate.Steps`."""
     steps: int
     throughout: Sequence[int]
-    """unknowns that act at every sample"""
+    """Indices of unknowns that act at every sample."""
     at_first: Sequence[int]
-    """unknowns that act on the carry before the first sample alone, which costs less"""
+    """Indices of unknowns that act only on the first carry, which costs less."""
     value: Callable[[Any], Any]
-    """of a carry what was computed at the sample that it left"""
+    """value(carry) returns the values at the sample before the carry."""
     end: Callable[[Any, Any], Any]
-    """of (unknowns, the carry at the last sample) the same of that sample"""
+    """end(unknowns, last carry) returns the values at the last sample."""
     rows: Callable[[Any, Sequence[Any]], Sequence[Sequence[Any]]]
-    """of such a value and of its derivatives, by unknown in the order above: of every row the
-    numbers whose products are summed"""
+    """rows(values, derivatives by unknown in the order above) returns for every row the numbers
+    whose products are summed.
+    """
 
 
 class Products:
-    """Carry and results with derivatives, as `fused.traced.Making` has them.
+    """Carry and results with derivatives, in the form of `fused.traced.Making`.
 
-    The result holds the sums over all samples and rows of v[i] v[j], i >= j, of each row's numbers
-    v, as a triangle row by row.
+    The result has the sums of v[i] v[j], i >= j, over all samples and rows, as a triangle row by
+    row. v are the numbers of a row.
     """
 
     def __init__(self, of: Sensitive, unknowns: Any) -> None:
@@ -42,7 +43,7 @@ class Products:
 
     @property
     def carry(self) -> Any:
-        """Carry, its derivatives, and the sums."""
+        """Return the carry, its derivatives, and the sums."""
         of = self._of
         first, push = jax.linearize(lambda z: of.run(z).carry, self._z)
         tangents = [push(self._unit(j)) for j in (*of.throughout, *of.at_first)]
@@ -58,13 +59,13 @@ class Products:
         return self._of.steps
 
     def step(self, carry: Any, k: Any, /) -> Any:
-        """The carry a sample after the k-th."""
+        """Return the carry one sample after the k-th."""
         of, (now, tangents, sums) = self._of, carry
         after, moved = self._pushed(lambda z, c: of.run(z).step(c, k), now, tangents)
         return after, moved, self._with(sums, of.value(after), [of.value(v) for v in moved])
 
     def last(self, carry: Any, /) -> Any:
-        """The sums with those of the last sample."""
+        """Return the sums with those of the last sample."""
         now, tangents, sums = carry
         return self._with(sums, *self._pushed(self._of.end, now, tangents))
 
@@ -97,7 +98,7 @@ class Products:
 
 
 def full(triangle: np.ndarray) -> np.ndarray:
-    """Symmetric matrices (k, m, m) of their triangles (m (m + 1) / 2, k), row by row."""
+    """Return symmetric matrices (k, m, m) from their triangles (m (m + 1) / 2, k), row by row."""
     count = triangle.shape[0]
     m = int((np.sqrt(8.0 * count + 1.0) - 1.0) / 2.0)
     rows, columns = np.tril_indices(m)

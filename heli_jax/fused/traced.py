@@ -1,4 +1,4 @@
-"""A run of one element, taken apart: what is computed once, and what at every sample."""
+"""The run of one element, split into parts computed once and parts computed at every sample."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -15,22 +15,23 @@ from heli_jax.numerics.hoist import hoisted
 
 
 type Making = Callable[[Any, Any, Any], Any]
-"""of (what all elements share, records (N, ...), what an element has of its own): a
-run as `heli_jax.simulation.accumulate.Steps` has it"""
+"""Function of (shared values, records (N, ...), an element's own values) that returns a run as in
+`heli_jax.simulation.accumulate.Steps`.
+"""
 
 
 class Traced(NamedTuple):
-    """A run as it is translated, with what comes before it."""
+    """A run prepared for translation, with the computations before it."""
 
     run: Run
     results: Any
-    """the structure of what the run gives"""
+    """Tree structure of the results."""
     begin: Any
-    """the jaxpr of (shared, records, element): the carry at first, then what stays"""
+    """Jaxpr of (shared, records, element): the first carry, then the constants."""
 
     @property
     def varies(self) -> tuple[bool, ...]:
-        """Return for each constant whether every element has its own."""
+        """Return a flag for each constant: True if every element has its own."""
         return tuple(not argument.shared for argument in self.run.stays)
 
     def _before(self, *arguments: Any) -> tuple[list[Any], list[Any]]:
@@ -39,12 +40,12 @@ class Traced(NamedTuple):
         return outputs[:n], outputs[n:]
 
     def own(self, shared: Any, records: Any, element: Any) -> tuple[list[Any], list[Any]]:
-        """Return an element's first carry, and its own constants. JAX can trace it."""
+        """Return an element's first carry and its own constants. JAX can trace it."""
         carry, stay = self._before(shared, records, element)
         return carry, [v for v, varying in zip(stay, self.varies, strict=True) if varying]
 
     def common(self, shared: Any, records: Any, element: Any) -> list[Any]:
-        """Return the constants that all elements share, from any of them."""
+        """Return the constants that all elements share, computed from any of them."""
         _, stay = self._before(shared, records, element)
         return [v for v, varying in zip(stay, self.varies, strict=True) if not varying]
 
@@ -59,10 +60,10 @@ class Traced(NamedTuple):
         """Compute the runs of elements.
 
         Args:
-            kernel: of `run`.
-            begun: what `own` gives, with the elements first.
-            common: what `common` gives.
-            records: as they were traced; each element's own have the elements last.
+            kernel: kernel of `run`.
+            begun: result of `own`, with the elements first.
+            common: result of `common`.
+            records: records as traced; those that differ between elements have the elements last.
 
         Returns:
             The results, with the elements last.
@@ -84,10 +85,9 @@ def traced(
     """Trace a run.
 
     Args:
-        records: arrays (N, ...) that are read by the sample.
-        element: an example of what an element has of its own.
-        own_records: of each leaf of the records whether every element has another; none unless
-            given.
+        records: arrays (N, ...) that are read by sample.
+        element: an example of an element's own values.
+        own_records: True for each leaf of the records that differs between elements; default: none.
 
     Raises:
         UnsupportedError: a part of it has no translation.
@@ -110,7 +110,7 @@ def traced(
         of_step, a_step = hoisted(step, own, inputs, carry, sample)
         of_last, the_last = hoisted(last, own, inputs, carry)
         both, n = [*of_step, *of_last], len(of_step)
-        # Traced here, where the values that they stay with are at hand.
+        # Traced here, where the constants' values are available.
         parts["step"] = jax.make_jaxpr(lambda v, *rest: a_step(v[:n], *rest))(
             both, records, carry, sample
         )
@@ -146,7 +146,7 @@ def traced(
 
 
 def _vary(jaxpr: Any, arguments: Sequence[Any]) -> list[bool]:
-    """Return for each result whether it depends on these arguments."""
+    """Return a flag for each result: True if it depends on these arguments."""
     own = set(arguments)
     for equation in jaxpr.eqns:
         # A literal has no hash, and depends on nothing.

@@ -1,9 +1,9 @@
 """Translation of a jaxpr into LLVM, line by line.
 
-Small arrays are taken apart into their elements; long ones, such as the inputs of a record, stay in
-memory, and what is computed of them is computed of the elements that are asked for.
+Small arrays are split into elements. Long ones, such as the inputs of a record, stay in memory, and
+expressions of them are computed only for the elements in use.
 
-What loops carry is kept in registers, one of LLVM's phi nodes each.
+Loop carries stay in registers, each as an LLVM phi node.
 """
 
 import functools
@@ -37,7 +37,7 @@ from heli_jax.fused.code import (
 from heli_jax.fused.operations import OPERATIONS
 
 _UNROLLED = 16
-"""Passes of a loop that are written out, since derivatives ask for what each has computed."""
+"""Most passes of a loop that is unrolled because derivatives need the results of each pass."""
 
 _NESTED = {
     "jit": "jaxpr",
@@ -54,13 +54,13 @@ _NESTED = {
 
 
 def translate(code: Code, jaxpr: Any, consts: Sequence[Any], operands: Sequence[Operand]) -> list:
-    """Write what a jaxpr computes.
+    """Write the translation of a jaxpr.
 
     Returns:
         An operand for each result.
 
     Raises:
-        UnsupportedError: an operation that has no translation.
+        UnsupportedError: an operation without a translation.
     """
     known: dict[Any, Operand] = {}
     for variable, value in zip(jaxpr.constvars, consts, strict=True):
@@ -78,7 +78,7 @@ def translate(code: Code, jaxpr: Any, consts: Sequence[Any], operands: Sequence[
             e.place = e.place or place_of(equation)
             raise
         except Exception as e:
-            # However unforeseen: said with the line of the model where it lies.
+            # Report any error with the line of the model.
             error = UnsupportedError(f"the operation {_named(equation)[0]} here ({said(e)})")
             error.place = place_of(equation)
             raise error from e
@@ -87,17 +87,17 @@ def translate(code: Code, jaxpr: Any, consts: Sequence[Any], operands: Sequence[
 
 
 def _named(equation: Any) -> tuple[str, dict[str, Any]]:
-    """An operation's name and its parameters."""
+    """Return an operation's name and parameters."""
     name, params = equation.primitive.name, equation.params
     if "_prim" not in params:
         return name, params
-    # Such as jnp.searchsorted, of which the primitive is the same for all.
+    # Such as jnp.searchsorted, whose primitive is shared by many operations.
     of = params["_prim"]
     return type(of).__name__, {**getattr(of, "params", {}), **params}
 
 
 def _made_of(of: Any, equation: Any) -> Any:
-    """The jaxpr of the operations that JAX makes one of its own of, such as jnp.ldexp."""
+    """Return the jaxpr of a composite operation of JAX, such as jnp.ldexp."""
     arguments = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in equation.invars]
 
     def expanded(*flat: Any) -> Any:
@@ -121,11 +121,11 @@ def _equation(code: Code, equation: Any, inputs: list[Operand]) -> list[Operand]
     if name == "cond":
         return _branches(code, params, inputs)
     if "callback" in name:
-        # Not even where all is known: Python would be called for a branch that nobody takes.
+        # Refused even for known operands, since Python would be called in branches not taken.
         raise UnsupportedError(f"the operation {name}")
     known = not any(isinstance(v, Stored) or v.dtype == object for v in inputs)
     if known and not (name in OPERATIONS and all(v.shape == () for v in inputs)):
-        # Whatever it is; single numbers LLVM folds as well.
+        # Any operation; LLVM folds single numbers itself.
         return at_compile_time(equation, inputs)
     if name in OPERATIONS:
         dtype = np.dtype(equation.outvars[0].aval.dtype)
@@ -143,7 +143,9 @@ def _equation(code: Code, equation: Any, inputs: list[Operand]) -> list[Operand]
 def _elementwise(
     code: Code, name: str, params: dict[str, Any], inputs: list[Operand], dtype: np.dtype
 ) -> Operand:
-    """Arrays of one shape, single numbers, and arrays with axes of length 1 that are repeated."""
+    """Apply an operation to arrays of one shape, single numbers, and arrays broadcast along axes of
+    length 1.
+    """
     operation = functools.partial(OPERATIONS[name], code, **params)
     shape = np.broadcast_shapes(*(v.shape for v in inputs))
     if any(isinstance(v, Stored) for v in inputs):
@@ -160,7 +162,7 @@ def _elementwise(
 def _repeated(
     own: tuple[int, ...], shape: tuple[int, ...], at: tuple[Value, ...]
 ) -> tuple[Value, ...]:
-    """Return the place in an array that a broadcast shape's place repeats."""
+    """Return the index into an array for an index of its broadcast shape."""
     if not own:
         return ()
     zero = constant(0, INDEX)
@@ -168,7 +170,9 @@ def _repeated(
 
 
 def _branches(code: Code, params: dict[str, Any], inputs: list[Operand]) -> list[Operand]:
-    """cond: each vehicle may take another branch, so all are computed and one result is taken."""
+    """Translate cond: vehicles may take different branches, so all are computed and one result is
+    selected.
+    """
     which, operands, branches = inputs[0], inputs[1:], params["branches"]
     if not isinstance(which, Stored) and which.dtype != object:
         branch = branches[int(np.clip(which, 0, len(branches) - 1))]
@@ -204,13 +208,13 @@ def _counts(params: dict[str, Any]) -> tuple[int, int]:
     """Return the number of a scan's constants and of its carries."""
     if "num_consts" in params:
         return params["num_consts"], params["num_carry"]
-    # From JAX 0.12 on it keeps trees in their place.
+    # JAX 0.12 and later store trees instead.
     consts, carry, _ = params["ft_in"].unpack()
     return len(list(consts)), len(list(carry))
 
 
 def _row(code: Code, operand: Operand, index: Value) -> Operand:
-    """operand[index]"""
+    """Return operand[index]."""
     shape = operand.shape[1:]
     view = Stored(shape, dtype_of(operand), lambda at: at_place(code, operand, (index, *at)))
     return view if int(np.prod(shape)) > MOST else elements(view)
@@ -245,14 +249,14 @@ def loop(
     carry: Sequence[Operand],
     body: Callable[[Value, list[Operand]], list[Operand]],
 ) -> list[Operand]:
-    """A loop that is passed at least once.
+    """Write a loop with at least one pass.
 
     Args:
-        body: of the pass's number (int32) and what is carried, what is carried on.
+        body: function of the pass number (int32) and the carry that returns the next carry.
     """
     starts = [elements(v) for v in carry]
     varies = [_vary(v) for v in starts]
-    # What starts the same for all vehicles may not stay so: tried until nothing changes.
+    # A carry that starts shared may not stay so; repeat until nothing changes.
     while True:
         mark = code.mark()
         results = _tried(code, passes, starts, varies, body)
@@ -264,7 +268,7 @@ def loop(
 
 
 def _vary(values: Elements) -> np.ndarray:
-    """Return for each value whether it differs between vehicles."""
+    """Return a mask of values that differ between vehicles."""
     return applied(lambda v: not v.shared, values).astype(bool)
 
 
@@ -275,7 +279,7 @@ def _tried(
     varies: list[np.ndarray],
     body: Callable[[Value, list[Operand]], list[Operand]],
 ) -> list[Elements]:
-    """The loop, where what is carried differs between vehicles as `varies` says."""
+    """Write the loop; `varies` marks carries that differ between vehicles."""
     before = [
         [code.of(v, not bool(w)) for v, w in zip(s.ravel(), each.ravel(), strict=True)]
         for s, each in zip(starts, varies, strict=True)
@@ -283,7 +287,7 @@ def _tried(
     entry, inside = code.block, code.new_label("loop")
     code.write(f"br label %{inside}")
     code.label(inside)
-    # The phi nodes are written when what comes round is known; their place is kept.
+    # The phi nodes need the values of the next pass, so they are inserted later at this place.
     place = len(code.lines)
     index = Value(code.register(), INDEX, True)
     carried = []
@@ -316,8 +320,8 @@ _INSTALLED = re.compile(r"(?:site|dist)-packages[/\\]([^/\\.]+)")
 def place_of(equation: Any) -> str | None:
     """Return 'at model.py:12' or 'in diffrax'; None if unknown."""
     trace, library = equation.source_info.traceback, None
-    # From the innermost call outwards, until somebody's own function is met. What a function of
-    # JAX's is made of was traced once for all who call it, and knows no caller.
+    # Search from the innermost call outwards for a user's function. JAX traces its own functions
+    # once for all callers, so they have no caller.
     for frame in () if trace is None else trace.frames:
         name = frame.file_name
         if name.startswith(_OURS):

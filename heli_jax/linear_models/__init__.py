@@ -1,5 +1,5 @@
 """Derivative models as files: a linear model from YAML (docs/linear-models.md).
 
-`expression.py` is the arithmetic of an entry, `content.py` checks what a file says,
-`equations.py` makes a Model of it, `read.py` finds the file and remembers what it read.
+`expression.py` has the arithmetic of entries, `content.py` checks a file, `matrices.py` checks its
+matrices, and `read.py` reads files, makes Models and caches them.
 """

@@ -1,6 +1,6 @@
-"""Content of a linear model's file beside its matrices, checked and in SI: `content_of`.
+"""Content of a linear model's file except its matrices, checked and in SI: `content_of`.
 
-Every problem is an InputError of one sentence that begins with the place in the file.
+Every problem is an InputError with one sentence that begins with the place in the file.
 """
 
 import keyword
@@ -19,16 +19,16 @@ _KEYS = (
     "name", "meaning", "states", "inputs", "outputs", "parameters", "A", "B", "C", "D", "E",
     "delays", "axes",
 )  # fmt: skip
-# Names become fields of NamedTuples, which take no leading underscore and no keyword, and stand in
-# expressions, whose grammar knows ASCII alone.
+# Names become fields of NamedTuples, which allow no leading underscore and no keyword. They also
+# appear in expressions, whose grammar is ASCII.
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,39}")
 _TITLE = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.+-]{0,59}")
 _MOST = 100
-"""states, inputs or outputs: dense matrices beyond take minutes to compile"""
+"""Most states, inputs or outputs; larger dense matrices take minutes to compile."""
 _TAKEN = ("seed", "sigma_w", "tau_w")
-"""names that a sweep or a disturbance adds"""
-# The order of the exponents in a Dimension: the base units that `heli_jax.units` has, but for the
-# radian, since an angle counts as a plain number here.
+"""Names that sweeps and disturbances add."""
+# Base units of `heli_jax.units` in the order of a Dimension, without the radian, since an angle is
+# a plain number here.
 BASE_UNITS = ("kg", "m", "s", "A")
 PLAIN: Dimension = (0, 0, 0, 0)
 TIME: Dimension = (0, 0, 1, 0)
@@ -38,9 +38,9 @@ class Signal(NamedTuple):
     """A state, an input or an output."""
 
     si: str
-    """the unit that it has inside"""
+    """Internal unit."""
     scale: float
-    """what takes a number in the file's unit to SI"""
+    """Factor from the file's unit to SI."""
     dimension: Dimension
     meaning: str
 
@@ -49,14 +49,14 @@ class Quantity(NamedTuple):
     """A parameter."""
 
     constant: Constant
-    """value and unit in SI"""
+    """Value and unit in SI."""
     dimension: Dimension
     positive: bool
     meaning: str
 
 
 class Content(NamedTuple):
-    """A file without its matrices, checked."""
+    """A checked file without its matrices."""
 
     name: str
     states: dict[str, Signal]
@@ -68,12 +68,12 @@ class Content(NamedTuple):
 
 
 def content_of(mapping: Mapping[str, Any]) -> Content:
-    """The content of a file from what its YAML holds.
+    """Return the content of a file from its YAML.
 
     Raises:
-        InputError: anything in it is wrong; the sentence begins with the place within the file.
+        InputError: it is wrong; the message begins with the place in the file.
     """
-    # Unknown keys first: a misspelt key is the likeliest reason for one that is missing.
+    # Unknown keys first, since a misspelt key is the most likely reason for a missing one.
     _known(mapping, _KEYS, "")
     for key in ("name", "states", "inputs", "outputs", "parameters", "A"):
         if key not in mapping:
@@ -81,7 +81,7 @@ def content_of(mapping: Mapping[str, Any]) -> Content:
     name = mapping["name"]
     if not isinstance(name, str) or not _TITLE.fullmatch(name):
         raise InputError(f"name: expected a short name such as roll, got {name!r:.60}")
-    # Outputs are not asked for names of their own below: one with a state's name is that state.
+    # Outputs may share names with states, since such an output is that state.
     states, inputs, outputs = (
         {n: _signal(one, f"{key}.{n}") for n, one in _section(mapping, key).items()}
         for key in ("states", "inputs", "outputs")
@@ -109,12 +109,12 @@ def _known(mapping: Mapping[Any, Any], known: Iterable[str], place: str) -> None
 
 
 def _section(mapping: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    """A section of named things, which may not be empty; their names can be names."""
+    """Return a section of named items, which must not be empty; check the names."""
     section = as_mapping(mapping[key], key)
     if not section:
         hint = ": for a free decay name one that does not act, and signals.inputs: {} of the flight"
         raise InputError(f"{key}: empty, expected at least one{hint if key == 'inputs' else ''}")
-    # Parameters make no matrix larger: only what has rows and columns is bounded.
+    # Parameters do not enlarge matrices, so they have no limit.
     if len(section) > _MOST and key != "parameters":
         raise InputError(f"{key}: expected at most {_MOST}, got {len(section)}")
     for name in section:
@@ -123,8 +123,7 @@ def _section(mapping: Mapping[str, Any], key: str) -> Mapping[str, Any]:
                 f"{key}: expected a name of letters, digits and _ that begins with a letter, got "
                 f"{name!r:.60}"
             )
-        # A sweep's axis of such a name could mean either, the model's parameter or the
-        # disturbance's.
+        # A sweep's axis with such a name would be ambiguous.
         if name in _TAKEN:
             raise InputError(f"{key}.{name}: taken by sweeps and disturbances, expected another")
     return section
@@ -137,7 +136,7 @@ def as_mapping(value: Any, place: str) -> Mapping[str, Any]:
 
 
 def _once(sections: Mapping[str, Mapping[str, Any]]) -> None:
-    """One name, one meaning: an expression would be read wrongly otherwise."""
+    """Refuse a name in two sections, which would make expressions ambiguous."""
     seen: dict[str, str] = {}
     for key, section in sections.items():
         for name in section:
@@ -147,8 +146,8 @@ def _once(sections: Mapping[str, Mapping[str, Any]]) -> None:
 
 
 def _signal(entry: Any, place: str) -> Signal:
-    """A state, input or output: its unit, or {unit, meaning}."""
-    # A unit alone is the usual case, and a mapping for it would double the length of a file.
+    """Return a state, input or output from its unit, or from {unit, meaning}."""
+    # A unit alone is the usual form; mappings would double the length of a file.
     entry = {"unit": entry} if isinstance(entry, str) else as_mapping(entry, place)
     _known(entry, ("unit", "meaning"), place)
     si, scale, dimension = _unit(entry, place)
@@ -159,11 +158,11 @@ def _quantity(entry: Any, place: str) -> Quantity:
     entry = as_mapping(entry, place)
     _known(entry, ("value", "unit", "source", "meaning", "positive"), place)
     value = entry.get("value")
-    # In Python true is the number 1, so that it has to be refused by itself, here and below.
+    # Python's true is the number 1, so it is refused explicitly, here and below.
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"{place}.value: expected a number, got {value!r:.40}")
     si, scale, dimension = _unit(entry, place)
-    # Finite in SI too: a large number in a large unit overflows only here.
+    # Checked in SI, since a large number in a large unit overflows only here.
     number = float(value) * scale
     if not math.isfinite(number):
         raise InputError(f"{place}.value: expected a finite number, got {value!r:.40}")
@@ -171,7 +170,7 @@ def _quantity(entry: Any, place: str) -> Quantity:
     if not isinstance(positive, bool):
         raise InputError(f"{place}.positive: expected true or false, got {positive!r:.40}")
     source = _words(entry, "source", place)
-    # Kept in SI, since every result is reported in SI, whatever the file was written in.
+    # Stored in SI, since all results are in SI.
     constant = Constant(number, si, source)
     return Quantity(constant, dimension, positive, _words(entry, "meaning", place))
 
@@ -184,7 +183,7 @@ def _words(mapping: Mapping[str, Any], key: str, place: str) -> str:
 
 
 def _unit(mapping: Mapping[str, Any], place: str) -> tuple[str, float, Dimension]:
-    """The SI unit of the same kind, what takes a number there, and the dimension."""
+    """Return the SI unit of the same kind, the factor to it, and the dimension."""
     unit = mapping.get("unit")
     # YAML reads a bare 1 as a number.
     unit = str(unit) if unit == 1 and not isinstance(unit, bool) else unit
@@ -192,14 +191,14 @@ def _unit(mapping: Mapping[str, Any], place: str) -> tuple[str, float, Dimension
         got = "nothing" if unit is None else f"{unit!r:.40}"
         raise InputError(f"{place}.unit: expected a unit such as rad/s or 1, got {got}")
     try:
-        # The SI unit is made of the exponents and not looked up, so that any unit of the same kind
-        # ends as the same text and can be compared by it.
+        # The SI unit comes from the exponents, so that units of one kind give the same text and can
+        # be compared by it.
         exponents = units.base_of(unit)
         si = units.as_text(exponents)
         scale = units.factor(unit, si)
     except ValueError as e:
         raise InputError(f"{place}.unit: {e}") from e
-    # An angle counts as a plain number here, so rad/s and 1/s are of one dimension.
+    # An angle is a plain number here, so rad/s and 1/s have one dimension.
     return si, scale, tuple(exponents.get(n, 0) for n in BASE_UNITS)
 
 
@@ -218,19 +217,18 @@ def _delays(
                 f"{place}: expected the name of a parameter, got {parameter!r:.40}"
                 f"{nearest(str(parameter), parameters)}"
             )
-        # The sign is left open: a negative delay is allowed where two clocks differ.
+        # Any sign is allowed, since a delay is negative if two clocks differ.
         if parameters[parameter].dimension != TIME:
             raise InputError(
                 f"{place}: expected a parameter in s, got {parameter} in "
                 f"{parameters[parameter].constant.unit}"
             )
         delays.append((name, parameter))
-    # Only states are looked for: without a rate there is nothing to disturb, and without an angle a
-    # mode still has a name.
+    # A disturbance needs a rate among the states; a mode has a name even without an angle.
     return tuple(delays)
 
 
-# Name, states that may be its rate, the state that may be its angle.
+# Axis, states that may be its rate, state that may be its angle.
 _AXES = (
     ("roll", ("p", "dphi"), "phi"),
     ("pitch", ("q", "dtheta"), "theta"),
@@ -242,7 +240,7 @@ _AXES = (
 def _axes(
     mapping: Mapping[str, Any], states: Mapping[str, Signal], inputs: Mapping[str, Signal]
 ) -> tuple[Axis, ...]:
-    """The axes that the file states, else those that the names of its states say."""
+    """Return the axes stated in the file, else those from the names of its states."""
     if "axes" not in mapping:
         return tuple(
             Axis(name, rate, angle if angle in states else None)
@@ -262,8 +260,7 @@ def _axis(
     _known(entry, ("rate", "angle", "stick", "flybar", "flapping"), place)
     if "rate" not in entry:
         raise InputError(f"{place}.rate: missing, expected a state")
-    # All names in one list, so that each of them is checked in the same way and told with its
-    # place.
+    # One list, so that all names are checked in the same way.
     named = [("rate", entry["rate"], states)]
     for key in ("flybar", "flapping"):
         several = entry.get(key, [])

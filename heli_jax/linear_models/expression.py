@@ -1,7 +1,7 @@
-"""The arithmetic that an entry of a matrix may be: `-1/tau_f`, `Bd/tau_f`, `2*(Lb - g)^2`.
+"""Arithmetic expressions for matrix entries: `-1/tau_f`, `Bd/tau_f`, `2*(Lb - g)^2`.
 
-Python's parser makes the tree and evaluates nothing. Sums, products, quotients, signs, whole powers
-of one digit (`^` or `**`), numbers and parameters pass; anything else is refused.
+Python's parser builds the tree without evaluating it. Sums, products, quotients, signs, integer
+powers of one digit (`^` or `**`), numbers and parameters are allowed; all else is refused.
 """
 
 import ast
@@ -15,9 +15,9 @@ from typing import Any
 from heli_jax.errors import nearest
 
 LONGEST = 200
-"""characters of an expression"""
+"""Longest expression [characters]."""
 
-# ASCII alone: Python's names and numbers may be of other scripts.
+# ASCII only, since Python allows names and numbers of other scripts.
 _STRAY = re.compile(r"[^-+*/^()A-Za-z0-9_. \t\n]")
 _NUMBER = re.compile(r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
 _OPERATORS: dict[type, Callable[[Any, Any], Any]] = {
@@ -35,21 +35,21 @@ type Dimension = tuple[int, ...]
 
 
 class ExpressionError(ValueError):
-    """An expression is wrong; the sentence says at which character, from 1."""
+    """Error in an expression; the message gives the character's position, from 1."""
 
 
 def parse(text: str, known: Mapping[str, Any]) -> Node:
-    """The tree of an expression.
+    """Return the tree of an expression.
 
     Args:
         text: the expression, of at most `LONGEST` characters.
 
     Raises:
-        ExpressionError: it is none, or names a parameter that is not known.
+        ExpressionError: it is malformed, or names an unknown parameter.
     """
     if len(text) > LONGEST:
         raise ExpressionError(f"expected at most {LONGEST} characters, got {len(text)}")
-    # In Python `^` is another operator, of another precedence.
+    # In Python `^` is another operator with another precedence.
     begin = len(text) - len(text.lstrip())
     source = re.sub(r"\s", " ", text[begin:]).replace("^", "**")
     places = [i for i, c in enumerate(text) if i >= begin for _ in range(2 if c == "^" else 1)]
@@ -83,7 +83,7 @@ def parse(text: str, known: Mapping[str, Any]) -> Node:
                 check(of)
             case ast.BinOp(left, ast.Pow(), right):
                 check(left)
-                # A free exponent would give the entry a unit that depends on a value.
+                # A variable exponent would give the entry a unit that depends on a value.
                 if _exponent(right) is None:
                     place = places[right.col_offset]
                     raise wrong(place, f"expected a whole power from -9 to 9, got {own:.20}")
@@ -98,7 +98,7 @@ def parse(text: str, known: Mapping[str, Any]) -> Node:
 
 
 def _exponent(node: Node) -> int | None:
-    """A whole number of one digit, with or without a sign; None for anything else."""
+    """Return an integer of one digit, with or without a sign; None for anything else."""
     match node:
         case ast.Constant(value) if type(value) is int and value <= 9:
             return value
@@ -108,10 +108,10 @@ def _exponent(node: Node) -> int | None:
 
 
 def evaluate(node: Node, value: Callable[[str], Any]) -> Any:
-    """The value of an expression.
+    """Return the value of an expression.
 
     Args:
-        value: value(name) of a parameter: a number or a traced scalar.
+        value: function that returns a parameter by name: a number or a traced scalar.
 
     Raises:
         ZeroDivisionError, OverflowError: among plain Python numbers; traced scalars become inf.
@@ -124,23 +124,23 @@ def evaluate(node: Node, value: Callable[[str], Any]) -> Any:
         case ast.UnaryOp(sign, of):
             return -evaluate(of, value) if isinstance(sign, ast.USub) else evaluate(of, value)
         case ast.BinOp(of, ast.Pow(), exponent):
-            # A plain integer: JAX makes products of it, whose derivative is right for a negative
-            # value and at zero.
+            # For an integer power JAX uses products, which have correct derivatives at zero and
+            # below.
             return evaluate(of, value) ** _exponent(exponent)
         case ast.BinOp(left, op, right):
             return _OPERATORS[type(op)](evaluate(left, value), evaluate(right, value))
 
 
 def parameters_of(node: Node) -> frozenset[str]:
-    """The parameters that an expression names."""
+    """Return the names of the parameters in an expression."""
     return frozenset(one.id for one in ast.walk(node) if isinstance(one, ast.Name))
 
 
 def dimension(node: Node, of: Mapping[str, Dimension], plain: Dimension) -> Dimension:
-    """The dimension of an expression.
+    """Return the dimension of an expression.
 
     Raises:
-        ExpressionError: it adds what cannot be added.
+        ExpressionError: it adds terms of different dimensions.
     """
     match node:
         case ast.Name(name):
@@ -156,8 +156,7 @@ def dimension(node: Node, of: Mapping[str, Dimension], plain: Dimension) -> Dime
             if isinstance(op, ast.Mult | ast.Div):
                 combine = operator.add if isinstance(op, ast.Mult) else operator.sub
                 return tuple(map(combine, a, b))
-            # A number in a sum is one without a unit: whether 2 in Lb + 2 is per second nobody
-            # could tell.
+            # A number in a sum has no unit: the 2 in Lb + 2 could not be given one.
             if a != b:
                 sign = "+" if isinstance(op, ast.Add) else "-"
                 raise ExpressionError(

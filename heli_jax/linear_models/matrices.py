@@ -1,4 +1,4 @@
-"""The matrices of a file, entry by entry: names, units and expressions checked."""
+"""Matrices of a file by entry, with checked names, units and expressions."""
 
 import ast
 import math
@@ -15,14 +15,14 @@ from heli_jax.linear_models.expression import Dimension, ExpressionError, Node
 
 
 class Entry(NamedTuple):
-    """One entry of a matrix: `factor` times an expression, in SI."""
+    """A matrix entry: `factor` times an expression, in SI."""
 
     row: str
     column: str
     node: Node
     factor: float
     place: str
-    """where it stands and what it says, for a sentence about it"""
+    """Position and text of the entry, for messages."""
 
 
 class _Unit(NamedTuple):
@@ -30,21 +30,21 @@ class _Unit(NamedTuple):
 
     dimension: Dimension
     scale: float
-    """what takes a number in the file's unit to SI"""
+    """Factor from the file's unit to SI."""
     bare: bool = True
-    """whether a number without a parameter has a meaning there"""
+    """True if a number without a parameter is allowed there."""
 
 
 def matrices_of(mapping: Mapping[str, Any], content: Content) -> dict[str, tuple[Entry, ...]]:
-    """The entries of A, B, C, D and E.
+    """Return the entries of A, B, C, D and E.
 
     Raises:
         InputError: an entry is wrong, or the parameters' values make one infinite.
     """
     matrices = _Matrices(mapping, content).all()
     values = {n: q.constant.value for n, q in content.parameters.items()}
-    # The file's own values have to be possible too: a model that cannot be run at its defaults
-    # would fail at the first use, far from the line that is wrong.
+    # The file's own values are checked here. Otherwise the model would fail at its first use, far
+    # from the wrong line.
     if problem := not_possible(content, matrices, values):
         raise InputError(problem)
     return matrices
@@ -55,14 +55,13 @@ def not_possible(
 ) -> str:
     """Return a sentence on parameters that are impossible; empty if all are possible.
 
-    Those that are positive have to be, every entry has to be a finite number, and E has to have an
-    inverse.
+    Parameters marked positive must be so, every entry must be finite, and E must be invertible.
 
     Args:
-        values: of all parameters, by name [SI].
+        values: values of all parameters, by name [SI].
     """
-    # A sentence is returned and nothing is raised, since who calls knows whether the values are the
-    # file's, a vehicle's or a configuration's, and begins the sentence with that.
+    # The message is returned, since only the caller knows whether the values are the file's, a
+    # vehicle's or a configuration's.
     for name, quantity in content.parameters.items():
         if quantity.positive and not values[name] > 0:
             return f"{name}: expected more than zero (positive: true), got {values[name]:g}"
@@ -75,8 +74,8 @@ def not_possible(
 def _value(entry: Entry, values: Mapping[str, float]) -> float:
     try:
         number = expression.evaluate(entry.node, lambda name: float(values[name]))
-    # Python raises where NumPy gives infinity. NaN stands for both, and every entry that is not
-    # finite is refused by its place.
+    # Python raises where NumPy returns infinity. NaN represents both, and the caller names the
+    # entry.
     except (ZeroDivisionError, OverflowError):
         return math.nan
     return entry.factor * float(number)
@@ -86,27 +85,26 @@ def _not_invertible(
     content: Content, entries: tuple[Entry, ...], values: Mapping[str, float]
 ) -> str:
     names = list(content.states)
-    # As the equations make it: the unit matrix in the rows that the file does not name.
+    # E as in the equations: rows that the file does not name are those of the unit matrix.
     E = np.eye(len(names))
     for row in {entry.row for entry in entries}:
         E[names.index(row)] = 0.0
     for entry in entries:
         E[names.index(entry.row), names.index(entry.column)] = _value(entry, values)
-    # Rows and columns of one size: units must not decide what is singular.
+    # Scale rows and columns, so that units do not affect the rank.
     for axis in (1, 0):
-        # A row of zeros stays one, and is found by the rank, in place of a division of zero by
-        # zero.
+        # A zero row stays zero and lowers the rank, without a division by zero.
         E = E / np.maximum(np.max(np.abs(E), axis=axis, keepdims=True), 1e-300)
     singular = np.linalg.matrix_rank(E) < len(names)
     return "E: has no inverse with the parameters' values" if singular else ""
 
 
 class _Matrices:
-    """The entries of A, B, C, D and E with their units checked and numbers taken to SI.
+    """Entries of A, B, C, D and E, with checked units and in SI.
 
-    A row of A and B is a derivative, so it is in the state's unit per second, times the unit of
-    E's diagonal where E names the row. An entry is in the row's unit over the column's. One that
-    names no parameter is a number in the file's units; any other is in SI by its parameters.
+    A row of A and B is a derivative, in the state's unit per second. If E names the row, it is also
+    multiplied by the unit of E's diagonal. An entry is in the row's unit over the column's. Without
+    a parameter it is a number in the file's units; otherwise its parameters make it SI.
     """
 
     def __init__(self, given: Mapping[str, Any], content: Content) -> None:
@@ -117,13 +115,12 @@ class _Matrices:
             for n, one in {**content.states, **content.inputs}.items()
         }
         self.outputs = {n: _Unit(o.dimension, o.scale) for n, o in content.outputs.items()}
-        # A derivative is per second whatever the file's units: only the state's own has to be taken
-        # to SI.
+        # A derivative is per second in any file, so only the state's unit is converted.
         self.rates = {n: _over(self.columns[n], _Unit(TIME, 1.0)) for n in content.states}
 
     def all(self) -> dict[str, tuple[Entry, ...]]:
         states, inputs, outputs = self.content.states, self.content.inputs, self.content.outputs
-        # E first: its diagonal decides in which unit its rows of A and B are.
+        # E first, since its diagonal sets the units of its rows in A and B.
         matrices = {"E": self.masses()}
         for name, rows, columns in (
             ("A", self.rates, states),
@@ -136,14 +133,13 @@ class _Matrices:
         return matrices
 
     def rows(self, matrix: str, known: Iterable[str], columns: Iterable[str]) -> dict[str, Any]:
-        """A matrix as it is written: by row, by column.
+        """Return a matrix as written, by row and column.
 
         Raises:
-            InputError: a row or a column has another name.
+            InputError: a row or a column has an unknown name.
         """
         by_row = {}
-        # Both names are checked before any entry is read, since an entry's unit is asked of its row
-        # and column.
+        # Check both names before reading an entry, whose unit depends on its row and column.
         kind = "output" if matrix in ("C", "D") else "state"
         for row, entries in as_mapping(self.given.get(matrix, {}), matrix).items():
             if row not in known:
@@ -160,7 +156,7 @@ class _Matrices:
     def matrix(
         self, name: str, rows: Mapping[str, _Unit], columns: Iterable[str]
     ) -> tuple[Entry, ...]:
-        """All entries of a matrix but E.
+        """Return all entries of a matrix other than E.
 
         Raises:
             InputError: a name or an entry is wrong.
@@ -172,11 +168,11 @@ class _Matrices:
         )
 
     def masses(self) -> tuple[Entry, ...]:
-        """E; its diagonal gives its rows their unit."""
+        """Return the entries of E, whose diagonal sets the units of its rows."""
         states, entries = self.content.states, []
         for row, row_entries in self.rows("E", states, states).items():
-            # The diagonal before the others of its row, since it says what the whole row is in: a
-            # mass times an acceleration is a force.
+            # The diagonal comes first, since it sets the unit of the whole row: mass times
+            # acceleration is a force.
             if row in row_entries:
                 node = self.tree(f"E.{row}.{row}", row_entries[row])
                 try:
@@ -185,9 +181,8 @@ class _Matrices:
                     raise InputError(f"E.{row}.{row}: {row_entries[row]!r:.80}: {e}") from e
                 rate = self.rates[row].dimension
                 total = tuple(i + j for i, j in zip(rate, mass, strict=True))
-                # Bare numbers of such a row would be in a unit made of the file's and the
-                # parameter's, which no reader could be sure of. They are refused unless the
-                # diagonal is a plain number.
+                # Plain numbers in such a row would mix the file's and the parameter's units. They
+                # are refused unless the diagonal is a plain number.
                 self.rates[row] = _Unit(total, self.rates[row].scale, total == rate)
             for column, one in row_entries.items():
                 place = f"E.{row}.{column}"
@@ -196,7 +191,7 @@ class _Matrices:
         return tuple(entries)
 
     def tree(self, place: str, source: Any) -> Node:
-        # In Python true is the number 1, and in a matrix it is a slip.
+        # Python's true is the number 1, which in a matrix is a mistake.
         if isinstance(source, bool) or not isinstance(source, int | float | str):
             raise InputError(f"{place}: expected a number or an expression, got {source!r:.40}")
         if isinstance(source, str):
@@ -218,21 +213,20 @@ class _Matrices:
         of: _Unit,
         per: _Unit | None = None,
     ) -> Entry:
-        """One entry, checked.
+        """Return one entry, checked.
 
         Args:
-            source: a number or an expression, as the YAML has it.
-            per: what the column is in; the state or the input itself unless given.
+            source: number or expression from the YAML.
+            per: unit of the column; default: that of the state or input.
 
         Raises:
-            InputError: it is no number or expression, or of another dimension than its place.
+            InputError: it is no number or expression, or has the wrong dimension.
         """
         node = self.tree(place, source)
         said = f"{place}: {source!r:.80}"
         over = self.columns[column] if per is None else per
         expected = _over(of, over)
-        # Numbers alone, 2*9.81 too: only what names a parameter has units that could be checked,
-        # and anything else is in those of the file.
+        # Only parameters have units to check. Plain numbers, also 2*9.81, are in the file's units.
         if not expression.parameters_of(node):
             if not of.bare:
                 raise InputError(
@@ -241,8 +235,7 @@ class _Matrices:
                 )
             return Entry(row, column, node, expected.scale, said)
         try:
-            # Parameters are in SI already, so the entry needs no factor once its dimension is
-            # right.
+            # Parameters are in SI, so the entry needs no factor if its dimension is right.
             dimension = expression.dimension(node, self.dimensions, PLAIN)
         except ExpressionError as e:
             raise InputError(f"{said}: {e}") from e
@@ -255,9 +248,10 @@ class _Matrices:
         return Entry(row, column, node, 1.0, said)
 
     def check_rows(self, states: Mapping[str, Any], outputs: Mapping[str, Signal]) -> None:
-        """Every state needs its derivative, every output its equation or a state of its name."""
-        # A state without a row would stay as it begins without a word. Who means that writes an
-        # empty row.
+        """Refuse states without a derivative, and outputs without an equation or a state of their
+        name.
+        """
+        # A state without a row would silently stay constant. An empty row states that on purpose.
         for name in states:
             if name not in self.given["A"] and name not in self.given.get("B", {}):
                 raise InputError(
@@ -272,8 +266,7 @@ class _Matrices:
                     f"outputs.{name}: expected a row C.{name}, or the name of a state"
                     f"{nearest(name, states)}"
                 )
-            # The dimension and not the unit: an output in degrees of a state in radians is the same
-            # number in SI.
+            # Compare dimensions, since degrees and radians are the same number in SI.
             if states[name].dimension != output.dimension:
                 raise InputError(
                     f"outputs.{name}.unit: expected the kind of the state {name}, in "

@@ -1,4 +1,4 @@
-"""Linear models from files: those that ship, by name, and anyone's own, by path."""
+"""Linear models from files: shipped ones by name, users' own by path."""
 
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping
@@ -21,77 +21,76 @@ from heli_jax.vehicle import Vehicle, vehicle_from_mapping
 from heli_jax.yaml_file import parse_mapping
 
 _LARGEST = 1_000_000
-"""bytes of a file"""
+"""Largest file [bytes]."""
 _ENDINGS = (".yaml", ".yml")
 _REMEMBERED = 256
-"""files that stay one Model each"""
+"""Number of files whose Models are cached."""
 
 
 class LinearModel(NamedTuple):
-    """A file of a linear model, read."""
+    """A linear model read from a file."""
 
     model: Model
     content: Content
     matrices: dict[str, tuple[Entry, ...]]
-    """the entries of A, B, C, D and E"""
+    """Entries of A, B, C, D and E."""
     path: str
 
     def vehicle(self, given: Mapping[str, Any] | None = None, where: str | None = None) -> Vehicle:
-        """The file's own values, some of them replaced.
+        """Return the file's values, with some replaced.
 
         Args:
-            given: what a vehicle file holds: numbers or {value, unit, source} by name; a number
+            given: content of a vehicle file: numbers or {value, unit, source} by name; a number
                 without a unit is in SI.
-            where: what a sentence about it begins with; the file unless given.
+            where: start of messages; default: the file.
 
         Raises:
-            InputError: an unknown name, or a value that cannot be.
+            InputError: an unknown name or an impossible value.
         """
         where = self.path if where is None else where
-        # The file's values are a vehicle by themselves, and what is given replaces some of them.
+        # The file's values form a complete vehicle, and given values replace some.
         own = {n: q.constant for n, q in self.content.parameters.items()}
         replaced = vehicle_from_mapping(given or {}, where, self.model.Params).constants
         constants = {**own, **replaced}
         values = {n: c.value for n, c in constants.items()}
-        # Together and not one by one: whether E has an inverse depends on all of them.
+        # Checked together, since all values determine whether E is invertible.
         if problem := not_possible(self.content, self.matrices, values):
             raise InputError(f"{where}: {problem}")
-        # Read a second time with all values at hand, so that the Params are made in one place with
-        # the units of the record.
+        # Read again with all values, so that Params are made in one place with the record's units.
         entries = {n: {"value": c.value, "unit": c.unit} for n, c in constants.items()}
         params = vehicle_from_mapping(entries, where, self.model.Params).params
         return Vehicle(params, constants, where)
 
 
 def shipped() -> tuple[str, ...]:
-    """The names of the linear models that ship."""
+    """Return the names of the shipped linear models."""
     folder = resources.files("heli_jax.linear_models").joinpath("files")
-    # By the files that are there: a new one ships without a list that has to name it.
+    # Taken from the files, so that a new one needs no entry in a list.
     return tuple(sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".yaml")))
 
 
 def is_shipped(name: str) -> bool:
-    """True if a text is the name of a shipped model, and no path."""
+    """True if a text is the name of a shipped model, not a path."""
     return name in shipped()
 
 
 def linear_model(file: str | Path, folder: str | Path = ".") -> LinearModel:
-    """A linear model from its file: `linear_model("r50-hover")`, `linear_model("mine.yaml")`.
+    """Read a linear model from its file: `linear_model("r50-hover")`, `linear_model("mine.yaml")`.
 
-    The same content gives the same Model again, which `jax.jit` then knows.
+    The same content returns the same Model, which `jax.jit` has already compiled.
 
     Args:
         file: the path of a YAML file (docs/linear-models.md), or the name of a shipped one.
 
     Raises:
-        InputError: there is none, or something in it is wrong.
+        InputError: the file does not exist or is wrong.
     """
     text, path = _text(file, Path(folder))
     return _read(text, path)
 
 
-# By the text and not by the path: a file that was edited is another model, and two copies of one
-# are the same to `jax.jit`.
+# Keyed by text, not path: an edited file is another model, and two copies are the same to
+# `jax.jit`.
 _models: OrderedDict[str, tuple[Model, Content, dict[str, tuple[Entry, ...]]]] = OrderedDict()
 
 
@@ -104,23 +103,22 @@ def _read(text: str, path: str) -> LinearModel:
         except InputError as e:
             raise InputError(f"{path}: {e}") from e
         _models[text] = (model_of(content, matrices), content, matrices)
-        # The oldest goes: a script that writes files in a loop would else keep every model.
+        # Remove the oldest, since a script that writes files in a loop would otherwise keep every
+        # model.
         if len(_models) > _REMEMBERED:
             _models.popitem(last=False)
     return LinearModel(*_models[text], path)
 
 
 def _text(file: str | Path, folder: Path) -> tuple[str, str]:
-    """Return the text of a file, and its name in sentences."""
+    """Return the text of a file, and its name for messages."""
     name = str(file)
-    # A shipped name goes before a file of the same name; a file is always meant by one with its
-    # ending.
+    # A shipped name takes precedence over a file of that name; a file is given with its ending.
     if is_shipped(name):
         own = resources.files("heli_jax.linear_models").joinpath("files", f"{name}.yaml")
         return own.read_text(encoding="utf-8"), name
     path = folder / name
-    # What has no ending of YAML was meant as a name, so the nearest name helps more than the path
-    # that was tried.
+    # Without a YAML ending a name was probably meant, so the nearest name helps more than the path.
     if path.suffix not in _ENDINGS and not path.exists():
         raise InputError(f"unknown linear model {name!r:.80}{nearest(name, shipped())}")
     try:
@@ -130,18 +128,18 @@ def _text(file: str | Path, folder: Path) -> tuple[str, str]:
             raise InputError(f"{e}; did you mean the shipped {path.stem!r}?") from e
         raise
     try:
-        # Editors of Windows begin a file with a mark that would belong to the first key.
+        # Windows editors may add a byte-order mark, which would belong to the first key.
         return data.decode("utf-8-sig"), str(path)
     except UnicodeDecodeError as e:
         raise InputError(f"{path}: is not text, expected a linear model in YAML") from e
 
 
 def model_of(content: Content, matrices: Mapping[str, tuple[Entry, ...]]) -> Model:
-    """The Model of a file; its Params have the file's values as defaults."""
+    """Return the Model of a file; its Params have the file's values as defaults."""
     State = _record("State", content.states)
     Outputs = _record("Outputs", content.outputs)
-    # The records are made once and used for both the functions and the Model: two classes of the
-    # same fields would be different trees to JAX.
+    # Functions and Model share the record classes, since JAX treats two equal classes as different
+    # trees.
     equations = _Equations(dict(matrices), State, Outputs)
     return Model(
         content.name,
@@ -151,7 +149,7 @@ def model_of(content: Content, matrices: Mapping[str, tuple[Entry, ...]]) -> Mod
         State,
         _record("Inputs", content.inputs),
         Outputs,
-        # By this simulations, sweeps and fits take the exact step unless another is asked for.
+        # Simulations, sweeps and fits then use the exact step by default.
         linear=True,
         axes=content.axes,
         delays=content.delays,
@@ -160,9 +158,9 @@ def model_of(content: Content, matrices: Mapping[str, tuple[Entry, ...]]) -> Mod
 
 
 def _record(title: str, signals: Mapping[str, Signal]) -> type:
-    """A class with one scalar a signal, in SI."""
+    """Return a class with one scalar per signal, in SI."""
     fields = [(n, Annotated[Scalar, one.si, one.meaning]) for n, one in signals.items()]
-    # At run time, since what the states are stands in the file; a type checker cannot know them.
+    # Made at run time, since the file defines the states; type checkers cannot know them.
     made: Any = NamedTuple(title, fields)  # type: ignore[misc]
     made.__reduce__ = by_value
     return made
@@ -173,38 +171,35 @@ def _params(content: Content) -> type:
         n: (Annotated[Scalar, q.constant.unit, q.meaning], q.constant.value)
         for n, q in content.parameters.items()
     }
-    # The values are defaults of the record, so that a script makes the Params of the file by
-    # calling it without arguments.
+    # The values are defaults, so that `Params()` gives those of the file.
     return naming.extended(_Nothing, "Params", fields)
 
 
 class _Nothing(NamedTuple):
-    """Parameters of a model that has none."""
+    """Parameters of a model without any."""
 
 
 class _Equations:
     """E x' = A x + B u and y = C x + D u, entry by entry.
 
-    Compared by identity: the same file is read once, so that its model is one to `jax.jit`.
+    Instances compare by identity. A file is read once, so `jax.jit` sees one model.
     """
 
     def __init__(self, matrices: dict[str, tuple[Entry, ...]], State: type, Outputs: type) -> None:
         self.matrices, self.State, self.Outputs = matrices, State, Outputs
 
     def vector_field(self, params: Any, state: Any, inputs: Any) -> Any:
-        """The derivatives of the states, per second."""
-        # Entry by entry: most of a matrix is zero, and a dense product would compute all of it at
-        # every step.
+        """Return the derivatives of the states, per second."""
+        # By entry, since a dense product would also compute the zeros of a matrix at every step.
         rates = self.rows(("A", "B"), naming.names(self.State), params, state, inputs)
-        # Without E the states' derivatives are the rows themselves, and no system has to be solved
-        # at every step.
+        # Without E the rows are the derivatives, and no system is solved.
         if self.matrices["E"]:
             return self.solved(params, rates)
         return self.State(**rates)
 
     def output(self, params: Any, state: Any, inputs: Any) -> Any:
-        """The outputs; one without a row is the state of its name."""
-        # An output with a row is what the row says, even where a state has its name.
+        """Return the outputs; one without a row is the state of its name."""
+        # A row takes precedence over a state of the same name.
         stated = {entry.row for name in ("C", "D") for entry in self.matrices[name]}
         names = naming.names(self.Outputs)
         rows = self.rows(("C", "D"), (n for n in names if n in stated), params, state, inputs)
@@ -213,25 +208,23 @@ class _Equations:
     def rows(
         self, matrices: tuple[str, str], names: Iterable[str], params: Any, state: Any, inputs: Any
     ) -> dict[str, Any]:
-        """The sums of two matrices' rows, the first times the states, the second times the
-        inputs.
-        """
-        # Zeros made of a state have its type and its batch axis.
+        """Return the rows of two matrices' products with states and inputs, summed."""
+        # Zeros computed from a state have its type and batch axis.
         zero = 0.0 * state[0]
         sums = dict.fromkeys(names, zero)
         for matrix, by in zip(matrices, (state, inputs), strict=True):
             for entry in self.matrices[matrix]:
-                # Evaluated at every call, since parameters are what a fit differentiates by.
+                # Evaluated at every call, since a fit differentiates by the parameters.
                 term = _value(entry, params) * getattr(by, entry.column)
                 sums[entry.row] = sums[entry.row] + term
         return sums
 
     def solved(self, params: Any, right: dict[str, Any]) -> Any:
-        """E^-1 times the right-hand side; E is the unit matrix in the rows that it does not
-        name."""
+        """Return E^-1 times the right-hand side; rows that E does not name are those of the unit
+        matrix.
+        """
         names = naming.names(self.State)
-        # A row that the file names is as written there, without a one on its diagonal that nobody
-        # asked for.
+        # A row in the file is taken as written, without an implied one on its diagonal.
         stated = {entry.row for entry in self.matrices["E"]}
         zero = 0.0 * right[names[0]]
         E = {
@@ -242,14 +235,14 @@ class _Equations:
         for entry in self.matrices["E"]:
             E[entry.row, entry.column] = zero + _value(entry, params)
         matrix = jnp.stack([jnp.stack([E[i, j] for j in names]) for i in names])
-        # Solved anew for each set of parameters: a mass may be free, so the inverse cannot be kept.
+        # Solved in every call, since a mass may be a free parameter.
         return naming.unravel(
             self.State, jnp.linalg.solve(matrix, jnp.stack([right[n] for n in names]))
         )
 
 
 def _value(entry: Entry, params: Any) -> Any:
-    """An entry [SI]."""
+    """Return the value of an entry [SI]."""
     number = evaluate(entry.node, lambda name: getattr(params, name))
-    # Entries with parameters are in SI already: their factor is one, and none is traced for them.
+    # Entries with parameters are in SI, so their factor of one is not traced.
     return number if entry.factor == 1.0 else entry.factor * number

@@ -1,5 +1,6 @@
-"""Own code where a library would do, because it is measurably faster where the time goes.
+"""Numerical code of our own that replaces a library because it is measurably faster where it
+matters.
 
-Each file names the benchmark that justifies it; where that no longer shows a gain, the library's
-function takes its place.
+Each file names the benchmark that justifies it. If the gain disappears, use the library's function
+again.
 """

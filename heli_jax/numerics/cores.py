@@ -4,8 +4,8 @@ import os
 
 
 def cores() -> int:
-    """Processor cores that this process may use."""
-    # A batch system may grant a few of the vehicle's cores: cpu_count() would tell all of them.
+    """Return the number of processor cores that this process may use."""
+    # A batch system may grant fewer cores than cpu_count() returns.
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

@@ -1,22 +1,23 @@
-"""Jumps of a sampled signal: sample intervals in which it was held and then stepped."""
+"""Jumps of a sampled signal: intervals in which it was held and then stepped."""
 
 from typing import Any
 
 import numpy as np
 
 _ROUNDING = 1e-9
-"""of the range: smaller moves are rounding"""
+"""Largest move that counts as rounding [fraction of the range]."""
 _COUNT = 1.5
-"""quanta up to which a move is one count of the log, whatever the rounding of either"""
+"""Largest move that counts as one count of the log, after rounding [quanta]."""
 FEW = 10.5
-"""quanta in the whole range, up to which one count is no longer the resolution's"""
+"""Range up to which one count is more than the resolution [quanta]."""
 _QUIET = 0.25 + 1e-6
-"""of a jump: a neighbouring move up to that is none"""
+"""Largest neighbouring move that counts as none [fraction of the jump]."""
 _BESIDE = 8
-"""sample intervals on either side in which jumps have to make up most of the motion"""
+"""Number of intervals on either side in which jumps must make up most of the motion."""
 POWER = 1.5
-"""Moves count by their size to this power: between their sum, which much small noise dominates, and
-their energy, which a single glitch does."""
+"""Exponent of the moves' weights, between 1, where small noise dominates, and 2, where one glitch
+does.
+"""
 
 
 def smallest_move(u: np.ndarray) -> float:
@@ -25,24 +26,23 @@ def smallest_move(u: np.ndarray) -> float:
 
 
 def weights(u: Any, xp: Any = np) -> Any:
-    """Weights (N-1,) of the moves from sample to sample; zero for rounding and single counts.
+    """Return the weights (N-1,) of moves between samples; zero for rounding and single counts.
 
     Args:
         u: samples (N,), finite, in any unit.
         xp: numpy, or jax.numpy for traced samples.
     """
     size, smallest, span = _sizes(u, xp)
-    # One count of a fine log is the resolution's, of a slow motion or of noise.
+    # In a fine log, one count is resolution, slow motion or noise.
     evident = (size > _COUNT * smallest) | (span <= FEW * smallest)
     return xp.where(evident, size / xp.where(span > 0, span, 1.0), 0.0) ** POWER
 
 
 def jumps(u: Any, xp: Any = np) -> Any:
-    """Return the sample intervals (N-1,) that a signal was held in until it jumped.
+    """Return a mask of intervals (N-1,) in which a signal was held until it jumped.
 
-    A jump is a move between two quiet ones: both neighbours are below a quarter of it. Chance makes
-    such moves of noise too, so jumps must also make up most of the motion within eight samples on
-    either side.
+    A jump is a move whose two neighbours are below a quarter of it. Noise has such moves by chance,
+    so jumps must also make up most of the motion within eight samples on either side.
 
     Args:
         u: samples (N,), finite, in any unit.
@@ -77,7 +77,7 @@ def split(u: Any, xp: Any = np) -> tuple[Any, Any]:
 
 
 def _sizes(u: Any, xp: Any) -> tuple[Any, Any, Any]:
-    """Sizes of the moves (N-1,), the smallest of them, and the range."""
+    """Return the sizes of the moves (N-1,), the smallest of them, and the range."""
     size, span = xp.abs(xp.diff(u)), xp.max(u) - xp.min(u)
     size = xp.where(size > _ROUNDING * span, size, 0.0)
     return size, xp.min(xp.where(size > 0, size, xp.inf)), span

@@ -1,65 +1,71 @@
-"""The noise in a signal by its own samples: how much there is, and whether it is white."""
+"""Noise of a signal from its samples: size and whiteness."""
 
 import numpy as np
 
 _FEW_DIFFERENCES = 0.2
-"""third differences of neighbours for each sample, below which they are taken across gaps"""
+"""Third differences per sample below which they are computed across gaps."""
 _WHITE, _INTEGRATED = -0.75, -2.0 / 3.0
-"""autocorrelation at one sample of the third differences of white noise and of its sum"""
+"""Lag-one autocorrelation of third differences of white noise, and of integrated white noise."""
 _SPREAD = 0.45
-"""sd of the first of them times the root of the number of samples (Bartlett's formula)"""
+"""Standard deviation of the first one times the square root of the number of samples (Bartlett's
+formula).
+"""
 _POWER_SPREAD = 2.15
-"""sd of the logarithm of their mean square times the root of the number of samples: the root of
-twice the sum of their squared autocorrelations"""
+"""Standard deviation of the log mean square of third differences, times the square root of the
+number of samples: the root of twice the sum of squared autocorrelations.
+"""
 _FEWEST = 400
-"""third differences that tell the two apart"""
+"""Fewest third differences that distinguish the two."""
 _REPEATED = 0.3
-"""share of samples equal to the one before from which on they are those of a slower sensor"""
+"""Share of repeated samples from which the sensor is slower than the grid."""
 _NO_NOISE = 1e-4
-"""of a signal's sd, below which its noise is that of no sensor"""
+"""Noise level below which there is no sensor noise [fraction of the signal's sd]."""
 _BELOW = 0.999
-"""part of the power of a signal that lies below the frequency that is its highest"""
+"""Share of a signal's power below its highest frequency."""
 _SEEN = 0.9
-"""part of the samples that a spectrum is made of, at least"""
+"""Least share of known samples for a spectrum."""
 
 
 def noise_guess(signal: np.ndarray) -> float:
-    """White measurement noise sd of a smooth signal, from its third differences; NaN is skipped.
+    """Return the sd of white noise on a smooth signal, from third differences; NaN is skipped.
 
-    Third differences of white noise have variance 20 sd^2; what is smooth all but vanishes in
-    them. Robust against the corners of a response (median of absolute values).
+    Third differences of white noise have variance 20 sd^2, and those of a smooth signal almost
+    vanish. The median of absolute values makes it robust against corners of a response.
     """
-    # A gap makes NaN of the differences across it alone: no sample has to be filled in.
+    # Only differences across a gap become NaN, so no sample has to be filled in.
     d, at = _third_differences(signal, 1), np.flatnonzero(np.isfinite(signal))
     d, signal = d[np.isfinite(d)], signal[at]
-    # Where gaps leave few samples in a row, as of a slow sensor on a fast grid, from one sample to
-    # the next wherever they stand.
+    # If gaps leave few consecutive samples, as for a slow sensor on a fast grid, use differences
+    # between known samples.
     if d.size < _FEW_DIFFERENCES * signal.size:
         d = _divided_differences(at.astype(float), signal)
-    # Of three samples and fewer, the signal itself bounds its noise.
+    # With three samples or fewer, the signal itself bounds its noise.
     if not d.size:
         d = signal - np.median(signal)
     guess = _noise_sd(d)
-    # A record without noise: rows divided by zero would be infinite.
+    # A record without noise would lead to division by zero.
     floor = 1e-9 * float(np.sqrt(np.mean(signal**2)))
     return max(guess, floor, 1e-300)
 
 
 def white_part(signal: np.ndarray) -> float:
-    """The sd of the white noise in a signal: what is there at its fastest and at its slowest.
+    """Return the sd of the white noise in a signal: the smaller of its levels at both ends of the
+    spectrum.
 
     Args:
         signal: (N,), NaN where nothing is measured.
     """
-    # Third differences look at the fast end of the spectrum alone, where a swing near the Nyquist
-    # frequency passes for noise. With every other sign turned the ends change places.
+    # Third differences see only high frequencies, where an oscillation near the Nyquist frequency
+    # looks like noise. Alternating signs exchange the ends of the spectrum.
     turned = signal * np.where(np.arange(signal.size) % 2, -1.0, 1.0)
     return min(noise_guess(signal), noise_guess(turned))
 
 
 def _divided_differences(at: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Third divided differences (N - 3,) of samples (N,) at any instants, scaled so that those of
-    white noise have its variance; a parabola has none."""
+    """Return third divided differences (N - 3,) of samples (N,) at any times.
+
+    They are scaled so that white noise keeps its variance; those of a parabola vanish.
+    """
     if y.size < 4:
         return np.zeros(0)
     t, y = (np.lib.stride_tricks.sliding_window_view(x, 4) for x in (at, y))
@@ -69,19 +75,20 @@ def _divided_differences(at: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def wanders(signal: np.ndarray) -> bool:
-    """True if a signal's fastest part is no white noise, as in an angle integrated from a rate.
+    """True if a signal's high frequencies are not white noise, as for an angle integrated from a
+    rate.
 
-    In third differences white noise has an autocorrelation of -3/4 at one sample, white noise that
-    was summed once has -2/3, what was smoothed has more than that. Too few samples tell nothing.
+    Third differences have a lag-one autocorrelation of -3/4 for white noise and -2/3 for integrated
+    white noise; smoothed signals have more. Too few samples give False.
 
     Args:
-        signal: (N,), NaN where nothing is measured. Of values repeated as a slower sensor's are,
-            the first counts.
+        signal: (N,), NaN where nothing is measured. Of repeated values, as from a slower sensor,
+            only the first counts.
     """
     known = signal[np.isfinite(signal)]
     repeated = np.diff(known) == 0.0
-    # A gap makes NaN of the differences across it alone; a sensor slower than the grid leaves none
-    # but those from one of its samples to the next.
+    # Only differences across a gap become NaN. For a sensor slower than the grid, use differences
+    # between its own samples.
     if known.size > 1 and np.mean(repeated) > _REPEATED:
         signal = known[np.r_[True, ~repeated]]
     elif known.size < 0.5 * signal.size:
@@ -90,7 +97,7 @@ def wanders(signal: np.ndarray) -> bool:
     pairs = np.isfinite(d[1:]) & np.isfinite(d[:-1])
     if np.sum(pairs) < _FEWEST:
         return False
-    # Corners of the motion must not outweigh the noise.
+    # Clip, so that corners of the motion do not outweigh the noise.
     d = _without_corners(d, noise_guess(signal))
     first, second = d[:-1][pairs], d[1:][pairs]
     square = 0.5 * float(np.sum(first**2) + np.sum(second**2))
@@ -99,14 +106,13 @@ def wanders(signal: np.ndarray) -> bool:
 
 
 def rises_when_slower(signal: np.ndarray, every: int) -> bool:
-    """True if a signal has more noise below a lower rate than near its own, as noise has behind a
-    low-pass.
+    """True if a signal has more noise at a lower rate than at its own, as after a low-pass.
 
-    White noise has as much in the third differences of every n-th sample as in those of neighbours.
+    White noise has equal third differences of every n-th sample and of neighbours.
 
     Args:
         signal: (N,), NaN where nothing is measured.
-        every: samples from one to the next at the lower rate, at least 2.
+        every: sample distance at the lower rate, at least 2.
     """
     differences = (_third_differences(signal, 1), _third_differences(signal, every))
     fast, slow = (d[np.isfinite(d)] for d in differences)
@@ -118,8 +124,10 @@ def rises_when_slower(signal: np.ndarray, every: int) -> bool:
 
 
 def _third_differences(signal: np.ndarray, every: int) -> np.ndarray:
-    """Return third differences of every so-many-th sample, NaN if one is missing; white noise keeps
-    its sd."""
+    """Return third differences at a distance of `every` samples; NaN if a sample is missing.
+
+    White noise keeps its sd.
+    """
     y = signal
     for _ in range(3):
         y = y[every:] - y[:-every]
@@ -127,13 +135,14 @@ def _third_differences(signal: np.ndarray, every: int) -> np.ndarray:
 
 
 def _noise_sd(d: np.ndarray) -> float:
-    """The sd of normal numbers by the median of their sizes, 0.674 of it, which corners of the
-    motion do not move."""
+    """Return the sd of normal numbers from the median of their sizes, 0.674 sd, which corners of
+    the motion do not affect.
+    """
     return float(np.median(np.abs(d)) / 0.6744897501960817)
 
 
 def _without_corners(d: np.ndarray, sd: float) -> np.ndarray:
-    """Differences clipped at four times their sd."""
+    """Clip differences at four times their sd."""
     return np.clip(d, -4.0 * sd, 4.0 * sd)
 
 
@@ -148,21 +157,21 @@ def without_noise(signal: np.ndarray) -> bool:
 
 
 def highest_frequency(signal: np.ndarray, dt: float) -> float | None:
-    """Below which frequency [Hz] all but a thousandth of a signal's power lies; None where too many
-    samples are missing to say.
+    """Return the frequency [Hz] below which 99.9 % of a signal's power lies; None if too many
+    samples are missing.
 
     Args:
         signal: (N,), NaN where nothing is measured; without noise (`without_noise`).
-        dt: from sample to sample [s].
+        dt: sample time [s].
     """
     seen = np.isfinite(signal)
     if np.mean(seen) < _SEEN:
         return None
-    # A short gap is bridged by a line: of a smooth signal that changes nothing below its band.
+    # A line across a short gap does not change a smooth signal's spectrum below its band.
     at = np.arange(signal.size)
     y = np.interp(at, at[seen], signal[seen])
     y = y - np.polyval(np.polyfit(at, y, 1), at)
-    # Without a window the ends of the record would put power at every frequency.
+    # Without a window the ends of the record would add power at every frequency.
     power = np.abs(np.fft.rfft(np.blackman(y.size) * y)) ** 2
     total = np.cumsum(power)
     at_highest = np.searchsorted(total, _BELOW * total[-1])

@@ -1,4 +1,4 @@
-"""Runs that are reduced to a value while they go on, and never kept: for large batches."""
+"""Runs that are reduced to a value during the simulation and not stored, for large batches."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -38,9 +38,11 @@ class Accumulated(NamedTuple):
 
     value: PyTree
     state: Record
-    """the model's State at the last sample"""
+    """The model's State at the last sample."""
     outside: dict[str, Bool[Array, ""]]
-    """by name of a limit of the model, whether it was left; empty for a model without limits"""
+    """True for each limit of the model that was exceeded, by name; empty for a model without
+    limits.
+    """
     result: dfx.RESULTS
 
 
@@ -53,12 +55,12 @@ def accumulate(
     start: PyTree,
     **keywords: Any,
 ) -> tuple[Any, dfx.RESULTS]:
-    """Reduce a run to a value without keeping it: for large batches.
+    """Reduce a run to a value without storing it, for large batches.
 
     Args:
         flight: a Flight, or the model's Inputs with arrays (N,) and `dt` [s].
-        update: value = update(value, outputs, data at that sample), at every sample.
-        start: the value before the first sample, a pytree of numbers.
+        update: function with value = update(value, outputs, data at that sample), for every sample.
+        start: value before the first sample, a pytree of numbers.
 
     Returns:
         The final value and diffrax's result.
@@ -68,7 +70,7 @@ def accumulate(
 
 
 _NOT_HERE = ("controller", "delay", "max_steps", "key", "feedback", "events")
-"""options of `simulate` that a run which is not kept has not"""
+"""Options of `simulate` that a run without storage does not have."""
 
 
 def accumulated(
@@ -82,22 +84,21 @@ def accumulated(
     limits: bool = False,
     **keywords: Any,
 ) -> Accumulated:
-    """Accumulate as `accumulate` does, with the last state and, if `limits`, whether the model's
-    range was left.
+    """Accumulate as `accumulate` does, and also return the last state and exceeded limits.
 
     Args:
         flight: a Flight, or the model's Inputs with arrays (N,) and `dt` [s].
-        update: value = update(value, outputs, data at that sample), at every sample.
-        start: the value before the first sample, a pytree of numbers.
+        update: function with value = update(value, outputs, data at that sample), for every sample.
+        start: value before the first sample, a pytree of numbers.
         data: a pytree of arrays (N,), such as the measured outputs.
-        limits: whether to look for the ends of the model's range.
+        limits: True to check the limits of the model's range.
         **keywords: `options`, a SimulationOptions, and single fields of it: dt, initial_state,
             solver, substeps, block, adjoint and hold.
 
     Raises:
-        ValueError: as `simulate`; a block below 1, or above 1 for a solver that is not exact; an
-            option that only `simulate` has.
-        TypeError: a keyword that is no option.
+        ValueError: as for `simulate`; a block below 1, or above 1 for a solver that is not exact;
+            an option that only `simulate` has.
+        TypeError: an unknown option.
     """
     options = keywords.pop("options", DEFAULT).changed(keywords)
     reducer, run, x0 = _prepared(model, params, flight, update, limits, options)
@@ -116,9 +117,7 @@ def accumulated(
         dt0=jnp.ones((), dtype),
         y0=steps.carry,
         args=steps.args,
-        saveat=dfx.SaveAt(
-            t1=True
-        ),  # the end alone: what a large batch has no memory for is the rest
+        saveat=dfx.SaveAt(t1=True),  # only the end, since a large batch does not fit in memory
         max_steps=steps.samples - 1,
         adjoint=adjoint,
         throw=False,
@@ -138,14 +137,14 @@ def in_steps(
     limits: bool = False,
     options: SimulationOptions = DEFAULT,
 ) -> "Steps":
-    """Return the steps of `accumulated`, for a loop that the caller makes.
+    """Return the steps of `accumulated`, for the caller's own loop.
 
-    Args and exceptions are those of `accumulated`.
+    Arguments and exceptions are those of `accumulated`.
     """
     reducer, run, x0 = _prepared(model, params, flight, update, limits, options)
     _, args, _, _ = run
     samples = jax.tree.leaves(args.inputs)[0].shape[0]
-    # Fewer samples than a block has make none.
+    # Runs shorter than a block use single samples.
     if 1 < (block := _block(reducer, args, options)) < samples:
         of = blocks(reducer.of, args, block, x0, start, data)
 
@@ -158,31 +157,32 @@ def in_steps(
 
 
 class Steps(NamedTuple):
-    """A run in its steps."""
+    """A run as single steps."""
 
     carry: PyTree
-    """before the first"""
+    """Carry before the first step."""
     steps: int
     step: Callable[[PyTree, Any], PyTree]
-    """of (the carry, k): the carry after the k-th"""
+    """step(carry, k) returns the carry after the k-th step."""
     last: Callable[[PyTree], Accumulated]
-    """what is left of the run, from the carry after the last step, which has not yet counted the
-    samples that no step begins with, one at least"""
+    """Complete the run from the carry after the last step; adds the remaining samples, at least
+    one.
+    """
 
 
 class _Samples(NamedTuple):
-    """A run of one step a sample."""
+    """A run with one step a sample."""
 
     solver: dfx.AbstractSolver
     term: dfx.ODETerm
     args: Any
     carry: PyTree
-    """before the first sample: the State, the value and the limits left"""
+    """State, value and exceeded limits before the first sample."""
     samples: int
     last: Callable[[PyTree], Accumulated]
 
     def step(self, carry: PyTree, k: Int[Array, ""]) -> PyTree:
-        """The carry a sample after the k-th."""
+        """Return the carry one sample after the k-th."""
         t = k.astype(jax.tree.leaves(carry)[0].dtype)
         return self.solver.step(self.term, t, t + 1.0, carry, self.args, None, False)[0]
 
@@ -198,8 +198,8 @@ def _prepared(
     limits: bool,
     options: SimulationOptions,
 ) -> "tuple[_Reducer, _Stepping, Record]":
-    """Return the work at a sample, the step to the next one, and the first State."""
-    # Refused rather than ignored: a run that is not kept cannot show that they did nothing.
+    """Return the reduction at a sample, the step to the next one, and the first State."""
+    # Refused, since without a stored run nobody would see that the options have no effect.
     for name in _NOT_HERE:
         if getattr(options, name) is not getattr(DEFAULT, name):
             raise ValueError(f"accumulate: expected no {name}, which only simulate has")
@@ -212,16 +212,16 @@ def _prepared(
 
 
 def _block(reducer: "_Reducer", args: ZeroOrderHoldArgs, options: SimulationOptions) -> int:
-    """Samples a step.
+    """Return the number of samples a step.
 
     Raises:
-        ValueError: what is asked for cannot be.
+        ValueError: the block is not possible.
     """
     block = options.block
     if block != 1 and (args.discrete is None or block < 1):
         raise ValueError(f"block must be 1, or more with solver='exact', got {block}")
-    # Limits are looked at sample by sample, so they take the way of one step a sample; so do late
-    # inputs, since a block's coefficients know no sample before its first.
+    # Limits are checked at each sample, and delayed inputs need samples before a block. Both take
+    # one step a sample.
     return 1 if reducer.limits is not None or args.delays is not None else block
 
 
@@ -232,7 +232,7 @@ class _Reducer(NamedTuple):
     limits: Callable[[Any, Any, Any], dict[str, Any]] | None
 
     def __call__(self, carried: PyTree, state: Record, inputs: Record, data: PyTree) -> Any:
-        # Once left, the range stays left: a run that came back has been out of it.
+        # A limit that was exceeded stays marked, even if the run comes back.
         value, outside = carried
         of = self.of
         if self.limits is not None:
@@ -244,56 +244,56 @@ class _Reducer(NamedTuple):
 def _by_samples(
     reducer: _Reducer, run: _Stepping, x0: Record, start: PyTree, data: PyTree
 ) -> _Samples:
-    """The run one step a sample."""
+    """Return a run with one step a sample."""
     method, args, term, linear = run
     (model, params, _), inputs = reducer.of, args.inputs
     n = jax.tree.leaves(inputs)[0].shape[0]
     args = args.in_scalars()
-    # What depends on the parameters alone is taken out of the loop over time.
+    # Expressions of the parameters alone are moved out of the loop over time.
     if args.discrete is None:
         values, field = hoisted(model.vector_field, params, x0, at(inputs, 0))
         term = field_term(model, field)
         args = args._replace(params=values)
-    # No limits: an empty record is carried, and costs nothing.
+    # Without limits an empty record is carried, at no cost.
     outside, dtype = {}, jax.tree.leaves(x0)[0].dtype
     check_countable(n, dtype)
     if reducer.limits is not None:
-        # Numbers, since diffrax counts with all that it carries: 1 from where the range is left on.
+        # 1 once a limit is exceeded. diffrax needs numbers, since it computes with the whole state.
         names = reducer.limits(params, x0, at(inputs, 0))
         outside = dict.fromkeys(names, jnp.zeros((), dtype))
 
     def last(carry: PyTree) -> Accumulated:
-        # The solver updates the value before each step, so the last sample is left.
+        # The solver updates the value before each step, so the last sample remains.
         state, carried = carry
         now = acting_at(args, n - 1, linear)
         value, left = reducer(carried, state, now, at(data, n - 1))
         left = {name: v > 0 for name, v in left.items()}
         return Accumulated(value, state, left, dfx.RESULTS.successful)
 
-    # A function of its own: diffrax compares solvers, and a record of tracers has no hash.
+    # A function, since diffrax compares solvers and a record of tracers has no hash.
     solver = Accumulating(method, lambda *now: reducer(*now), linear)
     return _Samples(solver, term, (args, data), (x0, (start, outside)), n, last)
 
 
 class Accumulating(SolverWrapper):
-    """A per-sample solver that carries a running value beside the state.
+    """A per-sample solver that carries a running value with the state.
 
-    y = (state, value); at each sample, before the step, value = update(value, state, held inputs
-    at that sample, k). Nothing else of the trajectory is kept.
+    y = (state, value). At each sample, before the step, value = update(value, state, held inputs at
+    that sample, k). Nothing else of the trajectory is stored.
     """
 
     update: Callable[..., Any] = eqx.field(static=True)
     linear: tuple[bool, ...] = eqx.field(static=True, default=())
-    """of each input whether it moves between samples; () holds all"""
+    """True for each input that moves between samples; () holds all."""
 
     def stepped(
         self, terms: dfx.AbstractTerm, t0: Time, t1: Time, y0: PyTree, args: PyTree
     ) -> Stepped:
-        """The value at a sample, then the step from it."""
+        """Update the value at a sample, then step from it."""
         held, data = args
         state, value = y0
-        # Before the step: the outputs of a sample belong to the state at its beginning. Whoever
-        # runs this has to add the last sample, which no step begins with.
+        # The outputs of a sample belong to the state at its start, so the update comes first. The
+        # caller must add the last sample, which has no step.
         k = sample_index(t0)
         value = self.update(value, state, acting_at(held, k, self.linear), at(data, k))
         state, result = self.solver.stepped(terms, t0, t1, state, held)

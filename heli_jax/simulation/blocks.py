@@ -1,12 +1,12 @@
 """The exact recurrence of a linear model in blocks: m samples a step, the rest by matrix products.
 
-For one record this takes a fraction of the time of a step per sample; for large batches of
-vehicles a step per sample is better, since the products grow with m.
+For one record this is several times faster than a step per sample. For large batches a step per
+sample is better, since the products grow with m.
 
-A run that is reduced while it goes on takes several samples a step likewise: from x[k] the state m
-samples on is A^m x[k] + ..., and each output between follows directly, as C A^j x[k] + ..., with
-coefficients of the vehicle's own. Of four states and one output four samples so take two thirds of
-the products that four steps take, two samples three quarters.
+Reduced runs can also take several samples a step. The state m samples after x[k] is A^m x[k] + ...,
+and each output between is C A^j x[k] + ..., with coefficients of the vehicle. With four states and
+one output, four samples take two thirds of the products of four steps; two samples take three
+quarters.
 """
 
 from collections.abc import Callable
@@ -27,10 +27,10 @@ from heli_jax.simulation.solvers import ZeroOrderHoldArgs, advance, dot
 
 
 def blockwise(args: ZeroOrderHoldArgs, m: int, x0: Record) -> Record:
-    """The states (N,) of a record from x0, cut into blocks of m samples.
+    """Return the states (N,) of a record from x0, computed in blocks of m samples.
 
-    From block to block X[k+1] = A^m X[k] + w[k]; within a block the powers of A take the state at
-    its start, and A^j B the inputs, to all its samples at once, one state variable at a time.
+    Between blocks X[k+1] = A^m X[k] + w[k]. Within a block, powers of A map the first state, and
+    A^j B the inputs, to all samples at once, one state variable at a time.
     """
     assert args.discrete is not None
     if args.discrete.Bn is not None:
@@ -39,22 +39,22 @@ def blockwise(args: ZeroOrderHoldArgs, m: int, x0: Record) -> Record:
         x0 = jax.tree.map(lambda x, a: x - a[0], x0, of_next)
         return jax.tree.map(jnp.add, blockwise(args, m, x0), of_next)
     A, (B, U) = args.discrete.Ad, columns(args)
-    # The last block is filled up with inputs of zero, and what they drive is cut off again.
+    # The last block is padded with zero inputs, and the excess is cut off.
     n, size = U.shape[0], A.shape[0]
     count = -(-n // m)
     U = jnp.pad(U, ((0, count * m - n), (0, 0))).reshape(count, m, -1)
-    # From block to block one step after another, then all samples of all blocks at once: N/m short
-    # steps in place of N, and the rest in matrix products.
+    # N/m short steps between blocks, then all samples of all blocks at once in matrix products.
     powers, Am = _powers(A, m)
     response = powers @ B
     w = jnp.einsum("kjr,jnr->kn", U, response[::-1])
 
     def step(x: Array, w: Array) -> tuple[Array, Array]:
-        # Am x as a sum: a product of a small matrix and a vector calls a routine in every step.
+        # Am x as a sum, since a product of a small matrix and a vector calls a routine in every
+        # step.
         return jnp.sum(Am * x[None, :], axis=1) + w, x
 
     _, starts = jax.lax.scan(step, jnp.stack(jax.tree.leaves(x0)), w)
-    # Sample j of a block has the inputs of the samples i < j behind it, by the response j - 1 - i.
+    # Sample j of a block depends on the inputs of samples i < j, through response j - 1 - i.
     lag = jnp.arange(m)[:, None] - 1 - jnp.arange(m)[None, :]
     kept = (lag >= 0)[:, :, None]
 
@@ -68,11 +68,11 @@ def blockwise(args: ZeroOrderHoldArgs, m: int, x0: Record) -> Record:
 
 
 def columns(args: ZeroOrderHoldArgs) -> tuple[Array, Array]:
-    """B (n, r) and what it multiplies (N, r): the inputs now, those before, and the next ones."""
+    """Return B (n, r) and its multipliers (N, r): the present, previous and next inputs."""
     assert args.discrete is not None
     _, B, before, after = args.discrete
-    # A late or a moving input makes a sample's state depend on two or three samples of it: columns
-    # beside B, for inputs that are shifted by one.
+    # With delayed or moving inputs the next state depends on two or three samples. Each adds
+    # columns to B, for inputs shifted by one.
     if before is None and after is None:
         return B, jnp.stack(jax.tree.leaves(args.inputs), axis=1)
     n = jax.tree.leaves(args.inputs)[0].shape[0]
@@ -83,17 +83,18 @@ def columns(args: ZeroOrderHoldArgs) -> tuple[Array, Array]:
 
 
 def without_next(discrete: Discrete) -> Discrete:
-    """The recurrence without the inputs one sample ahead: linear inputs cost what held ones do.
+    """Return the recurrence without the next inputs, so that linear inputs cost no more than held
+    ones.
 
-    z[k] = x[k] - Bn u[k] turns x[k+1] = Ad x[k] + Bd u[k] + Bn u[k+1] into
-    z[k+1] = Ad z[k] + (Ad Bn + Bd) u[k].
+    z[k] = x[k] - Bn u[k] turns x[k+1] = Ad x[k] + Bd u[k] + Bn u[k+1] into z[k+1] = Ad z[k] + (Ad
+    Bn + Bd) u[k].
     """
     A, B, before, after = discrete
     return Discrete(A, product(A, after) + B, before, None)
 
 
 def _next_sample(args: ZeroOrderHoldArgs, like: Record) -> Any:
-    """Bn u as a State with arrays (N,), built as `like` is."""
+    """Return Bn u as a State with arrays (N,), with the structure of `like`."""
     assert args.discrete is not None
     n = jax.tree.leaves(args.inputs)[0].shape[0]
     U = jnp.stack(jax.tree.leaves(at(args.inputs, jnp.arange(n), args.delays)), axis=1)
@@ -101,7 +102,7 @@ def _next_sample(args: ZeroOrderHoldArgs, like: Record) -> Any:
 
 
 def _powers(A: Array, m: int) -> tuple[Array, Array]:
-    """A^0 ... A^(m-1) and A^m."""
+    """Return A^0 ... A^(m-1), and A^m."""
 
     def step(P: Array, _: None) -> tuple[Array, Array]:
         return product(P, A), P
@@ -110,8 +111,8 @@ def _powers(A: Array, m: int) -> tuple[Array, Array]:
     return powers, top
 
 
-# `Any` below: State, Inputs and Params are the user's own classes; tree structures, of which JAX
-# exports no type; and nested tuples of scalars.
+# `Any` below: State, Inputs and Params are the user's classes, JAX exports no type of tree
+# structures, and scalars are in nested tuples.
 
 
 class Reducing(NamedTuple):
@@ -120,41 +121,40 @@ class Reducing(NamedTuple):
     model: Model
     params: Record
     update: Callable[[Any, Any, Any], Any]
-    """value = update(value, outputs, data at that sample)"""
+    """value = update(value, outputs, data at that sample)."""
 
 
 class _Block(NamedTuple):
     """The exact recurrence over a block of m samples, in nested tuples of scalars.
 
-    Nothing depends on the result before it within a block, so XLA makes one loop over the vehicles
-    of it; written out sample by sample it would compute every sample from the block's first again.
+    Within a block no result depends on the one before, so XLA makes one loop over the vehicles.
+    Written sample by sample, XLA would compute every sample from the block's first again.
     """
 
     free: Any
-    """C A^j, row by row, for j = 1 ... m - 1"""
+    """C A^j, row by row, for j = 1 ... m - 1."""
     forced: Any
-    """what an input of j samples before adds to the outputs, for j = 0 ... m - 1"""
+    """Effect on the outputs of an input j samples before, for j = 0 ... m - 1."""
     onward: Any
-    """A^m"""
+    """A^m."""
     driven: Any
-    """what each sample's inputs add to the state after the block"""
+    """Effect of each sample's inputs on the state after the block."""
     of_next: Any
-    """Bn, for inputs that are linear between samples; else None"""
+    """Bn, for inputs that are linear between samples; else None."""
 
 
 def _block_of(model: Model, args: ZeroOrderHoldArgs, m: int) -> tuple[_Block, Discrete]:
-    """The recurrence over m samples, and that over one."""
+    """Return the recurrence over m samples, and that over one."""
     assert args.discrete is not None
     A, B, _, Bn = discrete = args.discrete
     space = jacobians(model, args.params)
     C, D = space.C.astype(A.dtype), space.D.astype(A.dtype)
     of_next = None if Bn is None else scalars(Bn)
     if Bn is not None:
-        # Inputs that are linear between samples: another state, x - Bn u, has the recurrence of
-        # held ones.
+        # For linear inputs, the state x - Bn u has the recurrence of held inputs.
         discrete, D = without_next(discrete), D + product(C, Bn)
         B = discrete.Bd
-    # C A^j and A^j B for all j in m - 1 products each, in place of powers of A.
+    # C A^j and A^j B take m - 1 products each, without powers of A.
     rows, columns, power = [C], [B], A
     for _ in range(m - 1):
         rows.append(product(rows[-1], A))
@@ -163,7 +163,7 @@ def _block_of(model: Model, args: ZeroOrderHoldArgs, m: int) -> tuple[_Block, Di
     free = [scalars(row) for row in rows[1:]]
     forced = [scalars(D)] + [scalars(product(C, column)) for column in columns[:-1]]
     onward, driven = scalars(power), [scalars(column) for column in reversed(columns)]
-    # Behind a barrier the coefficients are computed once, not for every step that reads them.
+    # The barrier computes the coefficients once, instead of in every step.
     once = jax.lax.optimization_barrier((free, forced, onward, driven, of_next))
     return _Block(*once), discrete
 
@@ -176,26 +176,25 @@ class Blocks(NamedTuple):
     block: _Block
     discrete: Discrete
     inputs: Any
-    """the model's Inputs, arrays (N,)"""
+    """The model's Inputs, arrays (N,)."""
     data: PyTree
     carry: Any
-    """before the first step: the states as the recurrence has them, and the value"""
+    """Values before the first step: states of the recurrence, and the reduced value."""
     structure: Any
-    """of the model's State"""
+    """Tree structure of the model's State."""
 
     @property
     def samples(self) -> int:
-        """N"""
+        """Number of samples N."""
         return jax.tree.leaves(self.inputs)[0].shape[0]
 
     @property
     def steps(self) -> int:
-        """Number of steps; at least one sample is left over, since the last has outputs but no step
-        after it."""
+        """Number of steps. At least one sample remains, since the last has outputs but no step."""
         return (self.samples - 1) // self.m
 
     def step(self, carry: PyTree, k: Int[Array, ""], /) -> PyTree:
-        """The carry after the k-th step."""
+        """Return the carry after the k-th step."""
         rows = [
             jax.tree.map(lambda v, j=j: v[k * self.m + j], (self.inputs, self.data))
             for j in range(self.m)
@@ -203,12 +202,12 @@ class Blocks(NamedTuple):
         return self.over(carry, [jax.tree.leaves(r[0]) for r in rows], [r[1] for r in rows])
 
     def over(self, carry: PyTree, u: list[list[Array]], now: list[Any]) -> PyTree:
-        """The carry after m samples, of which the inputs and the data are given."""
+        """Return the carry after m samples with the given inputs and data."""
         x, value = carry
         value = self._reduced(x, value, u, now)
         new = []
         for i, row in enumerate(self.block.onward):
-            # The states last: their sums wait for those of the step before, the inputs for nothing.
+            # Input terms first, since the states depend on the previous step and the inputs do not.
             driven = [
                 (c, v)
                 for j in range(self.m)
@@ -218,7 +217,7 @@ class Blocks(NamedTuple):
         return new, value
 
     def last(self, carry: PyTree, /) -> tuple[Any, Any]:
-        """The value with the samples that are left, and the State at the last of them."""
+        """Return the value with the remaining samples, and the State at the last of them."""
         x, value = carry
         done = self.steps * self.m
         left = range(done, self.samples)
@@ -233,20 +232,22 @@ class Blocks(NamedTuple):
         return value, _plus(end, self.block.of_next, inputs)
 
     def _reduced(self, x: list[Array], value: Any, u: list[list[Array]], now: list[Any]) -> Any:
-        """The value after all samples of which the data are given, from the states at the first."""
+        """Return the value after all samples with data, from the states at the first."""
         for j, data in enumerate(now):
             value = self.reducing.update(value, self._outputs(x, u, j), data)
         return value
 
     def _outputs(self, x: list[Array], u: list[list[Array]], j: int) -> Any:
-        """The outputs of the j-th sample of a block that begins at x with the inputs u[0..j]."""
+        """Return the outputs of the j-th sample of a block that starts at x with the inputs
+        u[0..j].
+        """
         model, block = self.reducing.model, self.block
-        # The first sample by the model itself: nothing is gained there by the recurrence.
+        # The first sample uses the model itself, where the recurrence saves nothing.
         if j == 0:
             now = jax.tree.unflatten(jax.tree.structure(self.inputs), u[0])
             state = _plus(jax.tree.unflatten(self.structure, x), block.of_next, now)
             return model.output(self.reducing.params, state, now)
-        # y[j] = C A^j x + the inputs of this sample and of those before it in the block.
+        # y[j] = C A^j x + the effect of inputs of this sample and of earlier ones in the block.
         outputs = {}
         for i, name in enumerate(naming.names(model.Outputs)):
             forced = [
@@ -261,7 +262,7 @@ class Blocks(NamedTuple):
 def blocks(
     reducing: Reducing, args: ZeroOrderHoldArgs, m: int, x0: Record, start: PyTree, data: PyTree
 ) -> Blocks:
-    """A run in steps of m samples."""
+    """Return a run in steps of m samples."""
     block, discrete = _block_of(reducing.model, args, m)
     x0 = _plus(x0, block.of_next, at(args.inputs, 0), -1.0)
     carry = jax.tree.leaves(x0), start
@@ -272,9 +273,9 @@ def blocks(
 def of_whole_run(
     reducing: Reducing, args: ZeroOrderHoldArgs, m: int, x0: Record, start: PyTree, data: PyTree
 ) -> tuple[Any, Any]:
-    """The value of a run and its last State, by XLA; arguments as `blocks` has them."""
-    # Unrolled over the m samples, and a loop over the blocks: a block is a few hundred operations,
-    # all of them on vectors over the batch.
+    """Return the value of a run and its last State, by XLA; arguments as for `blocks`."""
+    # Unrolled over m samples, with a loop over blocks. A block is a few hundred operations on
+    # vectors over the batch.
     run = blocks(reducing, args, m, x0, start, data)
 
     def step(carry: PyTree, slices: tuple[list[Array], PyTree]) -> tuple[PyTree, None]:
@@ -291,7 +292,9 @@ def of_whole_run(
 
 
 def _plus(state: Record, rows: Any, inputs: Record, sign: float = 1.0) -> Record:
-    """A State plus (or minus) a matrix, row by row in scalars, times the inputs; None adds none."""
+    """Return a State plus (or minus) a matrix times the inputs, row by row in scalars; None adds
+    nothing.
+    """
     if rows is None:
         return state
     u = jax.tree.leaves(inputs)
@@ -300,7 +303,7 @@ def _plus(state: Record, rows: Any, inputs: Record, sign: float = 1.0) -> Record
 
 
 def _sum(terms: list[tuple[Array, Array]]) -> Array:
-    """Add products from the first to the last."""
+    """Add products in order."""
     total = terms[0][0] * terms[0][1]
     for a, b in terms[1:]:
         total = total + a * b

@@ -1,4 +1,4 @@
-"""Events that end a run: the ground, the limits of the rotor's speed, or anyone's own."""
+"""Events that end a run: the ground, limits of the rotor speed, or a user's own."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -12,22 +12,22 @@ from heli_jax.naming import Record, Scalar
 from heli_jax.simulation.hold import at_end
 
 type Event = Callable[[Any, Any, Any], Any]
-"""event(params, state, inputs) -> a number, above zero while the run goes on"""
+"""event(params, state, inputs) returns a number above zero while the run continues."""
 
 NO_END = (jnp.inf, -1)
-"""time and index of the event of a run that none ended"""
+"""Time and index of the event in a run that no event ended."""
 _BISECTIONS = 40
-"""of a sample: 1e-12 of it, which is below what Hermite's cubic is worth"""
+"""Number of bisections within a sample. 1e-12 of it is below the error of Hermite's cubic."""
 
 
 def ground(height: Scalar = 0.0) -> Event:
-    """The centre of gravity comes down to `height` [m] above the origin."""
+    """Return the event of the centre of gravity reaching `height` [m] above the origin."""
     return lambda params, state, inputs: state.z - height
 
 
 def rotor_speed(lowest: Scalar, highest: Scalar) -> Event:
-    """The rotor's speed leaves the range [rad/s]."""
-    # One number for both ends: it falls to zero where the nearer of the two is reached.
+    """Return the event of the rotor speed leaving a range [rad/s]."""
+    # One number for both limits, which is zero at the nearer of them.
     return lambda params, state, inputs: jnp.minimum(state.Omega - lowest, highest - state.Omega)
 
 
@@ -47,25 +47,24 @@ def stopped(
     inputs: Record,
     linear: tuple[bool, ...] = (),
 ) -> tuple[Any, tuple[Array, Array]]:
-    """The states (N,) with the moment of the first event in place of all that follow it.
+    """Return the states (N,), frozen at the time of the first event.
 
     Args:
-        times: of the samples [s], (N,).
-        states: the model's State, arrays (N,), constant from the first sample past an event.
+        times: sample times (N,) [s].
+        states: the model's State, arrays (N,), constant after the first sample beyond an event.
         inputs: the model's Inputs that acted, arrays (N,).
-        linear: of each input whether it moves within a sample; () holds all.
+        linear: True for each input that moves within a sample; () holds all.
 
     Returns:
-        The states, and the time [s] and the index of the event (`NO_END` where there was none).
-        Their derivatives, of any order and in both modes, count that the moment moves.
+        The states, and the time [s] and index of the event (`NO_END` if there was none). Their
+            derivatives, of any order and in both modes, include the change of the event's time.
     """
 
     def values(state: Record, u: Record) -> Array:
         return jnp.stack([jnp.asarray(event(params, state, u)) for event in events.values()])
 
-    # Which inputs act at the last sample of an interval is those held since its first.
-    # All runs of a batch take this way, also those without an event: nothing here may branch on it,
-    # and the choice is made at the end.
+    # Inputs at the last sample of an interval are those held since its first. All runs of a batch
+    # take this path, also those without an event, and the choice is made at the end.
     over = jnp.any(jax.vmap(values)(states, inputs) <= 0, axis=1)
     n = times.shape[0]
     last = jnp.argmax(over)
@@ -79,14 +78,14 @@ def stopped(
     end = _Interval(x0, x1, f0, f1, u, u1, h, bool(linear))
 
     came = jnp.any(over)
-    # A run that begins beyond an event ends where it begins; one without an event has no moment,
+    # A run that starts beyond an event ends at its start. A run without an event has no event time,
     # and a slope of 1 keeps its derivatives finite.
     found = came & ~over[0]
 
     def left(s: Array) -> Array:
         return jnp.where(found, jnp.min(values(end.state(s), end.inputs(s))), s)
 
-    # Bisection, not Newton: an event is anyone's function, with corners (`rotor_speed` has one).
+    # Bisection instead of Newton, since a user's event may have corners, as `rotor_speed` has.
     def bisected(left: Callable[[Array], Array], start: Array) -> Array:
         def halve(_: Array | int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
             middle = 0.5 * (ends[0] + ends[1])
@@ -96,11 +95,11 @@ def stopped(
         _, s = jax.lax.fori_loop(0, _BISECTIONS, halve, (start, one))
         return jnp.where(found, s, start)
 
-    # The derivatives are those of the implicit function: bisection itself has none.
+    # Derivatives come from the implicit function theorem; bisection has none.
     s = jax.lax.custom_root(left, 0.0 * one, bisected, lambda slope, y: y / slope(one))
-    # At that moment the one that has come is the smallest; the others are still above zero.
+    # At that time the event that occurred has the smallest value; the others are above zero.
     which = jnp.argmin(values(end.state(s), end.inputs(s)))
-    # argmax of no event is 0, so k and s are numbers of no meaning there: `came` chooses.
+    # Without an event, argmax is 0 and k and s are meaningless; `came` selects the result.
     moment = jnp.where(over[0], times[0], times[k] + s * h)
     rest = jnp.where(came, jnp.arange(n) >= last, False)
     frozen = jax.tree.map(lambda v, e: jnp.where(rest, e, v), states, end.state(s))
@@ -108,32 +107,32 @@ def stopped(
 
 
 class _Interval(NamedTuple):
-    """A run between two samples, by the fraction s in [0, 1] of the time between them."""
+    """A run between two samples, by the fraction s in [0, 1] of the interval."""
 
     x0: Record
     x1: Record
-    """the states at both ends"""
+    """States at both ends."""
     f0: Record
     f1: Record
-    """their rates"""
+    """Rates at both ends."""
     u0: Record
     u1: Record
-    """the inputs"""
+    """Inputs at both ends."""
     h: Array
-    """[s]"""
+    """Length of the interval [s]."""
     moving: bool
-    """whether inputs move between the samples"""
+    """True if inputs move between the samples."""
 
     def inputs(self, s: Array) -> Record:
         if not self.moving:
             return self.u0
         return jax.tree.map(lambda a, b: a + s * (b - a), self.u0, self.u1)
 
-    # Hermite's cubic by the rates at both ends: of fourth order in the sample time, as RK4 is, and
-    # no step of a solver has to be made again.
+    # Hermite's cubic from the rates at both ends is of fourth order in the sample time, as RK4 is.
+    # No solver step has to be repeated.
     def state(self, s: Array) -> Record:
         def cubic(a: Array, b: Array, da: Array, db: Array) -> Array:
-            """Between two values with their slopes."""
+            """Interpolate between two values with slopes."""
             rest = 1.0 - s
             ends = rest**2 * (1.0 + 2.0 * s) * a + s**2 * (3.0 - 2.0 * s) * b
             return ends + self.h * s * rest * (rest * da - s * db)

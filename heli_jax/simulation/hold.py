@@ -1,12 +1,12 @@
-"""Inputs between samples: constant (zero-order), on a straight line (linear), or mixed, which stays
-until it jumps and follows straight lines elsewhere.
+"""Inputs between samples: constant (zero-order), on a straight line (linear), or mixed. A mixed
+input is held until it jumps and is linear elsewhere.
 
-A stick that is commanded in steps stays; one that was sampled while it moved does not. To hold such
-an input delays it by half a sample on average.
+A stick that is commanded in steps is constant; one that was sampled while moving is not. Holding
+the latter delays it by half a sample on average.
 
-An input may be late, by one delay of all and one of its own. A delay is whole samples, by which an
-array is read further back, and the rest of a sample, which divides every sample interval in two:
-before and after the sample that falls into it.
+An input may have a common delay and one of its own. Whole samples of a delay shift the index into
+the array. The remainder divides every sample interval in two, at the time when the delayed sample
+acts.
 """
 
 import dataclasses
@@ -29,42 +29,42 @@ from heli_jax.numerics.jumps import split
 
 
 class Delays(eqx.Module):
-    """Delays of the inputs in samples; inputs that are equally late share a group."""
+    """Delays of the inputs in samples; inputs with equal delay share a group."""
 
     groups: tuple[int | None, ...] = eqx.field(static=True)
-    """by input, in the order of its fields; None where an input acts at once"""
+    """Group of each input, in the order of the fields; None for an input without delay."""
     whole: tuple[Array | int, ...]
-    """by group, an integer"""
+    """Whole samples of each group, an integer."""
     rest: tuple[Array | float, ...]
-    """by group, the fraction of a sample in [0, 1) beside it"""
+    """Remaining fraction of a sample of each group, in [0, 1)."""
 
     def group(self, i: int) -> int | None:
-        """The group of the i-th input; what comes behind the inputs (noise) is never late."""
+        """Return the group of the i-th input; columns after the inputs (noise) have no delay."""
         return self.groups[i] if i < len(self.groups) else None
 
     def members(self, group: int | None) -> tuple[int, ...]:
-        """Return which inputs belong to a group."""
+        """Return the indices of the inputs in a group."""
         return tuple(i for i, g in enumerate(self.groups) if g == group)
 
 
 def delays_of(
     model: Model, params: Record, common: "Number | Delays | None", dt: Number
 ) -> Delays | None:
-    """The delays of a model's inputs; None where none is late.
+    """Return the delays of a model's inputs; None if there are none.
 
     Args:
-        model: whose `delays` name the parameters that are delays of single inputs [s].
-        common: None, or the delay of all inputs beside their own [s]; Delays are taken as they
-            are, and a model's own are no longer added.
+        model: model whose `delays` name the parameters that are delays of single inputs [s].
+        common: None, or a delay of all inputs in addition to their own [s]. Delays are used
+            unchanged, without the model's own.
         dt: sample time [s].
     """
     if isinstance(common, Delays):
         return common
-    # None and not zeros: without a delay the program has no second part in each interval.
+    # None instead of zeros, so that the program has no second part in each interval.
     if common is None and not model.delays:
         return None
     own = dict(model.delays)
-    # One group a parameter: inputs that share it are late together, and cost no part more.
+    # One group for each parameter: inputs that share it change together and need no further part.
     keys = [own.get(name) for name in naming.names(model.Inputs)]
     distinct = list(dict.fromkeys(k for k in keys if k is not None or common is not None))
     whole, rest = [], []
@@ -72,15 +72,15 @@ def delays_of(
         seconds = 0.0 if common is None else jnp.asarray(common)
         if key is not None:
             seconds = seconds + jnp.asarray(getattr(params, key))
-        # Both delays of an input add before they are divided: two fractions of a sample may make a
-        # whole one.
+        # The delays of an input are added before the division, since two fractions may make a whole
+        # sample.
         samples = jnp.asarray(seconds) / dt
-        # The whole part has no derivative; the rest has that of the delay.
+        # The whole part has no derivative; the remainder has that of the delay.
         floor = jnp.floor(jax.lax.stop_gradient(samples))
         whole.append(floor.astype(int))
         rest.append(samples - floor)
-    # Which inputs are late is known when the program is made, by how much is not: a fit moves
-    # delays without compiling anew.
+    # Which inputs are delayed is static; the delays are not, so a fit changes them without
+    # compiling.
     groups = tuple(distinct.index(k) if k in distinct else None for k in keys)
     return Delays(groups, tuple(whole), tuple(rest))
 
@@ -90,15 +90,14 @@ def at(
     k: Int[Array, "..."] | Int[np.ndarray, "..."] | int,
     delays: Delays | None = None,
 ) -> PyTree:
-    """The inputs of sample k; before the first the first, after the last the last.
+    """Return the inputs of sample k, clipped to the first and the last sample.
 
     Args:
-        delays: where given, each input is read its whole samples before k.
+        delays: if given, each input is read its whole number of samples before k.
     """
 
     def pick(u: Any, k: Any) -> Any:
-        # Clipped on purpose and in sight: JAX would clip an index past the end, and wrap one below
-        # zero.
+        # Explicit clip: JAX would clip an index beyond the end, but wrap one below zero.
         return u[jnp.clip(k, 0, u.shape[0] - 1)]
 
     if delays is None:
@@ -112,47 +111,47 @@ def at(
 
 
 HOLDS = ("zero-order", "linear", "mixed")
-"""The names of what an input may do between samples."""
+"""Names of the holds of an input between samples."""
 
-# A Flight is a class of flights/, which this part does not import; Inputs are anyone's own.
+# Flight is a class of flights/, which this module does not import; Inputs are the user's.
 FlightOrInputs = Any
-"""a Flight, or a model's Inputs with arrays (N,)"""
+"""A Flight, or a model's Inputs with arrays (N,)."""
 
 type Hold = str | Mapping[str, str] | None
-"""one name for all inputs, or names by input"""
+"""One name for all inputs, or names by input."""
 
 
 class Between(NamedTuple):
-    """A model and its inputs, each of which is held or linear in all sample intervals."""
+    """A model and its inputs, each with one hold (zero-order or linear) throughout."""
 
     model: Model
-    """takes the staircases of mixed inputs as inputs of their own"""
+    """Model that takes the staircases of mixed inputs as separate inputs."""
     inputs: Record
-    """arrays (N,)"""
+    """Inputs with arrays (N,)."""
     linear: tuple[bool, ...]
-    """of each input whether it is linear between samples; () where none is"""
+    """True for each input that is linear between samples; () if none is."""
 
     def merged(self, inputs: Record, model: Model) -> Record:
-        """Return the Inputs of `model`, which this was made of, from those of `self.model`."""
+        """Return the Inputs of `model`, the original, from those of `self.model`."""
         return inputs if self.model is model else _merged(model, inputs)
 
 
 def between_samples(
     model: Model, flight: FlightOrInputs, inputs: Record, hold: Hold = None
 ) -> Between:
-    """Return a model and inputs of which each has one hold throughout.
+    """Return a model and inputs that each have one hold throughout.
 
-    A mixed input is the sum of a staircase of its jumps, which is held, and the rest, which is
-    linear. What takes inputs of either hold takes a mixed one as two.
+    A mixed input becomes two: a staircase of its jumps, which is held, and the rest, which is
+    linear.
 
     Args:
-        flight: a Flight, whose own `hold` counts for what `hold` does not name, or Inputs.
+        flight: a Flight, whose own `hold` applies to inputs not in `hold`, or Inputs.
 
     Raises:
-        ValueError: an unknown name of an input or of a hold.
+        ValueError: an unknown input or hold.
     """
     names = naming.names(model.Inputs)
-    # What is asked for goes before what the Flight says of its log; arrays alone are held.
+    # `hold` takes precedence over the Flight; plain arrays are held.
     of_flight = getattr(flight, "hold", None)
     by_name = {}
     if isinstance(of_flight, dict):
@@ -163,8 +162,7 @@ def between_samples(
         for name in hold:
             if name not in names:
                 raise ValueError(f"hold: {model.name} has no input {name!r}{nearest(name, names)}")
-        # Input by input: what is named goes before the Flight, the others stay as their log has
-        # them.
+        # Input by input: `hold` takes precedence over the Flight.
         by_name |= hold
     for value in by_name.values():
         check_hold(value)
@@ -175,7 +173,7 @@ def between_samples(
         for n in mixed:
             values[_stairs(n)], values[n] = split(values[n], jnp)
         inputs = model.Inputs(**values)
-    # The empty tuple where none moves: the simpler program, with one matrix less in its recurrence.
+    # An empty tuple gives the simpler program, with one matrix less in its recurrence.
     linear = tuple(n in moving for n in naming.names(model.Inputs)) if moving else ()
     return Between(model, inputs, linear)
 
@@ -184,10 +182,10 @@ def _stairs(name: str) -> str:
     return f"stairs_of_{name}"
 
 
-# Cached: a model is static to jit, and a second one of the same kind would be compiled again.
+# Cached, since a model is static to jit and a second equal one would be compiled again.
 @functools.cache
 def _with_stairs(model: Model, mixed: tuple[str, ...]) -> Model:
-    """Return the model with the staircases of mixed inputs as inputs beside the rest of them."""
+    """Return the model with staircases of mixed inputs as additional inputs."""
     annotations = naming.fields(model.Inputs)
     more = {_stairs(n): (annotations[n], None) for n in mixed}
     limits, late = model.limits, dict(model.delays)
@@ -213,30 +211,30 @@ def _merged(model: Model, inputs: Record) -> Record:
 
 
 def check_hold(value: PyTree, where: str = "hold") -> None:
-    """Refuse what is no hold.
+    """Refuse an unknown hold.
 
     Raises:
-        ValueError: naming the holds there are.
+        ValueError: the value is no hold; the message lists them.
     """
     if value not in HOLDS:
         raise ValueError(f"{where}: expected one of {', '.join(HOLDS)}, got {value!r:.60}")
 
 
 def at_end(inputs: Record, k: Int[Array, "..."] | int, linear: tuple[bool, ...]) -> Record:
-    """The inputs at the end of the interval from sample k on, before any of them jumps."""
+    """Return the inputs at the end of the interval after sample k, before any jump."""
     held = at(inputs, k)
     return _chosen(linear, at(inputs, k + 1), held) if linear else held
 
 
 class Segment(NamedTuple):
-    """A part of a sample interval in which every input stays or follows one straight line."""
+    """A part of a sample interval in which every input is constant or follows one straight line."""
 
     length: Array
-    """[s]"""
+    """Length [s]."""
     inputs: Record
-    """at its begin"""
+    """Inputs at its start."""
     slope: Record
-    """of the inputs, per second; zero where they stay"""
+    """Slope of the inputs per second; zero if held."""
 
 
 def segments(
@@ -246,19 +244,19 @@ def segments(
     k: Int[Array, "..."] | int,
     linear: tuple[bool, ...],
 ) -> list[Segment]:
-    """The parts of the interval from sample k (an integer or a whole array of them) to the next.
+    """Return the parts of the interval from sample k (an integer or an array) to the next.
 
     Args:
-        dt: [s].
-        delays: None, or how late the inputs are: the interval then has a part more for each group
-            of them, divided where its sample falls into it.
+        dt: sample time [s].
+        delays: None, or the delays of the inputs. Each group adds a part, divided where its sample
+            acts.
     """
     linear = linear or (False,) * len(jax.tree.leaves(inputs))
     if delays is None:
         now = at(inputs, k)
         return [Segment(jnp.asarray(dt), now, _slope(linear, now, at(inputs, k + 1), dt))]
-    # Three samples: the one that is late by a fraction arrives within the interval, before it the
-    # one before still acts, and a line leads on to the next.
+    # A sample with a fractional delay acts within the interval. Before it the previous sample acts,
+    # and after it a line leads to the next, so three samples are needed.
     before, now, after = (at(inputs, k + i, delays) for i in (-1, 0, 1))
     ends, ranks = _divided(delays)
     parts = []
@@ -284,13 +282,13 @@ def segments(
 
 
 def _divided(delays: Delays) -> tuple[list[Any], list[Any]]:
-    """Return the division points of an interval [samples] with its two ends, and the place of each
-    group among them."""
-    if len(delays.rest) == 1:  # nothing to sort, and nothing that depends on a value
+    """Return the division points of an interval [samples] with its ends, and each group's index
+    among them.
+    """
+    if len(delays.rest) == 1:  # nothing to sort, and nothing depends on a value
         return [0.0, delays.rest[0], 1.0], [0]
     rest = jnp.stack(delays.rest)
-    # Which delay is the shorter is no smooth question; the times between which the parts lie keep
-    # their derivatives.
+    # The order of delays is not smooth; the times between the parts keep their derivatives.
     order = jnp.argsort(jax.lax.stop_gradient(rest))
     inner = rest[order]
     ranks = jnp.argsort(order)
@@ -299,10 +297,11 @@ def _divided(delays: Delays) -> tuple[list[Any], list[Any]]:
 
 
 def _line(delays: Delays, i: int, u: Any, ranks: list[Any], j: int) -> tuple[Any, Any, Any]:
-    """The two corners of the line that the i-th input follows in the j-th part, and when the first
-    of them was reached [samples, from the begin of the interval].
+    """Return both corners of the i-th input's line in the j-th part, and the time of the first
+    corner.
 
-    By the rank and not by the time: two delays may be the same number.
+    The time is in samples from the start of the interval. Parts are found by rank, since two delays
+    may be equal.
     """
     before, now, after = u
     group = delays.group(i)
@@ -320,7 +319,8 @@ def _line(delays: Delays, i: int, u: Any, ranks: list[Any], j: int) -> tuple[Any
 
 
 def _slope(linear: tuple[bool, ...], first: Record, second: Record, dt: Number) -> Record:
-    # Over the whole sample time also where a part is shorter: the line is that between two samples.
+    # Divide by the whole sample time even for a shorter part, since the line is between two
+    # samples.
     slopes = jax.tree.map(lambda a, b: (b - a) / dt, first, second)
     return _chosen(linear, slopes, jax.tree.map(jnp.zeros_like, first))
 
@@ -328,7 +328,7 @@ def _slope(linear: tuple[bool, ...], first: Record, second: Record, dt: Number) 
 def delayed(
     inputs: Record, delays: Delays, k: Int[Array, "..."] | int, linear: tuple[bool, ...]
 ) -> Record:
-    """The inputs that act at sample k (an integer or an array of them) when they are late."""
+    """Return the acting inputs at sample k (an integer or an array) with delays."""
     before, now = at(inputs, k - 1, delays), at(inputs, k, delays)
     acting = []
     leaves = zip(jax.tree.leaves(before), jax.tree.leaves(now), strict=True)
@@ -339,15 +339,15 @@ def delayed(
             continue
         rest = delays.rest[group]
         if linear and linear[i]:
-            # On the line between the two samples, `rest` short of the second.
+            # Point on the line between the two samples, `rest` before the second.
             acting.append(rest * earlier + (1.0 - rest) * current)
         else:
-            # One that is late by a part of a sample has not arrived at the sample itself.
+            # A sample with a fractional delay does not act yet at the sample itself.
             acting.append(jnp.where(rest > 0, earlier, current))
     return jax.tree.unflatten(jax.tree.structure(inputs), acting)
 
 
 def _chosen(linear: tuple[bool, ...], moving: Record, held: Record) -> Record:
-    """The moving ones of the inputs that are linear, the held ones of the others."""
+    """Return the `moving` values of linear inputs, and the `held` values of the others."""
     leaves = zip(linear, jax.tree.leaves(moving), jax.tree.leaves(held), strict=True)
     return jax.tree.unflatten(jax.tree.structure(held), [a if is_ else b for is_, a, b in leaves])

@@ -1,4 +1,4 @@
-"""Stick inputs to excite a vehicle with; each function gives (N,) samples of unit amplitude."""
+"""Stick inputs for excitation; each function returns (N,) samples of unit amplitude."""
 
 import numpy as np
 
@@ -6,13 +6,14 @@ import numpy as np
 def random_steps(
     n: int, dt: float, rng: np.random.Generator, hold: tuple[float, float]
 ) -> np.ndarray:
-    """Pilot-like steps: levels uniform in [-1, 1], each held for a uniform time in `hold` [s].
+    """Return pilot-like steps: levels uniform in [-1, 1], each held for a uniform time in `hold`
+    [s].
 
     Args:
-        dt: [s].
-        hold: the shortest and the longest time [s].
+        dt: sample time [s].
+        hold: shortest and longest time [s].
     """
-    # Uneven times, since steps at a fixed interval leave gaps in the spectrum.
+    # Random times, since steps at a fixed interval leave gaps in the spectrum.
     u = np.empty(n)
     k = 0
     while k < n:
@@ -25,16 +26,16 @@ def random_steps(
 def multistep_3211(
     n: int, dt: float, rng: np.random.Generator, unit: float, pause: float
 ) -> np.ndarray:
-    """3-2-1-1 steps, in either direction, with neutral between.
+    """Return 3-2-1-1 steps in random directions, with neutral pauses.
 
     Args:
-        dt: [s].
+        dt: sample time [s].
         unit: length of the shortest step [s].
-        pause: of neutral between two of them [s].
+        pause: neutral time between two of them [s].
     """
-    # In either direction, so that a vehicle without stability does not wander off to one side.
+    # Random directions keep a vehicle without stability from drifting to one side.
     u = np.zeros(n)
-    # Whole samples, one at least: a unit below the sample time would leave steps of no length.
+    # At least one sample, since a unit below the sample time would give steps of zero length.
     step, rest = max(1, round(unit / dt)), max(1, round(pause / dt))
     k = rest
     while k < n:
@@ -47,15 +48,15 @@ def multistep_3211(
 
 
 def chirp(n: int, dt: float, low: float, high: float) -> np.ndarray:
-    """A sine whose frequency rises exponentially over the record.
+    """Return a sine whose frequency rises exponentially over the record.
 
     Args:
-        dt: [s].
+        dt: sample time [s].
         low: first frequency [Hz].
         high: last frequency [Hz].
     """
-    # Exponentially: each octave gets the same time, and so the low end its few long periods. The
-    # phase is the integral of the frequency; sin(2 pi f(t) t) would run past `high`.
+    # Each octave takes the same time, so the low end has a few long periods. The phase is the
+    # integral of the frequency; sin(2 pi f(t) t) would exceed `high`.
     t = np.arange(n) * dt
     growth = np.log(high / low) / max(t[-1], dt)
     return np.sin(2.0 * np.pi * low * np.expm1(growth * t) / growth)

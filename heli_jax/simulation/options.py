@@ -13,56 +13,62 @@ from heli_jax.simulation.hold import Hold
 
 
 class SimulationOptions(NamedTuple):
-    """Options of `simulate` and `accumulate`; each field is also a keyword of theirs."""
+    """Options of `simulate` and `accumulate`; each field is also a keyword of both."""
 
-    # Any, as a number that is never None once a run has begun: the Flight has one, or it is
-    # refused.
+    # Any: a number that is never None during a run, since the Flight has one or it is refused.
     dt: Any = None
-    """sample time [s]; that of the Flight unless given"""
+    """Sample time [s]; default: that of the Flight."""
     initial_state: Record | None = None
-    """the model's State at the first sample; `model.initial_state` unless given"""
+    """The model's State at the first sample; default: `model.initial_state`."""
     solver: str | dfx.AbstractSolver | None = None
-    """"exact" (linear models, the default there), "rk4" (the default elsewhere), or any diffrax
-    solver"""
+    """"exact" (default for linear models), "rk4" (default for others), or any diffrax solver."""
     substeps: int = 4
-    """steps per sample of a fixed-step solver"""
+    """Steps per sample of a fixed-step solver."""
     controller: dfx.AbstractStepSizeController | None = None
-    """a diffrax step-size controller makes the steps adaptive, with Dopri8 unless another solver
-    is given; they end at every sample"""
+    """diffrax step-size controller for adaptive steps, which end at every sample. The default
+    solver is then Dopri8.
+    """
     delay: Number | None = None
-    """the inputs act this much later (+) or earlier (-) than given [s]; differentiable. Before the
-    first sample its value holds, after the last the last one's"""
+    """Delay of the inputs [s], differentiable; negative values advance them. Beyond the record the
+    first or last value is held.
+    """
     adjoint: dfx.AbstractAdjoint | None = None
-    """`diffrax.DirectAdjoint()` unless given: forward and reverse mode both work. `ForwardMode()`
-    compiles faster, `RecursiveCheckpointAdjoint()` saves memory in reverse mode"""
+    """Default: `diffrax.DirectAdjoint()`, for forward and reverse mode. `ForwardMode()` compiles
+    faster, `RecursiveCheckpointAdjoint()` saves memory in reverse mode.
+    """
     max_steps: int = 4096
-    """bound on adaptive steps a sample; where it ends a run, `result` says so"""
+    """Limit of adaptive steps per sample; `result` shows if it was reached."""
     key: Array | None = None
-    """a JAX random key: the model's process noise is drawn with it, by the discrete process noise
-    of a sample: exact for linear models with solver "exact", of the model linearised at each sample
-    for others with fixed steps; without it there is none"""
+    """JAX random key for the model's process noise; without it there is none.
+
+    Noise has the discrete covariance of a sample. This is exact for linear models with solver
+    "exact"; other models are linearised at each sample, with fixed steps.
+    """
     block: int = 1
-    """samples per step of solver "exact". A single record: 32 is three times as fast as 1; large
-    batches: 1 is best for `simulate`, 4 for `accumulate` (64 side by side on a CPU)"""
+    """Samples per step of solver "exact". For a single record 32 is three times as fast as 1. For
+    large batches 1 is best for `simulate`, 4 for `accumulate` (64 side by side on a CPU).
+    """
     feedback: Callable[[Any, Any], Any] | None = None
-    """feedback(state, inputs) -> Inputs that act, once a sample; `inputs` are the given ones at
-    that sample (references, or what is added)"""
+    """feedback(state, inputs) returns the acting Inputs, once a sample. `inputs` are those given
+    for that sample (references, or additions).
+    """
     events: Mapping[str, Event] | None = None
-    """by name, event(params, state, inputs) -> a number that is above zero while the run goes on
-    (see `heli_jax.simulation.events`). The first to fall to zero or below ends the run: from there
-    on the state stays as it was at that moment"""
+    """Events by name: event(params, state, inputs) returns a number above zero while the run
+    continues (see `heli_jax.simulation.events`). The first to reach zero ends the run, and the
+    state is frozen from that time.
+    """
     hold: Hold = None
-    """what the inputs do between samples: "zero-order" (each sample stays until the next) or
-    "linear" (straight lines), for all or by input. Unless given, as the Flight says; given as
-    arrays they stay"""
+    """Hold of the inputs between samples: "zero-order" (constant until the next sample) or "linear"
+    (straight lines), for all or by input. Default: that of the Flight; plain arrays are held.
+    """
 
     def changed(self, keywords: Mapping[str, Any]) -> "SimulationOptions":
-        """These options with some fields given as keywords.
+        """Return the options with some fields changed by keywords.
 
         Raises:
-            TypeError: a keyword that is no field.
+            TypeError: an unknown field.
         """
-        # `_replace` refuses an unknown field too, without saying which one was meant.
+        # `_replace` also refuses an unknown field, but suggests no name.
         for name in keywords:
             if name not in self._fields:
                 raise TypeError(

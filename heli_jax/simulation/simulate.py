@@ -1,8 +1,8 @@
-"""simulate: a model, its parameters and inputs in; the trajectory out.
+"""simulate: compute the trajectory of a model from its parameters and inputs.
 
-Feedback, events and process noise are solvers around the one of a sample: each does one thing at a
-sample and leaves the step to the solver within. Process noise is drawn once a sample, with the
-covariance that a sample adds.
+Feedback, events and process noise are solvers that wrap the solver of one sample. Each acts once a
+sample and leaves the step to the inner solver. Process noise is drawn once a sample, with the
+covariance of a whole sample.
 """
 
 import functools
@@ -39,23 +39,25 @@ from heli_jax.simulation.stepping import check_countable, held_inputs, per_sampl
 from heli_jax.simulation.trajectory import Trajectory
 
 _LONGEST_STEP = 0.005
-"""of a fixed-step solver [s]: the flapping of a flybar, once a turn, is the fastest motion"""
+"""Longest step of a fixed-step solver [s]. Flapping of a flybar, once a turn, is the fastest
+motion.
+"""
 
 _OF_FASTEST = 1.4
-"""longest step times the rate of the fastest filter"""
+"""Longest step times the rate of the fastest filter."""
 
 
 def substeps_for(dt: float, fastest: float = 0.0) -> int:
-    """Steps of a fixed-step solver in a sample of dt [s]: four, and more in samples over 20 ms.
+    """Return the number of fixed steps in a sample of dt [s]: four, and more if dt exceeds 20 ms.
 
     Args:
-        dt: [s].
+        dt: sample time [s].
         fastest: rate of the fastest filter around the model [rad/s], `Model.fastest`.
     """
-    # RK4 needs four in 20 ms for 1e-6 with the first-order bar; a flybar by eq. 12 turns with
-    # Omega. 1e-9: a dt of 0.02 must not become five steps by a rounding error.
-    # RK4 diverges beyond 2.8 of the reciprocal of a rate; at 1.4 it is off by a twentieth in what
-    # a filter forgets within that step anyway.
+    # With the first-order bar, RK4 needs four steps in 20 ms for an error of 1e-6; a flybar by eq.
+    # 12 turns with Omega. The 1e-9 keeps rounding from giving five steps at a dt of 0.02. RK4
+    # diverges beyond 2.8 over the fastest rate. At 1.4 its error is 5 % of what a filter forgets in
+    # that step.
     longest = min(_LONGEST_STEP, _OF_FASTEST / fastest) if fastest > 0 else _LONGEST_STEP
     return max(4, math.ceil(dt / longest - 1e-9))
 
@@ -68,24 +70,24 @@ def simulate(
     options: SimulationOptions = DEFAULT,
     **keywords: Any,
 ) -> Trajectory:
-    """Simulate one vehicle; each input is held until the next sample, or linear between the two.
+    """Simulate one vehicle; each input is held until the next sample, or linear between samples.
 
     Args:
-        model: of one vehicle; `jax.vmap` over the other arguments simulates many.
+        model: model of one vehicle; `jax.vmap` over the other arguments simulates many.
         flight: a Flight, or the model's Inputs with arrays (N,) and `dt` [s].
-        **keywords: fields of SimulationOptions, in place of those of `options`: `dt`, `solver`,
+        **keywords: fields of SimulationOptions, which override those of `options`: `dt`, `solver`,
             `initial_state`, `delay`, `key`, `hold`, ...
 
     Returns:
-        A Trajectory; a failed integration is in its `status`, never an exception.
+        A Trajectory; a failed integration sets its `status` and raises nothing.
 
     Raises:
-        ValueError: "exact" for a model that is not linear, an unknown solver, wrong shapes, a key
-            for a model without noise or with adaptive steps, feedback with a delay or with a
-            linear hold, or an unknown hold.
-        TypeError: a keyword that is no option.
+        ValueError: "exact" for a nonlinear model, an unknown solver, wrong shapes, a key for a
+            model without noise or with adaptive steps, feedback with a delay or with a linear hold,
+            or an unknown hold.
+        TypeError: an unknown option.
     """
-    # dt belongs to the Flight unless it is given: from here on `options` has it.
+    # The Flight has dt unless it is given. From here on it is in `options`.
     options = options.changed(keywords)
     given = model
     inputs, dt = held_inputs(model, flight, options.dt)
@@ -106,7 +108,8 @@ def simulate(
     end = NO_END
     if options.events:
         states, end = stopped(model, params, options.events, times, states, acting, linear)
-    # After the run, all samples side by side: outputs and limits feed nothing back into it.
+    # Computed after the run for all samples at once, since outputs and limits do not affect the
+    # run.
     outputs = jax.vmap(lambda x, u: model.output(params, x, u))(states, acting)
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(states)]))
     outside = {}
@@ -124,23 +127,23 @@ def _method_with_extras(
     options: SimulationOptions,
     linear: tuple[bool, ...],
 ) -> tuple[dfx.AbstractSolver, ZeroOrderHoldArgs, dfx.ODETerm]:
-    """The solver of a run with what `simulate` alone has: feedback and process noise."""
+    """Return the solver of a run with the extras of `simulate`: feedback and process noise."""
     method, args, term = per_sample(model, params, inputs, options, linear)
     if isinstance(method, Adaptive) and options.key is not None:
-        # A step of the controller's choice would have noise of another covariance.
+        # A step of the controller would need noise of another covariance.
         raise ValueError("key: expected fixed steps to draw noise with, got a step-size controller")
     if options.feedback is not None:
         _check_feedback(args.delays, linear)
         method = StateFeedback(method, options.feedback)
-    # Around the feedback, not within: the noise comes after the step that the feedback drove.
+    # Noise wraps the feedback, since it is added after the step that the feedback drove.
     if options.key is not None:
         method, args = with_process_noise(model, args, method, options, linear)
     return method, args, term
 
 
 def _check_feedback(delays: Delays | None, linear: tuple[bool, ...]) -> None:
-    # Feedback is a function of the state at the sample and is held from there: a late input, or one
-    # on its way to the next sample's, would need a state that is not there yet.
+    # Feedback uses the state at the sample and is then held. A delayed or linear input would need a
+    # later state.
     if delays is not None:
         raise ValueError("feedback: expected a run without a delay, got one with delay")
     if linear:
@@ -157,8 +160,8 @@ def _states(
     options: SimulationOptions,
     linear: tuple[bool, ...],
 ) -> tuple[Any, dfx.RESULTS]:
-    """The states (N,), and what diffrax says of the integration."""
-    # Blocks know no events and no feedback: nobody looks at the state between their ends.
+    """Return the states (N,), and diffrax's result."""
+    # Blocks have no states between their ends, so events and feedback are impossible.
     method, args, term = run
     if options.block != 1:
         _require_blocks(method, options.block, options.events)
@@ -168,7 +171,7 @@ def _states(
     if not options.events:
         return _stepwise(method, args, term, x0, adjoint)
     over = functools.partial(any_over, options.events, args.params)
-    # A number, since diffrax counts with all that it carries: 1 while the run goes on.
+    # 1 while the run continues. diffrax needs a number, since it computes with the whole state.
     going = 1.0 - over(x0, at(inputs, 0)).astype(jax.tree.leaves(x0)[0].dtype)
     (states, _), result = _stepwise(
         Stopping(method, over, linear), args, term, (x0, going), adjoint
@@ -183,8 +186,8 @@ def _acting(
     delays: Delays | None,
     linear: tuple[bool, ...],
 ) -> Any:
-    """The inputs (N,) as they acted: late, or with the feedback's part."""
-    # Computed again from the states, which is cheaper than to carry them through the loop.
+    """Return the inputs (N,) as they acted: delayed, or with feedback added."""
+    # Computing them again from the states is cheaper than carrying them through the loop.
     if options.feedback is not None:
         return jax.vmap(options.feedback)(states, inputs)
     if delays is None:
@@ -193,8 +196,8 @@ def _acting(
 
 
 def _times(inputs: Record, dt: Number) -> Float[Array, " N"]:
-    """The samples' times from 0 [s], in the type of dt."""
-    # k dt, not a running sum of dt: the last of 1e6 samples is at the right time.
+    """Return the sample times from 0 [s], in the type of dt."""
+    # k dt is exact at the last of 1e6 samples; a running sum of dt is not.
     step = jnp.asarray(dt, jnp.result_type(dt) if hasattr(dt, "dtype") else float)
     return jnp.arange(jax.tree.leaves(inputs)[0].shape[0], dtype=step.dtype) * step
 
@@ -210,8 +213,8 @@ def _require_blocks(
         )
 
 
-# Steps of 1 from 0 to n - 1: the same program for every sample time, and no rounding of times
-# decides on the number of steps.
+# Steps of 1 from 0 to n - 1. One program serves every sample time, and rounding of times cannot
+# change the number of steps.
 def _stepwise(
     method: dfx.AbstractSolver,
     args: ZeroOrderHoldArgs,
@@ -219,7 +222,7 @@ def _stepwise(
     x0: Record,
     adjoint: dfx.AbstractAdjoint,
 ) -> tuple[Any, dfx.RESULTS]:
-    """The states from x0 on, one step a sample: time is counted in samples."""
+    """Return the states from x0, one step a sample; time is counted in samples."""
     n = jax.tree.leaves(args.inputs)[0].shape[0]
     dtype = jax.tree.leaves(x0)[0].dtype
     check_countable(n, dtype)
@@ -234,7 +237,7 @@ def _stepwise(
         saveat=dfx.SaveAt(t0=True, steps=True),
         max_steps=n - 1,
         adjoint=adjoint,
-        throw=False,  # one run of a batch that fails must not end the others
+        throw=False,  # a failing run must not stop a batch
     )
     return sol.ys, sol.result
 
@@ -246,7 +249,7 @@ def with_process_noise(
     options: SimulationOptions,
     linear: tuple[bool, ...],
 ) -> tuple[dfx.AbstractSolver, ZeroOrderHoldArgs]:
-    """Standard normal numbers as further inputs, multiplied by a root of the process noise.
+    """Add process noise: standard normal inputs times a square root of its covariance.
 
     Raises:
         ValueError: the model has no noise, or the options a delay.
@@ -257,29 +260,29 @@ def with_process_noise(
             f"key: expected a model with process noise, as with_disturbance makes one, got "
             f"{model.name!r}"
         )
-    # A delay of all inputs is for records: nothing is drawn for them.
+    # A delay of all inputs is for fits to records, which draw no noise.
     if options.delay is not None:
         raise ValueError(
             "key: expected a run without a delay to draw noise for, got one with delay"
         )
     n = jax.tree.leaves(args.inputs)[0].shape[0]
     dtype, states = jax.tree.leaves(args.inputs)[0].dtype, len(naming.names(model.State))
-    # Drawn for all samples at once: the same key gives the same record, whatever the solver does.
+    # All samples are drawn at once, so that a key gives the same record with any solver.
     if not isinstance(method, Exact) or args.discrete is None:
         feedback = method.feedback if isinstance(method, StateFeedback) else None
         draws = jax.random.normal(options.key, (n, states), dtype)
         acting = args.inputs
         if args.delays is not None:
-            # The model is linearised about the inputs as they act, which are read from here.
+            # The model is linearised at the acting inputs, which are read from here.
             acting = delayed(args.inputs, args.delays, jnp.arange(n), linear)
         args = args._replace(inputs=(args.inputs, acting, tuple(draws.T)))
         return WithProcessNoise(
             method, functools.partial(add_process_noise, model, args, feedback)
         ), args
-    # The recurrence of a linear model takes draws as it takes inputs: L beside Bd, no step more.
+    # The recurrence of a linear model treats draws as inputs, with L beside Bd and no extra step.
     L = square_root(process_noise(model, args.params, options.dt))
     draws = jax.random.normal(options.key, (n, L.shape[0]), L.dtype)
-    # The draws are no inputs: nothing of them comes late or from the next sample.
+    # The draws are not delayed and do not use the next sample.
     none, discrete = jnp.zeros_like(L), args.discrete
     discrete = Discrete(
         discrete.Ad,
@@ -298,19 +301,19 @@ def add_process_noise(
     inputs: Record,
     draws: Sequence[Scalar],
 ) -> Record:
-    """The state after a sample with the noise of that sample, of the model linearised there.
+    """Return the state after a sample with its noise, from the model linearised there.
 
     Args:
-        feedback: None, or what makes the acting inputs of the given ones.
+        feedback: None, or the function from given to acting inputs.
     """
     params, dt = args.params, args.dt
-    # The linearisation is at the inputs that acted, which the solver within keeps to itself.
+    # The inner solver does not return the inputs that acted, so they are computed here.
     if feedback is not None:
         inputs = feedback(state, inputs)
     x = naming.ravel(state)
 
-    # The model itself filters the drive of a sample: its covariance is not g g^T dt, in which
-    # states without a drive of their own would get none.
+    # The model itself filters the drive during a sample. With covariance g g^T dt, states without a
+    # drive of their own would get no noise.
     def rates(x: Array) -> Array:
         derivatives = model.vector_field(params, naming.unravel(model.State, x), inputs)
         return naming.ravel(derivatives, x.dtype, naming.names(model.State))
@@ -321,14 +324,14 @@ def add_process_noise(
     return naming.unravel(model.State, x + L @ jnp.stack(draws))
 
 
-# The arguments of `step` are diffrax's: terms, the interval [t0, t1] in samples, the state at its
-# begin, and what is known beside it; none of the solvers here keeps a state between steps.
+# Arguments of `step` are diffrax's: terms, the interval [t0, t1] in samples, its first state, and
+# args. No solver here keeps a state between steps.
 
 
 class StateFeedback(SolverWrapper):
     """A per-sample solver whose inputs are a function of the state at the sample.
 
-    feedback(state, given inputs of that sample) gives the inputs that are held.
+    feedback(state, given inputs of that sample) returns the inputs to hold.
     """
 
     feedback: Callable[..., Any]
@@ -336,43 +339,43 @@ class StateFeedback(SolverWrapper):
     def stepped(
         self, terms: dfx.AbstractTerm, t0: Time, t1: Time, y0: PyTree, args: ZeroOrderHoldArgs
     ) -> Stepped:
-        """A sample with the inputs that the feedback makes of the state at its begin."""
-        # One sample, index 0, stands for all: `at` takes the last where the index is past the end.
+        """Integrate one sample with the inputs from the feedback at its first state."""
+        # A single sample at index 0 serves all, since `at` clips indices beyond the end.
         u = self.feedback(y0, at(args.inputs, sample_index(t0)))
         held = args._replace(inputs=jax.tree.map(lambda v: jnp.asarray(v)[None], u))
         return self.solver.stepped(terms, t0, t1, y0, held)
 
 
 class Stopping(SolverWrapper):
-    """A per-sample solver that stays where it is after the first sample at which `over` holds.
+    """A per-sample solver that keeps the state after the first sample at which `over` is True.
 
-    y = (state, going), where going is 1 until then and 0 from there on.
+    y = (state, going), where going is 1 until then and 0 afterwards.
     """
 
-    # A number and not a truth value for `going`: diffrax takes derivatives of all that it carries.
+    # `going` is a number, since diffrax differentiates its whole state.
     over: Callable[..., Any]
     linear: tuple[bool, ...] = eqx.field(static=True, default=())
 
     def stepped(
         self, terms: dfx.AbstractTerm, t0: Time, t1: Time, y0: PyTree, args: ZeroOrderHoldArgs
     ) -> Stepped:
-        """A sample, or none where the run is over."""
-        # A batch cannot stop for one of its runs, so the step is made and its result not taken.
+        """Integrate one sample; keep the state if the run is over."""
+        # A batch cannot stop for one run, so the step is computed and discarded.
         state, going = y0
         new, result = self.solver.stepped(terms, t0, t1, state, args)
         new = jax.tree.map(lambda a, b: jnp.where(going > 0, a, b), new, state)
         result = dfx.RESULTS.where(going > 0, result, dfx.RESULTS.successful)
-        # The inputs at the end of the interval: those held since its begin, or the next ones.
+        # Inputs at the end of the interval: those held since its start, or the next ones.
         ended = self.over(new, at_end(args.inputs, sample_index(t0), self.linear))
         y1 = (new, jnp.where(ended, jnp.zeros_like(going), going))
         return y1, result
 
 
 class WithProcessNoise(SolverWrapper):
-    """A per-sample solver whose state gets its process noise after every sample.
+    """A per-sample solver that adds process noise after every sample.
 
-    The inputs are (the model's, the same as they act, standard normal numbers); add_noise(state,
-    acting inputs, numbers of that sample) gives the new state.
+    The inputs are (the model's inputs, the acting inputs, standard normal numbers).
+    add_noise(state, acting inputs, numbers of that sample) returns the new state.
     """
 
     add_noise: Callable[..., Any]
@@ -380,8 +383,8 @@ class WithProcessNoise(SolverWrapper):
     def stepped(
         self, terms: dfx.AbstractTerm, t0: Time, t1: Time, y0: PyTree, args: ZeroOrderHoldArgs
     ) -> Stepped:
-        """A sample, and the noise that comes in over it."""
-        # The draws travel as inputs: they are samples too, and diffrax carries only y and args.
+        """Integrate one sample and add its noise."""
+        # Draws are passed as inputs, since diffrax carries only y and args.
         inputs, acting, draws = args.inputs
         held = args._replace(inputs=inputs)
         y, result = self.solver.stepped(terms, t0, t1, y0, held)

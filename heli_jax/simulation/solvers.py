@@ -1,8 +1,8 @@
-"""Solver classes of our own: one step a sample, named scalar leaves.
+"""Solvers with one step a sample and named scalar leaves.
 
-A Runge-Kutta method that reads a held input by time sees the next sample in its last stage, an
-error of first order. Here the input of an interval is picked once and held while the step is made;
-one that is linear between samples is followed along its line by every stage.
+A Runge-Kutta method that reads a held input by time uses the next sample in its last stage, a
+first-order error. Here the input is read once for an interval and held during the step. For an
+input that is linear between samples, every stage uses the value on the line.
 """
 
 import abc
@@ -22,14 +22,14 @@ from heli_jax.simulation.discretize import Discrete
 from heli_jax.simulation.hold import Delays, at, delayed, segments
 
 type Time = Real[Array, ""] | Real[np.ndarray, ""] | int | float
-"""as diffrax takes it, which has no NumPy scalars among its types"""
+"""Time as diffrax accepts it, which excludes NumPy scalars."""
 
 
 class ZeroOrderHoldArgs(NamedTuple):
     """Arguments of a step: the parameters, and the inputs sample by sample.
 
-    `inputs` holds arrays (N,). `delays` is None, or by how many samples each of them acts later
-    than given. `dt` [s] is the sample time.
+    `inputs` holds arrays (N,). `delays` is None, or the delay of each input in samples. `dt` [s] is
+    the sample time.
     """
 
     params: Record
@@ -39,29 +39,30 @@ class ZeroOrderHoldArgs(NamedTuple):
     discrete: Discrete | None
 
     def in_scalars(self) -> "ZeroOrderHoldArgs":
-        """Return the arguments as a solver steps with them."""
+        """Return the arguments with scalar coefficients, as a solver uses them."""
         if self.discrete is None:
             return self
         return self._replace(discrete=self.discrete.in_scalars())
 
 
 def acting_at(args: ZeroOrderHoldArgs, k: Int[Array, ""] | int, linear: tuple[bool, ...]) -> Record:
-    """The inputs as they act at sample k."""
+    """Return the acting inputs at sample k."""
     if args.delays is None:
         return at(args.inputs, k)
     return delayed(args.inputs, args.delays, k, linear)
 
 
 class IntervalArgs(NamedTuple):
-    """The arguments of a vector field within one interval: parameters and the held inputs."""
+    """Arguments of a vector field within one interval: parameters and held inputs."""
 
     params: Record
     inputs: Record
 
 
 class RampArgs(NamedTuple):
-    """Arguments as `IntervalArgs`, for inputs that move: at the begin of a step, and their slope
-    per second."""
+    """Arguments like `IntervalArgs` for moving inputs: values at the start of a step, and slopes
+    per second.
+    """
 
     params: Record
     inputs: Record
@@ -74,22 +75,22 @@ class RampArgs(NamedTuple):
 
 
 def sample_index(t: Time) -> Int[Array, ""]:
-    """The sample that an interval begins with, from its time in samples."""
-    # Time is counted in samples, and a step begins at one of them but for rounding: in float32 that
-    # is more than a thousandth of a sample from 16,000 on.
+    """Return the first sample of an interval, from its time in samples."""
+    # A step starts at a sample except for rounding, which in float32 exceeds a thousandth of a
+    # sample from 16,000 on.
     return jnp.round(t).astype(int)
 
 
-# The arguments of `init`, `func` and `step` are those of diffrax.AbstractSolver: terms, times, the
-# state y0 and `args`. Time is counted in samples in the solvers of a whole sample, in seconds from
-# the begin of a step within it.
+# Arguments of `init`, `func` and `step` are those of diffrax.AbstractSolver: terms, times, state y0
+# and `args`. Solvers of a whole sample count time in samples, those within it in seconds from the
+# start of the step.
 
 
 type Stepped = tuple[PyTree, dfx.RESULTS]
 
 
 class _Stateless(dfx.AbstractSolver):
-    """Base of the solvers here: straight lines between samples, nothing kept between steps."""
+    """Base class of the solvers: linear interpolation, no state between steps."""
 
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., dfx.LocalLinearInterpolation]] = (
@@ -109,7 +110,7 @@ class _Stateless(dfx.AbstractSolver):
         solver_state: PyTree,
         made_jump: bool | Bool[Array, ""],
     ) -> Any:
-        """One step, in the five parts that diffrax asks for."""
+        """Return one step in the five parts that diffrax expects."""
         y1, result = self.stepped(terms, t0, t1, y0, args)
         return y1, None, {"y0": y0, "y1": y1}, None, result
 
@@ -117,14 +118,14 @@ class _Stateless(dfx.AbstractSolver):
     def stepped(
         self, terms: dfx.AbstractTerm, t0: Time, t1: Time, y0: PyTree, args: PyTree
     ) -> Stepped:
-        """The state at t1 and diffrax's result."""
+        """Return the state at t1 and diffrax's result."""
 
 
 class SolverWrapper(_Stateless):
-    """A solver of whole samples around another (see also `heli_jax.simulation.simulate`)."""
+    """A solver of whole samples that wraps another (see also `heli_jax.simulation.simulate`)."""
 
     solver: Any
-    """one of ours; that of `PerSample` any of diffrax's"""
+    """Inner solver: one of this module's; for `PerSample` any of diffrax's."""
 
     def order(self, terms: dfx.AbstractTerm) -> int | None:
         return self.solver.order(terms)
@@ -134,10 +135,12 @@ class SolverWrapper(_Stateless):
 
 
 class Exact(_Stateless):
-    """Exact for linear models, held inputs or linear ones: a recurrence of scalar coefficients."""
+    """Exact solver for linear models with held or linear inputs: a recurrence with scalar
+    coefficients.
+    """
 
     def order(self, terms: dfx.AbstractTerm) -> None:
-        # No error to have an order: diffrax takes None where nobody asks for one.
+        # An exact solver has no order; diffrax accepts None.
         return None
 
     def func(self, terms: dfx.AbstractTerm, t0: Time, y0: PyTree, args: PyTree) -> Any:
@@ -146,9 +149,9 @@ class Exact(_Stateless):
     def stepped(
         self, terms: dfx.AbstractTerm, t0: Time, t1: Time, y0: PyTree, args: ZeroOrderHoldArgs
     ) -> Stepped:
-        """One sample of the recurrence."""
+        """Advance the recurrence by one sample."""
         assert args.discrete is not None
-        # Whole samples of a delay shift the inputs; the rest of it is in Bd and Bp.
+        # Whole samples of a delay shift the inputs; the remainder is in Bd and Bp.
         k, late = sample_index(t0), args.delays
         ahead = args.discrete.Bn is not None
         before = None if late is None else jax.tree.leaves(at(args.inputs, k - 1, late))
@@ -166,14 +169,14 @@ def advance(
     before: Sequence[Scalar] | None = None,
     after: Sequence[Scalar] | None = None,
 ) -> list[Scalar]:
-    """x[k+1] from x[k] and the inputs.
+    """Return x[k+1] from x[k] and the inputs.
 
     Args:
-        before: those of the sample before, where the recurrence has a Bp.
-        after: those of the next sample, where it has a Bn.
+        before: inputs of the previous sample, if the recurrence has Bp.
+        after: inputs of the next sample, if the recurrence has Bn.
     """
-    # Sums of scalars and not a matrix product: under vmap each is a vector over the batch, which
-    # XLA fuses into one loop. A product of many 4x4 matrices calls a routine for each of them.
+    # Scalar sums instead of a matrix product: under vmap each is a vector over the batch, which XLA
+    # fuses into one loop. A product of many 4x4 matrices calls a routine for each.
     new = [dot(a, x) + dot(b, u) for a, b in zip(discrete.Ad, discrete.Bd, strict=True)]
     if discrete.Bp is not None:
         assert before is not None
@@ -185,8 +188,8 @@ def advance(
 
 
 def dot(coefficients: Sequence[Scalar], values: Sequence[Scalar]) -> Scalar:
-    """The sum of products of two lists of scalars, term by term from the first."""
-    # Not sum(): that begins with a 0, and an addition more at each step.
+    """Return the sum of products of two lists of scalars, in order."""
+    # sum() would start with 0 and add one operation to each step.
     total = coefficients[0] * values[0]
     for c, v in zip(coefficients[1:], values[1:], strict=True):
         total = total + c * v
@@ -196,7 +199,7 @@ def dot(coefficients: Sequence[Scalar], values: Sequence[Scalar]) -> Scalar:
 class RK4(_Stateless):
     """The classical Runge-Kutta method of fourth order on named scalar leaves.
 
-    `rolled` makes the four stages a loop: a quarter of the code to compile, and somewhat slower.
+    `rolled` makes the four stages a loop: a quarter of the code to compile, but slightly slower.
     """
 
     rolled: bool = eqx.field(static=True, default=False)
@@ -210,20 +213,20 @@ class RK4(_Stateless):
     def stepped(
         self, terms: dfx.AbstractTerm, t0: Time, t1: Time, y0: PyTree, args: PyTree
     ) -> Stepped:
-        """One step of the method."""
+        """Make one step of the method."""
         h: Any = t1 - t0
 
-        # Written here although diffrax has Runge-Kutta methods: those stack the stages into arrays,
-        # which XLA does not fuse into one loop over a batch of vehicles.
+        # diffrax's Runge-Kutta methods stack the stages into arrays, which XLA does not fuse into
+        # one loop over a batch.
         def f(t: Time, y: PyTree) -> Any:
-            # Behind a barrier each slope is computed once: without it XLA computes all of them
-            # again for every state variable.
+            # The barrier makes XLA compute each slope once, instead of once for every state
+            # variable.
             return jax.lax.optimization_barrier(terms.vf(t, y, args))
 
         def along(y: PyTree, slope: PyTree, step: Time) -> PyTree:
             return jax.tree.map(lambda a, b: a + step * b, y, slope)
 
-        # The slopes at t0, twice halfway and at t1; weights 1, 2, 2, 1 over 6.
+        # Slopes at t0, twice at mid-step and at t1; weights 1, 2, 2, 1 over 6.
         if self.rolled:
             y1 = self._rolled(f, along, t0, h, y0)
             return y1, dfx.RESULTS.successful
@@ -240,8 +243,8 @@ class RK4(_Stateless):
     def _rolled(
         f: Callable[..., Any], along: Callable[..., Any], t0: Time, h: Array, y0: PyTree
     ) -> PyTree:
-        # Stage i stands on the slope of stage i - 1 alone, so a loop can carry it; the first has a
-        # reach of zero, and any slope will do.
+        # Each stage needs only the previous slope, so a loop can carry it. The first stage has zero
+        # reach, so any slope works.
         def stage(carry: PyTree, node: tuple[Array, Array]) -> tuple[PyTree, None]:
             total, slope = carry
             reach, weight = node
@@ -259,15 +262,15 @@ type _Part = tuple[Array, IntervalArgs | RampArgs]
 
 
 class PerSample(SolverWrapper):
-    """Any solver inside one sample: `substeps` equal steps.
+    """Any solver inside one sample, with `substeps` equal steps.
 
-    With a delayed input the interval has two parts, before and after the change of the input,
-    with `substeps` steps each.
+    With a delayed input the interval has two parts, before and after the input changes, with
+    `substeps` steps each.
     """
 
     substeps: int = eqx.field(static=True)
     linear: tuple[bool, ...] = eqx.field(static=True, default=(), kw_only=True)
-    """of each input whether it is linear between samples; () holds all"""
+    """True for each input that is linear between samples; () holds all."""
 
     def func(self, terms: dfx.AbstractTerm, t0: Time, y0: PyTree, args: PyTree) -> Any:
         return self.solver.func(
@@ -277,8 +280,8 @@ class PerSample(SolverWrapper):
     def stepped(
         self, terms: dfx.AbstractTerm, t0: Time, t1: Time, y0: PyTree, args: ZeroOrderHoldArgs
     ) -> Stepped:
-        """One sample in its parts."""
-        # The first failure counts: what comes after it is no news.
+        """Integrate one sample in its parts."""
+        # Return the first failure; later ones follow from it.
         y, result = y0, dfx.RESULTS.successful
         for length, now in self._parts(args, sample_index(t0)):
             y, part = self._steps(terms, length / self.substeps, y, now)
@@ -286,10 +289,12 @@ class PerSample(SolverWrapper):
         return y, result
 
     def _parts(self, args: ZeroOrderHoldArgs, k: Int[Array, ""]) -> list[_Part]:
-        """The parts of the interval from sample k on: how long [s], and with which inputs."""
-        # A line across a sample is one part; late by a fraction, it bends within the interval. Each
-        # part has its own steps and ends where an input jumps: a step across the jump would be of
-        # first order, whatever the method's.
+        """Return the parts of the interval after sample k: length [s], and arguments with the
+        inputs.
+        """
+        # A line across a sample is one part; with a fractional delay it bends within the interval.
+        # Each part ends where an input jumps, since a step across a jump would be of first order
+        # with any method.
         parts = segments(args.inputs, args.dt, args.delays, k, self.linear)
         if self.linear:
             return [(p.length, RampArgs(args.params, p.inputs, p.slope)) for p in parts]
@@ -298,9 +303,10 @@ class PerSample(SolverWrapper):
     def _steps(
         self, terms: dfx.AbstractTerm, h: Array, y0: PyTree, now: IntervalArgs | RampArgs
     ) -> Any:
-        """`substeps` steps of h [s]. Nothing depends on time while the input is held, and where it
-        moves it is counted from the step's begin, so each begins at 0: a step length that is the
-        same number in all steps makes the code faster.
+        """Make `substeps` steps of h [s].
+
+        Held inputs do not depend on time, and moving ones count it from the start of the step. So
+        each step starts at 0, and a constant step length makes the code faster.
         """
         begin = jnp.zeros_like(h)
 
@@ -332,7 +338,7 @@ class Adaptive(PerSample):
             self.solver,
             t0=jnp.zeros_like(h),
             t1=self.substeps * h,
-            dt0=None,  # the controller chooses a first step anew in each interval: inputs jump
+            dt0=None,  # inputs jump, so the controller chooses a first step in each interval
             y0=y0,
             args=now,
             saveat=dfx.SaveAt(t1=True),
@@ -341,22 +347,22 @@ class Adaptive(PerSample):
             adjoint=self.adjoint,
             throw=False,
         )
-        # A sample cut short by a delay may have no length at all, and then nothing happens.
+        # A part cut off by a delay may have zero length; then the state stays unchanged.
         reached = jax.tree.map(lambda a, b: jnp.where(h > 0, a[-1], b), sol.ys, y0)
         fine = dfx.RESULTS.where(h > 0, sol.result, dfx.RESULTS.successful)
         return reached, fine
 
 
-# An implicit one needs a root finder with tolerances, which a name cannot give.
+# Implicit solvers need a root finder with tolerances, which a name cannot give.
 NAMED = ("Euler", "Midpoint", "Heun", "Ralston", "Bosh3", "Tsit5", "Dopri5", "Dopri8")
-"""Solvers of diffrax that have a name here: explicit ones, of fixed steps."""
+"""Names of available diffrax solvers: explicit, with fixed steps."""
 
 
 def solver_named(name: str) -> str | dfx.AbstractSolver:
-    """ "exact", "rk4", or a diffrax solver of fixed steps by its name there, such as "Tsit5".
+    """Return "exact", "rk4", or diffrax's fixed-step solver of that name, such as "Tsit5".
 
     Raises:
-        ValueError: there is none of that name.
+        ValueError: the name is unknown.
     """
     if name in ("exact", "rk4"):
         return name

@@ -1,4 +1,4 @@
-"""Solvers that make one step a sample, from a model and its inputs."""
+"""Solvers with one step a sample, from a model and its inputs."""
 
 from collections.abc import Callable
 from typing import Any
@@ -31,19 +31,20 @@ from heli_jax.simulation.solvers import (
 
 
 def held_inputs(model: Model, flight: FlightOrInputs, dt: Number | None) -> tuple[Record, Number]:
-    """The model's Inputs as arrays (N,) and the sample time, from a Flight or from Inputs with dt.
+    """Return the model's Inputs as arrays (N,) and the sample time, from a Flight or Inputs with
+    dt.
 
     Args:
         flight: a Flight, or Inputs with arrays (N,).
-        dt: [s]; that of the Flight unless given.
+        dt: sample time [s]; default: that of the Flight.
 
     Raises:
-        TypeError: what is flown is neither a Flight nor Inputs.
+        TypeError: `flight` is neither a Flight nor Inputs.
         ValueError: a needed input is missing, the lengths differ, or dt is missing or not above
             zero.
     """
-    # By its dictionary, not by its class: anything with `inputs` and `dt` may be a flight, and a
-    # model's Inputs may have a field of that name, which is an array.
+    # Checked by its dictionary: any object with `inputs` and `dt` may be a flight. A model's Inputs
+    # may also have a field `inputs`, but it is an array.
     by_name = getattr(flight, "inputs", None)
     if isinstance(by_name, dict):
         missing = [n for n in naming.names(model.Inputs) if n not in by_name]
@@ -60,14 +61,14 @@ def held_inputs(model: Model, flight: FlightOrInputs, dt: Number | None) -> tupl
                 f"got {type(flight).__name__}"
             )
         inputs = jax.tree.map(jnp.asarray, flight)
-    # Backwards, or on the spot, a run would end like any other. Traced it has no value yet.
+    # A run with dt of zero or below would end without an error. A traced dt has no value yet.
     if dt is not None and not isinstance(dt, core.Tracer) and not np.all(np.asarray(dt) > 0):
         raise ValueError(f"dt: expected a sample time above zero [s], got {dt}")
     if dt is None:
         raise ValueError(
             "expected dt, the sample time in seconds, beside inputs given as arrays, got none"
         )
-    # Two samples at least: one has no interval, and nothing to integrate over.
+    # One sample has no interval to integrate over.
     shapes = {u.shape for u in jax.tree.leaves(inputs)}
     if len(shapes) != 1 or any(len(s) != 1 or s[0] < 2 for s in shapes):
         raise ValueError(f"inputs: expected the shape (N,) for all, N >= 2, got {sorted(shapes)}")
@@ -77,14 +78,14 @@ def held_inputs(model: Model, flight: FlightOrInputs, dt: Number | None) -> tupl
 def start_state(
     model: Model, params: Record, initial_state: Record | None, inputs: Record
 ) -> Record:
-    """The initial state in the dtype that the parameters and inputs give together.
+    """Return the initial state in the common dtype of parameters and inputs.
 
     Raises:
-        TypeError: `params` are none of the model's.
+        TypeError: `params` are not the model's.
     """
     check_params(model.Params, params)
-    # A loop needs one dtype for its state: float32 parameters in a float64 session stay float32,
-    # and a state that is given in integers becomes numbers.
+    # A loop needs one dtype for its state: float32 parameters stay float32 in a float64 session,
+    # and an integer state becomes floating point.
     state = model.initial_state(params) if initial_state is None else initial_state
     leaves = (*jax.tree.leaves(params), *jax.tree.leaves(inputs))
     dtype = jnp.result_type(*(jnp.asarray(v) for v in leaves))
@@ -98,8 +99,8 @@ def check_countable(samples: int, dtype: Any) -> None:
     Raises:
         ValueError: float32 and more than 4 million samples.
     """
-    # diffrax makes k out of the end and a quotient, off by up to two units in the last place; above
-    # this they are half a sample.
+    # diffrax computes k from the end time and a quotient, with an error of up to two units in the
+    # last place. Above this limit that is half a sample.
     most = round(0.5 / float(jnp.finfo(dtype).eps))
     if samples > most:
         raise ValueError(
@@ -109,7 +110,9 @@ def check_countable(samples: int, dtype: Any) -> None:
 
 
 _LARGE = 8
-"""States beyond which the stages of RK4 are a loop: 5 % slower, a quarter of the compilation."""
+"""Number of states above which the stages of RK4 are a loop: 5 % slower, a quarter of the
+compilation.
+"""
 
 
 def _method(model: Model, solver: str | dfx.AbstractSolver | None) -> dfx.AbstractSolver:
@@ -121,7 +124,7 @@ def _method(model: Model, solver: str | dfx.AbstractSolver | None) -> dfx.Abstra
                 f"model {model.name!r} is not linear: expected solver='rk4' or another, got 'exact'"
             )
         return Exact()
-    # Long equations are compiled four times over unless the stages are a loop.
+    # Without the loop, long equations would be compiled four times.
     if solver == "rk4":
         return RK4(rolled=len(naming.names(model.State)) > _LARGE)
     if isinstance(solver, dfx.AbstractSolver):
@@ -136,12 +139,12 @@ def per_sample(
     options: SimulationOptions,
     linear: tuple[bool, ...] = (),
 ) -> tuple[dfx.AbstractSolver, ZeroOrderHoldArgs, dfx.ODETerm]:
-    """The solver, its arguments and the term for time counted in samples.
+    """Return the solver, its arguments and the term, with time counted in samples.
 
     Args:
-        options: of which dt, solver, substeps, delay, controller, adjoint and max_steps count.
+        options: used fields: dt, solver, substeps, delay, controller, adjoint and max_steps.
     """
-    # "exact" and "rk4" have no error estimate to adapt to; a controller alone means Dopri8.
+    # "exact" and "rk4" have no error estimate for a controller; a controller alone selects Dopri8.
     controller, solver = options.controller, options.solver
     method = _method(model, dfx.Dopri8() if controller is not None and solver is None else solver)
     if controller is not None and isinstance(method, Exact | RK4):
@@ -149,13 +152,13 @@ def per_sample(
             "controller: expected a diffrax solver with an error estimate, such as Dopri8(), got "
             f"{options.solver!r}"
         )
-    # Of the parameters at hand, which may be traced: a delay is estimated like any other parameter.
+    # Delays use the given parameters, possibly traced, since they can be estimated too.
     delays = delays_of(model, params, options.delay, options.dt)
 
     term = field_term(model, model.vector_field)
     dt = jnp.asarray(options.dt, jax.tree.leaves(inputs)[0].dtype)
     if isinstance(method, Exact):
-        # Discretised once, outside the loop: the parameters do not change during a run.
+        # Discretise once outside the loop, since parameters are constant during a run.
         discrete = discretize(model, params, dt, delays, linear)
         return method, ZeroOrderHoldArgs(params, inputs, dt, delays, discrete), term
     if options.substeps < 1:
@@ -169,24 +172,24 @@ def per_sample(
 
 
 class _Field(eqx.Module):
-    """A vector field as diffrax calls it: equal for equal models, so that it is compiled once."""
+    """A vector field in diffrax's form; equal for equal models, so that it is compiled once."""
 
     State: type = eqx.field(static=True)
     vector_field: Callable[[Any, Any, Any], Any] = eqx.field(static=True)
 
     def __call__(self, t: Time, x: PyTree, now: PyTree) -> PyTree:
-        # What is beside the state (a running value, whether it goes on) does not change with time.
+        # Other parts of the state (a running value, a flag) have zero derivative.
         if not isinstance(x, self.State):
             return jax.tree.map(jnp.zeros_like, x)
         if isinstance(now, ZeroOrderHoldArgs):
-            return x  # only the shapes are asked for; the inputs may not be the model's
+            return x  # only shapes matter here; the inputs may not be the model's
         if isinstance(now, RampArgs):
             now = now.after(t)
         return self.vector_field(now.params, x, now.inputs)
 
 
 def field_term(model: Model, vector_field: Callable[[Any, Any, Any], Any]) -> dfx.ODETerm:
-    """The vector field, per second, within one sample; of its parameters as those of
+    """Return the vector field, per second, within one sample, with the parameters of
     `ZeroOrderHoldArgs`.
 
     diffrax also evaluates it with the solver's own arguments and state, to compare shapes.
@@ -194,8 +197,8 @@ def field_term(model: Model, vector_field: Callable[[Any, Any, Any], Any]) -> df
     return dfx.ODETerm(_Field(model.State, vector_field))
 
 
-# Where a Kalman filter goes through the record, inputs enter as a known drive: how B and U are
-# multiplied, all samples at once or some at a time, is left to the filter.
+# Kalman filters take inputs as a known drive and choose how to multiply B and U: all samples at
+# once or in parts.
 def held_columns(
     model: Model,
     params: Record,
@@ -204,10 +207,10 @@ def held_columns(
     delay: Number | None,
     linear: tuple[bool, ...] = (),
 ) -> tuple[Float[Array, "n n"], Float[Array, "n r"], Float[Array, "N r"], Float[Array, "N m"]]:
-    """x[k+1] = Ad x[k] + B U[k] for a linear model: Ad, B, U, and the inputs that act at k.
+    """Return Ad, B, U of x[k+1] = Ad x[k] + B U[k] for a linear model, and the inputs acting at k.
 
     Args:
-        dt: [s].
+        dt: sample time [s].
     """
     options = SimulationOptions(dt=dt, solver="exact", delay=delay)
     _, args, _ = per_sample(model, params, inputs, options, linear)

@@ -10,42 +10,45 @@ from jaxtyping import Array, Bool, Float, Int
 
 from heli_jax.naming import Record
 
-# The functions of summaries and exports are imported where they are used: they build on this class,
-# and pandas, xarray and HTML are no business of a simulation.
+# Local imports: summaries and exports use this class, and a simulation needs no pandas, xarray or
+# HTML.
 if TYPE_CHECKING:
     import xarray as xr
 
 STATUS = ("ok", "ended by an event", "outside the model's range", "not finite", "solver stopped")
-"""What `Trajectory.status` counts, from the best to the worst."""
+"""Meanings of `Trajectory.status`, from best to worst."""
 
 
 class Trajectory(NamedTuple):
-    """A run, sample by sample; batched from outside by vmap."""
+    """A simulated run, sample by sample; vmap adds batch dimensions."""
 
     times: Float[Array, " N"]
-    """[s], from 0"""
+    """Sample times [s], from 0."""
     states: Record
-    """the model's State with arrays (N,)"""
+    """The model's State with arrays (N,)."""
     outputs: Record
-    """the model's Outputs with arrays (N,)"""
+    """The model's Outputs with arrays (N,)."""
     inputs: Record
-    """the model's Inputs with arrays (N,), as they acted at each sample: with the feedback's part,
-    and where there are delays, what was commanded that much earlier"""
+    """The model's Inputs with arrays (N,) as they acted at each sample: with feedback added, and
+    with delays applied.
+    """
     result: dfx.RESULTS
-    """diffrax's result: `diffrax.RESULTS.successful`, or why the integration stopped"""
+    """diffrax's result: `diffrax.RESULTS.successful`, or the reason why the integration stopped."""
     finite: Bool[Array, ""]
-    """whether every state is a finite number"""
+    """True if every state is finite."""
     outside: dict[str, Bool[Array, " N"]]
-    """by name of a limit of the model, where it was left; empty for a model without limits"""
+    """True at samples where a limit of the model is exceeded, by name; empty for a model without
+    limits.
+    """
     ended: Float[Array, ""] | float
-    """when an event ended the run [s]; inf where none did"""
+    """Time at which an event ended the run [s]; inf if none did."""
     event: Int[Array, ""] | int
-    """which event that was, in the order given; -1 where none did"""
+    """Index of that event, in the given order; -1 if none ended the run."""
 
     @property
     def valid(self) -> Bool[Array, " N"]:
         """True at samples within the model's range that are finite."""
-        # Sample by sample: a run that diverges is of use up to where it does.
+        # A run that diverges is usable up to that point.
         finite = [jnp.isfinite(v) for v in jax.tree.leaves(self.states)]
         return functools.reduce(
             jnp.logical_and, [*finite, *(~out for out in self.outside.values())]
@@ -53,18 +56,18 @@ class Trajectory(NamedTuple):
 
     @property
     def status(self) -> Int[Array, " *batch"]:
-        """The worst that happened, an index into `STATUS`; one a run of a batch."""
-        # From the mildest to the worst, so that what comes later overrules.
+        """Index of the worst status in `STATUS`, one for each run of a batch."""
+        # In rising order, so that worse codes overwrite.
         code = jnp.where(jnp.asarray(self.event) >= 0, 1, 0)
         for out in self.outside.values():
             code = jnp.where(jnp.any(out, axis=-1), 2, code)
-        # A run that is not finite has left the range as well, and the solver may call it a success.
+        # A run that is not finite has also left the range, and the solver may report success.
         code = jnp.where(self.finite, code, 3)
         return jnp.where(self.result == dfx.RESULTS.successful, code, jnp.maximum(code, 4))
 
     def first(self, n: int) -> "Trajectory":
-        """The first n samples of it."""
-        # What belongs to the whole run (result, finite, status) stays as it is.
+        """Return the first n samples."""
+        # result, finite and status describe the whole run and stay.
         parts = (self.times, self.states, self.outputs, self.inputs, self.outside)
         times, states, outputs, inputs, outside = jax.tree.map(lambda v: v[:n], parts)
         return self._replace(
@@ -82,10 +85,11 @@ class Trajectory(NamedTuple):
         return as_html(of_trajectory(self, STATUS))
 
     def to_xarray(self) -> "xr.Dataset":
-        """The run as an xarray Dataset over `time` [s]: states, outputs and inputs by name, each
-        with its unit in `attrs["units"]`; runs of a batch along `run_0`, ...
+        """Return the run as an xarray Dataset over `time` [s], with states, outputs and inputs by
+        name.
 
-        An output or input of a name that is taken is `NAME_output` or `NAME_input`.
+        Units are in `attrs["units"]`; runs of a batch are along `run_0`, ... An output or input
+        whose name is taken becomes `NAME_output` or `NAME_input`.
         """
         from heli_jax.exports import trajectory_dataset
 

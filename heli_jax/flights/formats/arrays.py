@@ -153,7 +153,7 @@ class DataSets:
         notes = list(self.notes)
         if self._missing:
             each = listed(f"{shown(name)} ({n})" for name, n in self._missing.items())
-            words = f"the file's marks for no value are taken as missing samples: {each}"
+            words = f"fill values of the file are missing samples: {each}"
             total = sum(self._missing.values())
             notes.append(note("samples.marks", words, *self._missing, value=total))
         if self._left_out:
@@ -236,7 +236,7 @@ def _one(attributes: Mapping[str, object], name: str, otherwise: float) -> float
     numbers = _numbers(attributes[name])
     number = float(numbers[0]) if numbers.size == 1 else float("nan")
     if not np.isfinite(number) or (name == "scale_factor" and number == 0):
-        raise Packing(f"since its {name} is no number that packs")
+        raise Packing(f"because its {name} is no valid number")
     return number
 
 
@@ -272,7 +272,7 @@ def _unstacked(
         or any(x.shape[:2] != shape for x in cubes.values())
         or any(x.shape != shape and x.size != shape[1] for x in clocks.values() if x.size > 1)
     ):
-        why = "runs are read of arrays (run, sample, channel), with a time for each sample"
+        why = "runs are read from arrays (run, sample, channel) with a time for each sample"
         shapes = listed(f"{shown(n)} {x.shape}" for n, x in cubes.items())
         said = note(LEFT_OUT, f"left out, since {why}: {shapes}", *cubes)
         return {n: x for n, x in arrays.items() if n not in cubes}, (said,)
@@ -285,7 +285,7 @@ def _unstacked(
     if shape[0] > 1:
         made.setdefault(SEGMENT, np.repeat(np.arange(1.0, shape[0] + 1.0), shape[1]))
     words = (
-        f"stacked arrays: {shape[0]} segments of {shape[1]} samples, put one after another; "
+        f"stacked arrays: {shape[0]} segments of {shape[1]} samples, joined; "
         f"{SEGMENT!r} numbers them"
     )
     return made, (note("channels.stacked", words, *cubes, value=shape[0]),)
@@ -322,7 +322,7 @@ def by_clocks(table: ArrayTable) -> ChannelLog | None:
         topics.append(Topic(clock, clocks[clock], {n: arrays[n] for n in names}, units_of, clock))
     if without:
         each = listed(f"{shown(n)} ({sample_count(arrays[n].size)})" for n in without)
-        words = "no time of their length, or several, stand in their groups"
+        words = "their groups have no time of their length, or several"
         notes = (*notes, note(LEFT_OUT, f"left out, since {words}: {each}", *without))
     return ChannelLog.of_table(table, tuple(topics), notes=notes)
 
@@ -345,5 +345,5 @@ def clock_notes(table: Table) -> tuple[Finding, ...]:
     if log is None:
         return ()
     topics = listed(f"{shown(t.name)} of {len(t.columns)}" for t in log.topics)
-    words = f"arrays have clocks of their own, read where no time is stated: {topics}"
+    words = f"arrays have their own clocks, used if no time is stated: {topics}"
     return (note("clock.of-arrays", words, value=len(log.topics)),)

@@ -122,7 +122,7 @@ def open_csv(path: Path) -> "CsvTable":
     rows, notes = _whole(rows, head)
     if any(head.units):
         each = listed(f"{n} [{u}]" for n, u in zip(head.names, head.units, strict=True))
-        words = f"a line of units stands below {line} and is no sample: {each}"
+        words = f"units are read from the line below {line}: {each}"
         notes = (*notes, note("text.units-line", words, value=head.first_line - 1))
     return CsvTable(where, size, digest, rows, head, notes, data.find(b'"', head.begin) >= 0)
 
@@ -163,7 +163,7 @@ def as_text(path: str, data: bytes) -> bytes:
         try:
             data = data.decode("utf-16").encode()
         except UnicodeDecodeError as e:
-            raise wrong(path, "begins as text in UTF-16, and is none, expected whole text") from e
+            raise wrong(path, "begins as UTF-16 text but is damaged, expected whole text") from e
     data = data.removeprefix(codecs.BOM_UTF8)
     if (null := data.find(b"\0")) >= 0:  # valid in UTF-8, but in no log
         at = data.count(b"\n", 0, null) + 1
@@ -422,7 +422,7 @@ class CsvTable:
             columns = [table.column(str(i)) for i in indices]
             return [(floats(c), len(c) - c.null_count, 0) for c in columns]
         if len(self._rows) > _LARGEST_TEXT:
-            problem = "has quotes, a row of other than the header's number of cells, or a cell that"
+            problem = "has quotes, a row with another number of cells, or a cell that"
             problem += f" is no plain number, expected at most {size_words(_LARGEST_TEXT)} then"
             raise wrong(self.path, f"{problem}, got {size_words(len(self._rows))}")
         table = self._arrow(indices, pa.string())
@@ -510,7 +510,7 @@ class CsvTable:
                 problem = f"{count} cell{'' if count == 1 else 's'}, expected"
                 problem += f" {len(self.names)} as in the header in line {self._head.number}"
                 if not self._head.is_fitting:
-                    problem += "; no line of names stands right above rows of as many cells"
+                    problem += "; no line of names is right above rows of as many cells"
                 return wrong(self.path, problem, f"line {line}")
         return wrong(self.path, "holds no rows that can be read, expected rows of numbers")
 

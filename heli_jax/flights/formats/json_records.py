@@ -43,7 +43,7 @@ def open_json(path: Path) -> ArrayTable:
     for name, values in columns.items():
         _add(sets, name, values, texts)
     if texts:
-        words = f"left out, since they hold text: {listed(map(shown, texts))}"
+        words = f"left out, because they hold text: {listed(map(shown, texts))}"
         sets.notes.append(note(LEFT_OUT, words, *texts))
     return sets.table(where, "json", data)
 
@@ -56,7 +56,7 @@ def _parsed(where: str, data: bytes) -> Any:
     try:
         return json.loads(text)
     except RecursionError as e:
-        raise wrong(where, "has records within records without end, expected a log") from e
+        raise wrong(where, "is nested too deeply, expected a log") from e
     except ValueError as e:
         whole = e
     # One record per line; the last may be cut off if the logger lost its power.

@@ -65,7 +65,7 @@ def open_hdf5(path: Path) -> ArrayTable:
 def _read(path: Path, kind: str, reader: Reader, what: str, data: bytes) -> ArrayTable:
     """Read the file with its reader in a separate process."""
     if what == "HDF5 file" and importlib.util.find_spec("h5py") is None:
-        problem = "is an HDF5 file inside, for which h5py is needed: pip install 'heli_jax[logs]'"
+        problem = "is an HDF5 file, which needs h5py: pip install 'heli_jax[logs]'"
         raise wrong(str(path), problem)
     facts, vectors, notes = read_apart(path, reader, what, len(data))
     arrays = dict(zip(facts["units"], vectors, strict=True))
@@ -120,7 +120,7 @@ def read_matlab(path: Path, budget: Budget) -> Content:
             take(name, value, 0)
     if objects and sets.longest < 2:
         name, kind = next(iter(objects.items()))
-        problem = f"holds {shown(name)}, a {kind} of MATLAB, which is no array; save its numbers"
+        problem = f"holds {shown(name)}, a {kind} of MATLAB, not an array; save its numbers"
         way = f"writetable or writetimetable({name}, 'flight.csv') writes what is read"
         raise wrong(str(path), f"{problem} as arrays, or of a table {way}")
     if objects:
