@@ -42,12 +42,9 @@ def _untied(valley: Any, null: Any, spread: Any, unknowns: Any) -> Any:
 
 ABLATIONS: tuple[Ablation, ...] = (
     Ablation(
-        "noisy_scales", f"{_IDENTIFICATION}.estimation.noise_scales:free_scales", lambda *_: ()
-    ),
-    Ablation(
-        "restricted_likelihood",
-        f"{_IDENTIFICATION}.estimation.noise_scales:with_own_noise",
-        lambda problem, noise: noise,
+        "corrections",
+        f"{_IDENTIFICATION}.estimation.noise_scales:first_corrections",
+        lambda problem: (),
     ),
     Ablation("strays", f"{_FLIGHTS}.marks:strays", lambda *_: ()),
     Ablation(
@@ -55,7 +52,11 @@ ABLATIONS: tuple[Ablation, ...] = (
         f"{_IDENTIFICATION}.identifiability.equivalents:second_solutions",
         lambda *_, **__: (),
     ),
-    Ablation("valley", f"{_IDENTIFICATION}.identifiability.equivalents:Valley.tied", _untied),
+    Ablation(
+        "valley",
+        f"{_IDENTIFICATION}.identifiability.equivalents:Valley.determined_combinations",
+        _untied,
+    ),
 )
 
 

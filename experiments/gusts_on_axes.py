@@ -21,7 +21,7 @@ import scipy.linalg
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem, fit
 from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.identification.select import disturbed_sets
+from heli_jax.identification.select import alternatives
 from heli_jax.simulation.inputs import random_steps
 
 DT, NOISE = 0.02, {"p": 0.01, "q": 0.01, "r": 0.01, "w": 0.03}
@@ -109,7 +109,7 @@ def problem(flight: Flight) -> Problem:
 def one_run(seed: int, n: int) -> dict[str, Any]:
     """Return which intervals cover, and the AIC and whiteness against each disturbance left out."""
     flight = record(seed, n)
-    sets = disturbed_sets(problem(flight), MODEL, ON).problems
+    sets = alternatives(problem(flight), MODEL, ON).problems
     whole = fit(sets[f"all: {', '.join(ON)}"])
     truth = {f"sigma_w_{k}": v for k, v in SIZES.items()}
     truth |= {f"tau_w_{k}": v for k, v in TIMES.items()} | TRUTH

@@ -186,7 +186,7 @@ def roll_damping(p: Any) -> float:
 
 def figure5(r: Run) -> Figure:
     """Draw measured and simulated roll: by RLS, as in the paper, and by filter error."""
-    made, y = style.figure(5.2, constrained=True), r.flights[STAND_RUN].outputs["roll"]
+    made, y = style.figure(5.2), r.flights[STAND_RUN].outputs["roll"]
     known = r.fits["filter error, a known"].signals[0].simulated["roll"]
     shown = {"RLS of order 4": r.rls[STAND_RUN].simulated, "Filter error, a known": known}
     axes = made.subplots(2, 1, sharex=True)
@@ -201,7 +201,7 @@ def figure5(r: Run) -> Figure:
 
 def figure6(r: Run) -> Figure:
     """Draw the run with the stick at neutral, on the scale of Figure 5."""
-    made, roll = style.figure(2.8, constrained=True), r.flights[NEUTRAL].outputs["roll"]
+    made, roll = style.figure(2.8), r.flights[NEUTRAL].outputs["roll"]
     ax = made.subplots()
     ax.plot(roll, color=style.BLUE, lw=0.8)
     _dressed(ax, r, f"Stick at neutral: {np.std(roll):.2f} rad rms")

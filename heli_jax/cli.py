@@ -147,7 +147,7 @@ _COMMANDS = {
     )),
     "compare": ("fits side by side: estimates, verdicts, agreement", (
         _arg("runs", nargs="+", metavar="RUN", help="directories of heli-jax fit"),
-        _arg("--out", metavar="FILE", help="page (.html), estimates as .csv or as LaTeX (.tex)"),
+        _arg("--out", metavar="FILE", help="page (.html) or estimates (.csv)"),
     )),
     "new": ("write a configuration from a log, with guesses marked", (
         _LOG, _TIME_RATE, _FLIGHT,
@@ -657,7 +657,7 @@ def _compare(options: argparse.Namespace) -> int:
     from heli_jax.report.compared_runs import compare_runs
 
     place = None if options.out is None else Path(options.out)
-    endings = (".html", ".csv", ".tex")
+    endings = (".html", ".csv")
     if place is not None and place.suffix.lower() not in endings:
         raise InputError(f"--out {place}: expected a name ending in {', '.join(endings)}")
     compared = compare_runs(options.runs)
@@ -680,10 +680,7 @@ def _compare(options: argparse.Namespace) -> int:
 
             write_page(temporary, compared)
         else:
-            csv = place.suffix.lower() == ".csv"
-            temporary.write_text(
-                compared.to_csv() if csv else compared.to_latex(), encoding="utf-8"
-            )
+            temporary.write_text(compared.to_csv(), encoding="utf-8")
     options.say(f"wrote {place}")
     return DONE
 

@@ -1,4 +1,4 @@
-"""Results as objects of other libraries: pandas, xarray, arviz; each is imported on use.
+"""Results as objects of other libraries: pandas, xarray; each is imported on use.
 
 The classes whose methods call this module import it. It imports none of them, so their objects are
 `Any` here.
@@ -82,29 +82,3 @@ def trajectory_dataset(run: Any) -> "xr.Dataset":
     precision, cost = precision_of(run)
     attributes = {"precision": precision} | ({"precision_note": cost} if cost else {})
     return xr.Dataset(variables, coordinates, attributes)
-
-
-# arviz is an extra, so its class cannot be named here.
-def posterior_tree(
-    draws: Mapping[str, np.ndarray], statistics: Mapping[str, np.ndarray] | None = None
-) -> Any:
-    """Return posterior draws, each (chains, draws), as arviz inference data.
-
-    Args:
-        draws: variables of the group `posterior`.
-        statistics: variables of the group `sample_stats`; default: none.
-
-    Raises:
-        ValueError: arviz is not installed.
-    """
-    try:
-        import arviz  # pyright: ignore[reportMissingImports]
-    except ImportError as e:
-        raise ValueError(
-            "to_arviz: arviz is not installed, expected the extra bayes: "
-            "pip install 'heli_jax[bayes]'"
-        ) from e
-    groups = {"posterior": dict(draws)}
-    if statistics:
-        groups["sample_stats"] = dict(statistics)
-    return arviz.from_dict(groups)

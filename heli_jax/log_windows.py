@@ -8,7 +8,7 @@ from heli_jax import config as configuration
 from heli_jax.config import Experiment
 from heli_jax.config.logs import require_flights, with_log
 from heli_jax.errors import located
-from heli_jax.identification.design.accuracy import GUESSED, too_good
+from heli_jax.identification.design.accuracy import GUESSED
 from heli_jax.identification.design.windows import (
     DETERMINES,
     ENOUGH,
@@ -72,13 +72,11 @@ def print_ranking(ranking: Ranking) -> None:
     rest = [w for w in ranking.windows if not w.excluded and w not in taken]
     # Sort by the geometric mean of the sds, as the D-criterion does.
     rest.sort(key=lambda w: float(np.sum(np.log(np.minimum(w.sd, 1e3)))))
-    rows = [
-        (f"{i + 1}", *_of(choice.window), choice.reason) for i, choice in enumerate(ranking.taken)
-    ]
-    rows += [("", *_of(w), "") for w in rest[: max(_MOST - len(rows), 0)]]
+    rows = [(f"{i + 1}", *_of(window)) for i, window in enumerate(taken)]
+    rows += [("", *_of(w)) for w in rest[: max(_MOST - len(rows), 0)]]
     several = len({w.label for w in ranking.windows}) > 1
     head = ("taken", *(("flight",) if several else ()), "from [s]", "to [s]")
-    head += (*(f"sd {n}" for n in ranking.parameters), "why")
+    head += tuple(f"sd {n}" for n in ranking.parameters)
     if not several:
         rows = [(row[0], *row[2:]) for row in rows]
     print_table(head, rows, keys=head.index("to [s]") + 1)
@@ -118,9 +116,6 @@ def _print_doubts(ranking: Ranking) -> None:
         tell(f"{'x' if finding.severity == 'refuse' else '!'} {finding.topic}: {finding.sentence}")
     for name in ranking.guessed:
         tell(f"noise of {name}: {ranking.noise[name]:.3g} ({GUESSED})")
-    finite = ranking.all_sd[np.isfinite(ranking.all_sd)]
-    if ranking.guessed and (doubt := too_good(finite)):
-        tell(f"! {doubt.sentence}")
     for found in ranking.notes:
         tell(f"! {found.sentence}")
     if names := not_determined(ranking):

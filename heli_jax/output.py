@@ -4,13 +4,11 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
 from heli_jax import compatibility
 from heli_jax.compatibility import Compatibility
 from heli_jax.config.frequency import missing_handling
 from heli_jax.finding import Finding
-from heli_jax.identification.design.accuracy import GUESSED, too_good
+from heli_jax.identification.design.accuracy import GUESSED
 from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.equation_error.start import EquationErrorStart
 from heli_jax.identification.fit import Check, Estimate
@@ -73,7 +71,7 @@ def _print_details(run: FitRun) -> None:
         tell_table(responses)
     if problem.first_guess is not None:
         _print_first_guess(problem.first_guess)
-    gates = card(problem, fit, supplementary.responses)
+    gates = card(fit, supplementary.responses)
     tell(plain_words(f"acceptance card: {summary(gates, _GATES)}"))
     if supplementary.choice is not None:
         compared = report_tables.choice(supplementary.choice)
@@ -177,11 +175,6 @@ def print_check(check: Check, *, verbose: bool = False) -> None:
         if verbose or name in check.guessed:
             guess = f" ({GUESSED})" if name in check.guessed else ""
             tell(f"noise of {name}: {terse(sd, 3)}{guess}")
-    # A relative sd of a zero value does not exist.
-    kept = [i for i, name in enumerate(verdict.names) if name not in check.at_zero]
-    sds = np.sqrt(np.diag(verdict.covariance))[kept]
-    if check.guessed and (doubt := too_good(sds)):
-        tell(f"! {doubt.sentence}")
     if verbose:
         _print_rank(verdict)
     tell("\nIs this log enough?")

@@ -586,5 +586,5 @@ def test_quiet_hides_progress_and_no_doubt(tmp_path, bench_log, capsys):
     capsys.readouterr()
     assert main(["convert", str(log), str(out), "--quiet"]) == 0
     said = capsys.readouterr().err
-    assert "column 't' is taken for a clock in s" in said
+    assert "column 't' is taken as the clock in s" in said
     assert "wrote" not in said

@@ -32,7 +32,7 @@ def test_the_schema_takes_what_is_shipped(path: Path) -> None:
     ("place", "content", "valid"),
     [
         ("fit.start", "equation-error", True),
-        ("fit.start", {"method": "equation-error", "stepwise": True}, True),
+        ("fit.start", "guess", False),
         ("fit.start", {"methd": "given"}, False),
         ("fit.nuisance", {"input_offset": ["x_roll"]}, True),
         ("fit.nuisance", {"input_offset": 3}, False),

@@ -1,6 +1,5 @@
 """How objects show themselves, and what other libraries get of them."""
 
-import sys
 from pathlib import Path
 
 import jax
@@ -11,7 +10,6 @@ import pytest
 from heli_jax import Flight, Free, Prior, Problem, fit, load_vehicle, models, simulate
 from heli_jax.finding import note
 from heli_jax.flights.flight import Source
-from heli_jax.identification.uncertainty.nuts import Posterior
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 SCRIPT = "<script>alert(1)</script>"
@@ -92,17 +90,3 @@ def test_a_run_as_a_dataset(run):
     assert batch.status.shape == (2,)
     with pytest.raises(ValueError, match="same times"):
         many._replace(times=jnp.stack([run.times, 2.0 * run.times])).to_xarray()
-
-
-def test_draws_as_arviz_data_or_a_sentence(monkeypatch):
-    draws = {"Ixx": np.random.default_rng(0).standard_normal((4, 100))}
-    posterior = Posterior(draws, 1.0, 400.0, 0)
-    with monkeypatch.context() as without:
-        without.setitem(sys.modules, "arviz", None)
-        with pytest.raises(ValueError, match=r"arviz is not installed.*extra bayes"):
-            posterior.to_arviz()
-    try:
-        import arviz  # noqa: F401
-    except ImportError:
-        pytest.skip("arviz is not installed")
-    np.testing.assert_array_equal(posterior.to_arviz()["posterior"]["Ixx"].values, draws["Ixx"])

@@ -379,7 +379,7 @@ def _found_by_fit(config: Config) -> tuple[str, ...]:
     """Return the parameters that a fit finds without a start value."""
     # A regression of the records needs no start, so neither the configuration nor the vehicle must
     # have one.
-    if config.fit is None or config.fit.start.method == "given":
+    if config.fit is None or config.fit.start == "given":
         return ()
     return tuple(config.fit.free)
 

@@ -227,12 +227,8 @@ def candidate_models(experiment: Experiment, fitted: Problem) -> "Alternatives":
     Raises:
         InputError: no axis of the model can be disturbed.
     """
-    # Imported on demand: the optimiser takes a second to import.
-    from heli_jax.identification.select import (
-        alternatives,
-        disturbed_sets,
-        undisturbed_too,
-    )
+    # Not before it is needed: it imports the optimiser, which takes a second.
+    from heli_jax.identification.select import alternatives, undisturbed_too
 
     model, disturbance = experiment.model, experiment.config.disturbance
     axes = disturbable(model)
@@ -247,13 +243,10 @@ def candidate_models(experiment: Experiment, fitted: Problem) -> "Alternatives":
     asked = (
         stated if disturbance is not None and disturbance.axis else undisturbed_too(model, stated)
     )
-    if len(asked) > 1:
-        with located(f"{experiment.path}: disturbance"):
-            return disturbed_sets(fitted, model, asked, stated)
-    axis = next(iter(asked))
-    # The stand is compared only if its stiffness is free.
-    bare = model.without_stand if "kappa" in fitted.free else None
-    return alternatives(fitted, model, axis, without_stand=bare)
+    # Whether there is a stand is in question only where its stiffness is.
+    bare = model.without_stand if len(asked) == 1 and "kappa" in fitted.free else None
+    with located(f"{experiment.path}: disturbance"):
+        return alternatives(fitted, model, asked, stated=stated, without_stand=bare)
 
 
 # Params are classes of each model, hence Any.
@@ -299,13 +292,13 @@ def _first_guesses(
     assert config is not None
     # Before the search: a parameter that the model lacks has no start.
     known = naming.names(experiment.model.Params)
-    found = config.start.method == "equation-error"
+    found = config.start == "equation-error"
     asked = [n for n, f in free.items() if found or math.isnan(f.start)]
     words = f"model {experiment.model.name} has no parameter"
     require_known(asked, known, f"{path}: fit.free", words)
     # NaN means that a start was left out; no optimiser can use it. A fit in frequency begins at the
     # given starts, and its result replaces them later.
-    if config.start.method != "equation-error":
+    if config.start != "equation-error":
         free = _from_vehicle(experiment, free)
         missing = [n for n, f in free.items() if math.isnan(f.start)]
         if missing:
@@ -318,12 +311,8 @@ def _first_guesses(
     # Imported on demand: it takes a second.
     from heli_jax.identification.equation_error.start import equation_error_start
 
-    # Without stepwise selection every term stays in the model; removing one has to be requested.
-    limits = (config.start.f_enter, config.start.f_remove) if config.start.stepwise else None
     with experiment.located("fit"):
-        guess = equation_error_start(
-            experiment.model, experiment.vehicle.params, flights, free, stepwise=limits
-        )
+        guess = equation_error_start(experiment.model, experiment.vehicle.params, flights, free)
     # Only the start is used: noise and gusts bias a regression, so bounds and priors stay as
     # stated.
     return {n: f._replace(start=guess.values[n].value) for n, f in free.items()}, guess
@@ -358,7 +347,7 @@ def _instrument_for(config: FitConfig, method: str) -> tuple[str, ...] | None:
         config: section whose `instrument` may apply to the start, or to a method of `also`.
         method: the method.
     """
-    others = [m for m in (config.start.method, *config.also) if m in METHODS]
+    others = [m for m in (config.start, *config.also) if m in METHODS]
     if objective_of(method).noise_model == "spectrum" or not any(
         objective_of(m).noise_model == "spectrum" for m in others
     ):
@@ -369,7 +358,7 @@ def _instrument_for(config: FitConfig, method: str) -> tuple[str, ...] | None:
 def _started_in_frequency(experiment: Experiment, problem: Problem) -> Problem:
     """Return the problem with the starts of `fit.start: frequency-error`, else unchanged."""
     config = experiment.config.fit
-    if config is None or config.start.method != "frequency-error":
+    if config is None or config.start != "frequency-error":
         return problem
     # Imported on demand: the optimiser takes a second to import.
     from heli_jax.identification.frequency_start import frequency_error_start, started

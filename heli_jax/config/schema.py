@@ -11,7 +11,6 @@ from heli_jax.config.onboard import Delay, Filters, Notches, OnboardConfig, Vibr
 from heli_jax.config.run_sections import SimulateConfig, SweepConfig
 from heli_jax.config.section import Section
 from heli_jax.config.signal_section import LoggedInputConfig, Numbers, PresetConfig, ScaledConfig
-from heli_jax.identification.equation_error.start import F_ENTER
 from heli_jax.identification.methods import METHODS
 from heli_jax.identification.problem import Sign
 
@@ -230,38 +229,6 @@ class ShootingConfig(Section):
 StartMethod = Literal["given", "equation-error", "frequency-error"]
 
 
-class StartMethodConfig(Section):
-    """Source of the free parameters' start values."""
-
-    method: StartMethod = "given"
-    """equation-error: by regression of the records, for linear models; frequency-error: by a fit in
-    frequency from the given starts"""
-    stepwise: bool = False
-    """true: leave out terms that hardly improve the prediction"""
-    # By default entry and removal have one limit; `F_ENTER` documents its origin.
-    f_enter: Positive = F_ENTER
-    """partial F-ratio above which a term enters"""
-    f_remove: Positive = F_ENTER
-    """partial F-ratio below which a term is removed again"""
-
-    @model_validator(mode="after")
-    def _consistent(self) -> "StartMethodConfig":
-        if self.stepwise and self.method != "equation-error":
-            raise ValueError(
-                f"stepwise: expected method: equation-error with it, got {self.method}"
-            )
-        # A term below the limit of removal at its entry would enter and leave forever.
-        if self.f_remove > self.f_enter:
-            raise ValueError(
-                f"f_remove: expected at most f_enter ({self.f_enter:g}), got {self.f_remove:g}"
-            )
-        return self
-
-
-def _start_method(value: Any) -> Any:
-    return {"method": value} if isinstance(value, str) else value
-
-
 class FitConfig(Section):
     # From the table of estimators, so that a new one needs no entry here.
     method: Literal[tuple(METHODS)] = "output-error"  # pyright: ignore[reportInvalidTypeForm]
@@ -270,11 +237,9 @@ class FitConfig(Section):
     """further methods that fit the same problem, for comparison with `method`"""
     free: dict[str, FreeConfig]
     """parameters to estimate, by the model's names"""
-    start: Annotated[
-        StartMethodConfig,
-        BeforeValidator(_start_method, json_schema_input_type=StartMethod | StartMethodConfig),
-    ] = StartMethodConfig()
-    """given, equation-error, frequency-error, or {method: equation-error, stepwise: true}"""
+    start: StartMethod = "given"
+    """source of the start values: given; equation-error, a regression of the records, for linear
+    models; frequency-error, a fit in frequency from the given values"""
     instrument: str | Annotated[list[str], Field(min_length=1)] | None = None
     """in frequency: inputs used by their instrument, or none; default all inputs with an instrument
     in every flight (docs/frequency-fits.md)"""
@@ -305,7 +270,7 @@ class FitConfig(Section):
 
     @model_validator(mode="after")
     def _another_start(self) -> "FitConfig":
-        if self.method == self.start.method:
+        if self.method == self.start:
             raise ValueError(f"start: {self.method}: expected another method to fit by")
         return self
 

@@ -320,8 +320,8 @@ def repeats_removed(
             continue
         made[name] = without_repeats(y, usual)
         words = (
-            f"{name} keeps each value for {usual} samples: the first is used and the others are missing "
-            "(`repeats: keep` keeps them)"
+            f"{name} keeps each value for {usual} samples: the first is used, the others are "
+            "missing (`repeats: keep` keeps them)"
         )
         notes.append(note("repeats.missing", words, name, value=usual))
     return made, notes

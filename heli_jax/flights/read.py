@@ -67,7 +67,7 @@ def read_flight(
         outputs: the same for the measured outputs.
         options: part and rate of the log to read; by default all of it.
         **keywords: fields of ReadOptions that replace those of `options`: `rate` [Hz], `window`
-        [s], `known` [SI], `hold_out`, `name`, `number`, `also`.
+            [s], `known` [SI], `hold_out`, `name`, `number`, `also`.
 
     Raises:
         InputError: one sentence on what is wrong with the log or with the arguments.

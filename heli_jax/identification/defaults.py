@@ -16,31 +16,27 @@ from heli_jax.flights.flight import Flight
 from heli_jax.numerics.white_noise import rises_when_slower, wanders
 from heli_jax.vehicle import of_helicopter
 
-# Outputs whose sensor's noise came through an on-board low-pass, and is not white in the log.
-
-
 _WHITE_TO = 3.0
 """times its cut-off, up to which rate noise behind a low-pass is nearly white: by simulation, see
 docs/onboard.md"""
 
 
 def filtered_noise(low_passes: Sequence[LowPass], flights: Sequence[Flight]) -> tuple[LowPass, ...]:
-    """The low-passes above whose cut-off the flights have samples, where the samples show them."""
+    """Return the low-passes which the noise of the flights shows."""
     return tuple(p for p in low_passes if any(_shows(p, f) for f in flights))
 
 
 def _shows(low_pass: LowPass, flight: Flight) -> bool:
-    """True if noise in an output falls off as the low-pass lets it, near the Nyquist frequency or
-    from the least rate at which it is not white."""
+    """Return True if the noise of an output falls off as behind the low-pass."""
     above = 1.0 / (flight.dt * _WHITE_TO * low_pass.hz)
     if low_pass.output not in flight.outputs or not above > 1.0:
         return False
     signal = flight.outputs[low_pass.output]
-    # Noise behind the filter, or a coarse log, hides at the fastest end what came through it.
+    # Noise behind the filter, or a coarse log, hides this near the Nyquist frequency.
     return wanders(signal) or rises_when_slower(signal, max(2, int(above)))
 
 
-# params, states and inputs are Any: records of a model, whose classes may be a user's own.
+# Params, states and inputs are Any: records of a model.
 
 _ALLOWED = 10.0
 """times what was measured: the sd of the weak prior of a bias or an initial state"""
@@ -50,21 +46,20 @@ _ROUNDING = 1e-8
 def offset_inputs(
     model: Model, params: Any, flight: Flight, free: tuple[str, ...]
 ) -> tuple[str, ...]:
-    """The sticks of a vehicle in free flight: those whose constant offset no initial state and no
-    bias can take the place of, in the order of the model.
+    """Return the sticks of a vehicle in free flight, in the order of the model: inputs whose
+    constant offset is no initial state and no bias.
 
-    Throttle and collective have no centre, and where a free parameter is a constant term of the
-    equations that parameter stands for the offsets already.
+    Throttle and collective have no centre. A free parameter that is a constant term of the
+    equations replaces all offsets.
     """
     centreless = ("x_throttle", "x_collective", "Omega")
     sticks = [n for n in naming.names(model.Inputs) if n not in centreless]
-    # Our model that is not linear is the whole helicopter, which flies free. Its matrices at the
-    # mean inputs and the model's own initial state, no trim, would say nothing.
+    # The nonlinear model is the whole helicopter, which flies free.
     if of_helicopter(model.Params) and not model.linear:
         return tuple(sticks)
     if flight.known:
         params = naming.replace(params, **{n: jnp.asarray(v) for n, v in flight.known.items()})
-    # A model declared linear vanishes at zero, so it has no constant term to look for.
+    # A model declared linear has no constant term.
     if not model.linear and _has_constant_term(model, params, free):
         return ()
     taken_up = _taken_up(model, params, flight)
@@ -72,12 +67,11 @@ def offset_inputs(
 
 
 def _taken_up(model: Model, params: Any, flight: Flight) -> set[str]:
-    """The inputs whose constant offset moves a model to another equilibrium, where a bias of the
-    outputs shows it like the one before.
+    """Return the inputs whose constant offset only moves the equilibrium, as a bias of the outputs.
 
-    Of a vehicle in free flight there is no such equilibrium, or it is farther off than the weak
-    prior of a bias lets it be: a slow mode (the spiral of an aeroplane) goes far in the end, though
-    not in the record. The model is linearised at the flight's mean inputs.
+    A vehicle in free flight has no such equilibrium, or one farther off than the weak prior of a
+    bias: a slow mode (the spiral of an aeroplane) goes far in the end, though not in the record.
+    The model is linearised at the flight's mean inputs.
     """
     dtype = jnp.result_type(float)
     means = {n: np.asarray(np.mean(u), dtype) for n, u in flight.inputs.items()}
@@ -89,7 +83,7 @@ def _taken_up(model: Model, params: Any, flight: Flight) -> set[str]:
     C = C[[outputs.index(n) for n in flight.outputs]]
     A, (scale, _) = scipy.linalg.matrix_balance(A, permute=False, separate=True)
     B, C = B / scale[:, None], C * scale
-    # Only what the outputs show has to come to rest: the span of C', A'C', ...
+    # Only the observable part has to come to rest: the span of C', A'C', ...
     V, further = np.zeros((len(A), 0)), C.T
     while further.size:
         sizes = np.max(np.abs(further), axis=0)
@@ -102,11 +96,11 @@ def _taken_up(model: Model, params: Any, flight: Flight) -> set[str]:
     x = np.linalg.lstsq(rates, -drive, rcond=_ROUNDING)[0]
     largest = np.array([np.ptp(flight.inputs[n]) / 2.0 for n in inputs])
     rms = np.array([np.sqrt(np.nanmean(np.square(y))) for y in flight.outputs.values()])
-    # Start values may be so large that their squares overflow: nothing is taken up then.
+    # Start values may be so large that their squares overflow.
     with np.errstate(all="ignore"):
         rests = np.linalg.norm(rates @ x + drive, axis=0) <= 1e-6 * np.linalg.norm(drive, axis=0)
-        # From another initial state it is there from the first sample on, unless that state leaves
-        # in an unstable mode what was measured.
+        # With another initial state it is there from the first sample on, unless an unstable mode
+        # leaves the record.
         end = C @ V @ scipy.linalg.expm(rates * flight.duration) @ x
         moved = np.stack([C @ V @ x, end])
         near = np.all(np.abs(moved) * largest <= _ALLOWED * rms[:, None], axis=(0, 1))
@@ -114,7 +108,7 @@ def _taken_up(model: Model, params: Any, flight: Flight) -> set[str]:
 
 
 def _has_constant_term(model: Model, params: Any, free: tuple[str, ...]) -> bool:
-    """True if a free parameter is added to the rates whatever the state and the inputs are."""
+    """Return True if a free parameter is a constant term of the rates."""
     rng = np.random.default_rng(11)
     dtype = jnp.result_type(float)
 
@@ -127,8 +121,7 @@ def _has_constant_term(model: Model, params: Any, free: tuple[str, ...]) -> bool
 
     values = {n: jnp.asarray(getattr(params, n), dtype) for n in free}
     slopes_at_points = []
-    # A constant term has the same derivative everywhere. Three random points: one where the
-    # derivative of another term happens to be the same is as good as impossible.
+    # A constant term has the same derivative everywhere: at three random points.
     for _ in range(3):
         slopes = jax.jacfwd(rates)(values, draw(model.State), draw(model.Inputs))
         by_state = naming.asdict(slopes)

@@ -25,7 +25,7 @@ from heli_jax.identification.estimation.disturbance_search import likely_gusts
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import measured_count
 from heli_jax.identification.estimation.multistart import FirstGuess, StartRow
-from heli_jax.identification.estimation.noise_covariance import first_noise, unless_stuck
+from heli_jax.identification.estimation.noise_covariance import first_noise
 from heli_jax.identification.estimation.objective import noise_unknowns
 from heli_jax.identification.identifiability.analysis import Around, verdict_of
 from heli_jax.identification.identifiability.equivalents import Valley, second_solutions
@@ -56,7 +56,7 @@ def _with_likely_gusts(problem: Problem) -> FirstGuess:
     guess = first_guess(problem)
     if not (unstated_gusts(problem) and guess.layout.disturbance):
         return guess
-    z, e = likely_gusts(Solution(*guess[:4]), guess.e)
+    z, e = likely_gusts(Solution(*guess[:4]))
     return guess._replace(z=z, e=e)
 
 
@@ -66,7 +66,7 @@ def _require_problem(problem: Any) -> None:
             f"problem: expected a heli_jax.Problem, got {type(problem).__name__}; of a "
             "configuration heli_jax.config.problem(heli_jax.load_config(path)) makes it"
         )
-    # In single precision a filter's likelihood and the rank of a Jacobian are lost in rounding.
+    # In single precision the rank of a Jacobian is rounding.
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise ValueError(
             "fit and check need double precision: call jax.config.update('jax_enable_x64', True) "
@@ -86,7 +86,7 @@ def check(problem: Problem) -> Check:
         guess = guess._replace(noise=noise, e=evaluate(guess.layout, guess.data, noise, guess.z))
     c = context_of(problem, guess)
     findings, verdict = diagnose(c), c.verdict
-    # Sensitivities are those of the model, whatever moved what was measured.
+    # Sensitivities are those of the model, even if the outputs do not follow its inputs.
     if any(f.code == NOTHING_FOLLOWS and f.severity == "refuse" for f in findings):
         words = sentence("verdict.nothing-follows", names=verdict.names)
         verdict = verdict.nothing(words)
@@ -103,8 +103,7 @@ def context_of(problem: Problem, guess: FirstGuess | None = None) -> Context:
         guess: of `first_guess`, where it is at hand already.
     """
     guess = guess or first_guess(problem)
-    # Start values that are far off may determine other parameters than the optimum does. The fit
-    # analyses its optimum again.
+    # Far from the optimum other parameters may be determined; the fit analyses its optimum again.
     at = Solution(*guess[:4])
     second = second_solutions(problem, at, guess.e, optimum=False)
     around = Around(second=second, valley=Valley(problem, at, guess.e))
@@ -135,7 +134,7 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
     ranking = rank_windows(problem, at, guess.e, length)
     c = Context(problem, at, guess.e, guess.e, verdict_of(problem, guess.layout, guess.e))
     notes = tuple(gusts_guessed(c))
-    # A record may be at rest for most of its time and still have a good window.
+    # A record that mostly rests may still have a good window.
     asked = (rates_enough, nothing_follows, inputs_together)
     record = tuple(
         f._replace(severity="doubt") if f.code == NOTHING_FOLLOWS else f
@@ -179,12 +178,10 @@ def fit(
     report = progress or (lambda _: None)
     with stage("first guess"):
         guess = first_guess(problem)
-    # If the optimiser does not converge, this is all that is known of identifiability.
     before = verdict_of(problem, guess.layout, guess.e)
     words = f"fitting {', '.join(guess.layout.of_interest)}"
     report(words)
-    # Simulations of an unstable model overflow on the way. The search handles numbers that are not
-    # finite, so NumPy need not warn.
+    # Simulations of an unstable model overflow, which the search handles.
     with stage(words), np.errstate(over="ignore", invalid="ignore"):
         ended = search(problem, guess, starts, seed, max_steps, report)
     timing = {"fit": time.perf_counter() - began}
@@ -199,7 +196,6 @@ def _where_ended(
     """Return the Context at the end of the search."""
     layout, data, optimum = ended.search.layout, ended.search.data, ended.optimum
     e = evaluate(layout, data, optimum.noise, optimum.best.z)
-    optimum = unless_stuck(layout, optimum, e, problem.free)
 
     def context() -> Context:
         at = Solution(layout, data, optimum.noise, optimum.best.z)
@@ -208,7 +204,7 @@ def _where_ended(
     c = context()
     if c.rounding:
         # No diagnostic may use a likelihood that is rounding.
-        optimum = optimum._replace(best=optimum.best._replace(converged=np.asarray(False)))
+        optimum = optimum._replace(best=optimum.best._replace(converged=False))
         c = context()
     return c
 
@@ -217,8 +213,8 @@ def _result(c: Context, starts: tuple[StartRow, ...], seed: int, timing: dict[st
     """Put the Fit together."""
     layout, data, noise, _ = c.at
     assert c.optimum is not None
-    # AIC and BIC count all that was estimated, but no disturbance that vanished: with sigma_w = 0
-    # the correlation time has no meaning either.
+    # AIC and BIC count no disturbance that vanished: with sigma_w = 0 the correlation time has no
+    # effect either.
     unknowns = layout.determined + noise_unknowns(layout) - len(c.absent)
     findings = diagnose(c)
     estimates = {n: c.estimates[n] for n in layout.free}

@@ -1,7 +1,7 @@
-"""A first guess of a problem's parameters by frequency error, for a fit in time.
+"""Start values for a fit in time by a fit with frequency error.
 
-The misfit in time has valleys and plateaus far from its optimum, and an unstable vehicle's
-simulation overflows there; the one in frequency simulates nothing.
+Far from its optimum the cost in time has local minima and plateaus, and the simulation of an
+unstable vehicle overflows. The cost in frequency needs no simulation.
 """
 
 import dataclasses
@@ -25,8 +25,6 @@ class FrequencyErrorStart(NamedTuple):
     """that it took"""
     notes: tuple[str, ...]
     """of the fit in frequency"""
-    selection: None = None
-    """no stepwise selection of terms"""
 
     @property
     def findings(self) -> list[Finding]:
@@ -37,8 +35,6 @@ class FrequencyErrorStart(NamedTuple):
             reasons = list(dict.fromkeys(v.reason for v in self.values.values() if v.reason))
             return [found("start.frequency-error-failed", "note", reasons=reasons, **run)]
         out = [found("start.frequency-error", "note", names=taken, **run)]
-        if several := [n for n in taken if self.values[n].sd is None]:
-            out.append(found("start.several-solutions", "note", names=several))
         return out + reasons_of(self.values)
 
 
@@ -63,10 +59,10 @@ def frequency_error_start(problem: Problem, *, max_steps: int = 200) -> Frequenc
             reason = "the spectra do not determine them"
         else:
             reason = "frequency error ended at their bounds" if e.at_bound else ""
-        values[name] = StartValue(e.value, e.sd, e.unit, "frequency error", "")
+        values[name] = StartValue(e.value, e.unit, "frequency error", "")
         if reason:
             stated = problem.free[name].start
-            values[name] = StartValue(stated, None, e.unit, "as stated", reason)
+            values[name] = StartValue(stated, e.unit, "as stated", reason)
     return FrequencyErrorStart(values, first.status, time.perf_counter() - began, first.notes)
 
 

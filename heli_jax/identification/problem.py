@@ -1,4 +1,4 @@
-"""Problem: what is fitted to what, what is free in it, and what makes no sense of it."""
+"""Problem: model, flights and free parameters, and the checks that they fit together."""
 
 import functools
 import math
@@ -42,8 +42,7 @@ class Free(NamedTuple):
     """
 
     start: float = math.nan
-    """the initial guess; NaN where none is stated, and one has to be found before a Problem is made
-    (`equation_error_start`)"""
+    """the initial guess; NaN to find one before a Problem is made (`equation_error_start`)"""
     lower: float | None = None
     upper: float | None = None
     prior: Prior | None = None
@@ -84,13 +83,13 @@ MAX_TIME_SHIFT = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A model, a vehicle, flights, and what is free.
+    """A model, a vehicle, flights, and free parameters.
 
     Flights with `hold_out` are predicted, never fitted. A flight's `known` parameters replace the
     vehicle's for that flight.
 
     Raises:
-        ValueError: something in it does not fit together; the sentence says what and where.
+        ValueError: parts that do not fit together, with their place.
         TypeError: `model` is no Model.
     """
 
@@ -107,27 +106,25 @@ class Problem:
     """output-error compares with a simulation; filter-error with one-step predictions of a
     Kalman filter, for models with a disturbance (`with_disturbance`)"""
     fixed_noise: tuple[str, ...] = ()
-    """what filter error takes as given instead of estimating it: `sigma_w` and `tau_w` (of several
-    disturbances `sigma_w_p`, ...) from `vehicle`, `sigma_y` (the measurement noise) from the
-    flights' `sd`"""
+    """noise that filter error does not estimate: `sigma_w` and `tau_w` (of several disturbances
+    `sigma_w_p`, ...) of `vehicle`, `sigma_y` (the measurement noise) by the flights' `sd`"""
     window: float | None = None
     """multiple shooting: flights are simulated in windows of this length [s], each from an initial
-    state of its own, because the error of an initial state grows in unstable flight"""
+    state of its own, since the error of an initial state grows in unstable flight"""
     continuity: float | None = None
     """with windows: standard deviation of the jump of each state from one window to the next, as a
-    part of what the state does; None leaves them apart"""
+    part of its motion; None: free jumps"""
     instrument: tuple[str, ...] | None = None
     """in frequency: inputs that are taken by their instrument (`Flight.instruments`); None: all
     that every flight holds one of; (): none"""
     # Any: an EquationErrorStart, whose class stands above this module in the order of imports.
     first_guess: Any = None
-    """how the starts were found, for the report; None where they were given"""
+    """the origin of the starts, for the report; None where they are given"""
     frequency: ResponseOptions = field(default_factory=ResponseOptions)
-    """frequency-response: band, windows, and the responses that are fitted; the same problem by
-    another method takes no notice of it"""
+    """frequency-response: band, windows, and the responses that are fitted"""
 
     def __post_init__(self) -> None:
-        # The model first: all that follows asks it for names and units.
+        # The model first: other checks take its names and units.
         check_model(self.model)
         _check_arguments(self.model.Params, self.vehicle, self.flights, self.free)
         if not isinstance(self.nuisance, Nuisance):
@@ -138,8 +135,7 @@ class Problem:
         if self.instrument is not None:
             names = (self.instrument,) if isinstance(self.instrument, str) else self.instrument
             object.__setattr__(self, "instrument", tuple(names))
-        # All constants of a helicopter are of one sign; derivatives of an aircraft, say, are not.
-        # So is what the model says is positive; delays and gains of devices around it are not.
+        # All constants of a helicopter keep their sign; derivatives of an aircraft, say, do not.
         positive = set(self.model.positive)
         if of_helicopter(self.model.Params):
             positive |= set(naming.names(Helicopter))
@@ -147,7 +143,6 @@ class Problem:
             n: f if f.sign is not None else f._replace(sign="keep" if n in positive else "any")
             for n, f in self.free.items()
         }
-        # Frozen: what was accepted in another form is put right once, here.
         object.__setattr__(self, "free", free)
         _check_method(self)
         if not self.free:
@@ -177,12 +172,11 @@ class Problem:
         """The parameters of the disturbances that filter error estimates, with their starts."""
         if self.noise_model != "disturbance":
             return {}
-        # Of the size of the motion, and a second: a coarse search takes it from there.
+        # The size of the motion, and a second: the start of a coarse search.
         sizes = {d.sigma: self.motion for d in disturbances_of(self.model)}
         free = {n: Free(sizes.get(n, 1.0)) for n in self.noise_names}
         for name in free:
-            # What somebody stated goes before the guess. Zero is the default of a sigma and no
-            # statement: it has no logarithm to begin with.
+            # A stated value counts. Zero is the default of a sigma.
             value = float(getattr(self.vehicle, name))
             if math.isfinite(value) and value > 0:
                 free[name] = Free(value)
@@ -198,11 +192,11 @@ class Problem:
 
     @functools.cached_property
     def filtered_noise(self) -> dict[str, Free]:
-        """By output the start of the sd of its sensor's noise where that came through on-board
-        low-passes and the samples show it; filter error estimates it by itself."""
+        """By output the start of the sd of its sensor's noise before on-board low-passes, if the
+        samples show them; filter error estimates it."""
         if self.noise_model != "disturbance" or self.noise_is_fixed:
             return {}
-        # A model's own parameter of that name is its own noise of that sensor.
+        # A model may have its own noise of that sensor.
         own = naming.names(self.model.Params)
         coloured = [p.output for p in filtered_noise(self.model.low_passes, self.training)]
         return {
@@ -219,8 +213,8 @@ class Problem:
 
     @functools.cached_property
     def offset_inputs(self) -> tuple[str, ...]:
-        """The inputs whose offset is estimated, in the order of the model: as
-        `nuisance.input_offset` says, or the sticks of a vehicle in free flight."""
+        """The inputs whose offset is estimated, in the order of the model: those of
+        `nuisance.input_offset`, or the sticks of a vehicle in free flight."""
         inputs, requested = naming.names(self.model.Inputs), self.nuisance.input_offset
         if requested is None:
             # The first flight alone: all are of one vehicle.
@@ -258,7 +252,7 @@ class Problem:
 
     @functools.cached_property
     def _varied(self) -> naming.Varied:
-        # What is known under a wrong name is refused when its flight is checked, with its place.
+        # `_check_flight` refuses other names.
         own = set(naming.names(type(self.vehicle)))
         known = (n for f in self.flights for n in f.known if n in own)
         return naming.Varied(self.vehicle, dict.fromkeys((*self.free, *known)))
@@ -322,10 +316,9 @@ def _check_windows(problem: Problem) -> None:
             raise ValueError(f"{key} must be above zero, got {value:g}")
     if window is None:
         return
-    # A filter corrects its state at every sample, which is what windows are for.
+    # A filter corrects its state at every sample.
     if problem.noise_model != "white":
         raise ValueError(f"window is for method output-error: {problem.method} needs none")
-    # Nothing measured says where a window begins.
     if not problem.nuisance.initial_state:
         raise ValueError("windows need nuisance.initial_state, which is off")
     for flight in problem.flights:
@@ -345,7 +338,7 @@ def _check_possible(problem: Problem) -> None:
         return
     for key in ("start", "lower", "upper"):
         values = {n: getattr(f, key) for n, f in problem.free.items()}
-        # A bound of zero is the usual way to say that a mass is positive, and is never reached.
+        # A bound of zero on a mass only states its sign.
         stated = {
             n: v for n, v in values.items() if v is not None and not (key != "start" and v == 0)
         }
@@ -364,7 +357,7 @@ def _check_flight(flight: Flight, problem: Problem) -> None:
     missing = [n for n in naming.names(model.Inputs) if n not in flight.inputs]
     if missing:
         raise ValueError(f"{where} has no input {missing[0]!r}, which model {model.name} needs")
-    # An output of the model need not be measured; what is measured has to be one of them.
+    # An output of the model need not be measured.
     unknown = [n for n in flight.outputs if n not in naming.names(model.Outputs)]
     if unknown:
         raise ValueError(
@@ -374,20 +367,18 @@ def _check_flight(flight: Flight, problem: Problem) -> None:
     if not flight.outputs:
         raise ValueError(f"{where} has no output: nothing can be compared with the model")
     for name, y in flight.outputs.items():
-        # Most may be missing, as those of a slow sensor are; but a handful has no variance of its
-        # own, and so no noise.
+        # Most may be missing, as of a slow sensor; but a handful of samples has no noise.
         if (seen := int(np.isfinite(y).sum())) < FEWEST_SEEN:
             raise ValueError(
                 f"{where}, output {name!r}: expected at least {FEWEST_SEEN} measured samples, got "
                 f"{seen} of {y.size}"
             )
-        # A flight held out is simulated, not weighed: it needs no noise.
         if problem.noise_is_fixed and name not in flight.sd and not flight.hold_out:
             raise ValueError(
                 f"{where}, output {name!r}: expected the sd of its noise, which is fixed "
                 "(sigma_y), got none"
             )
-    # What one flight knows cannot be estimated over all of them.
+    # A parameter is known of a flight or estimated over all.
     for name, value in flight.known.items():
         if name not in naming.names(model.Params):
             raise ValueError(
@@ -402,7 +393,7 @@ def _check_flight(flight: Flight, problem: Problem) -> None:
         if wrong:
             raise ValueError(f"{where}, known: {wrong}")
     count, least = len(problem.free), _PER_PARAMETER * len(problem.free)
-    # What counts is what was measured, of the output of which most was.
+    # By the output with the most measured samples.
     measured = max(int(np.isfinite(y).sum()) for y in flight.outputs.values())
     if not flight.hold_out and measured < least:
         raise ValueError(
@@ -414,10 +405,10 @@ def _check_flight(flight: Flight, problem: Problem) -> None:
 def _check_model(problem: Problem) -> None:
     params, model = problem.start_params(), problem.model
     for flight in problem.flights:
-        # With what each flight knows: that alone may complete a vehicle.
+        # The known parameters of a flight may complete a vehicle.
         own = naming.replace(params, **flight.known)
         require_constants(model, own)
-        # A helicopter of ours begins anywhere. First rates depend on the flight's first inputs.
+        # First rates depend on the flight's first inputs.
         if not model.linear and not of_helicopter(model.Params):
             first = {n: float(u[0]) for n, u in flight.inputs.items()}
             if wrong := cannot_start(model, own, first):
@@ -458,7 +449,6 @@ def _check_free(name: str, free: Free, model: Model) -> None:
         ),
         (free.sign not in ("keep", "any"), f".sign: expected 'keep' or 'any', got {free.sign!r}"),
         (positive and start <= 0, f".start: expected more than zero, {since}, got {start:g}"),
-        # Zero will do as a lower bound, which is open.
         (
             positive and -math.inf < low < 0,
             f".lower: expected zero or more, {since}, got {low:g}",
@@ -469,12 +459,12 @@ def _check_free(name: str, free: Free, model: Model) -> None:
             f".sign: keep: expected bounds of one sign, got {low:g} to {high:g}",
         ),
         (low >= high, f": lower must be below upper, got {low:g} and {high:g}"),
-        # Not on a bound either: in the coordinates of a bounded parameter its ends are at infinity.
+        # Between two bounds of different sign a bound has an infinite coordinate.
         (
             not low < start < high,
             f".start: expected a value inside {low:g} to {high:g}, got {start:g}",
         ),
-        # Zero has no logarithm; between two bounds the search is in another coordinate.
+        # Zero has no logarithm.
         (
             start == 0 and keeps and not bounded,
             ".start: expected a start of the right sign and size, or lower and upper, or sign: "
@@ -487,7 +477,7 @@ def _check_free(name: str, free: Free, model: Model) -> None:
 
 
 def _numbers(free: Free) -> dict[str, Any]:
-    """The numbers that are given, by the name of their key."""
+    """Return the stated numbers, by key."""
     prior = free.prior
     numbers = {"start": free.start, "lower": free.lower, "upper": free.upper}
     if prior is not None:
@@ -495,21 +485,18 @@ def _numbers(free: Free) -> dict[str, Any]:
     return {key: value for key, value in numbers.items() if value is not None}
 
 
-# What a script may pass for a Problem, said in words where it passed something else.
-
-
 _HEADINGS = {"psi", "yaw"}
-"""angles that may go on for more than a turn"""
+"""angles that may exceed a turn"""
 _FURTHEST = 6 * math.pi
 """rad: linear models of an axis roll over in long records, with no pilot to hold them"""
 _HALF_TURN = 1.1 * math.pi
-"""rad that nothing but an unwrapped roll or loop goes beyond"""
+"""rad: only an unwrapped roll or loop goes beyond"""
 _FASTEST, _OVER = 15.0, 0.1
 """rad/s, 860 deg/s: no helicopter turns as fast for that many seconds"""
 
 
 def _check_arguments(params: type, vehicle: Any, flights: Any, free: Any) -> None:
-    """Refuse what is of another kind than it has to be.
+    """Refuse arguments of another type.
 
     Raises:
         TypeError: naming the argument, what was expected and what was found.
@@ -534,7 +521,7 @@ def _check_arguments(params: type, vehicle: Any, flights: Any, free: Any) -> Non
             kind = type(each.prior).__name__
             raise TypeError(f"free.{name}.prior: expected Prior(mean, sd), got {kind}")
         for key, value in _numbers(each).items():
-            # Of Python, NumPy or JAX; True is none, though Python counts with it.
+            # Numbers of Python, NumPy or JAX; not True.
             kind = getattr(value, "dtype", np.dtype(type(value))).kind
             if getattr(value, "shape", ()) != () or kind not in "iuf":
                 raise TypeError(f"free.{name}.{key}: expected a number, got {value!r:.60}")
@@ -553,7 +540,7 @@ def _warn_of_degrees(outputs: type, flights: Sequence[Flight]) -> None:
         y, steps = np.asarray(flight.outputs[name], float), max(1, round(_OVER / flight.dt))
         turned = np.abs(y[steps:] - y[:-steps])
         turned = turned[np.isfinite(turned)]
-        # Single wild samples are left out.
+        # Without single wild samples.
         fastest = float(np.quantile(turned, 0.98)) / (steps * flight.dt) if turned.size else 0.0
         largest = float(np.nanmax(np.abs(y), initial=0.0))
         if largest > _FURTHEST or (largest > _HALF_TURN and fastest > _FASTEST):

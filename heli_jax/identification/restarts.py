@@ -54,23 +54,23 @@ class Restart(NamedTuple):
     points: Callable[[SearchState], Iterable[StartPoint]]
 
 
-# By windows: where a damping begins with the wrong sign, a simulation over the whole record grows
-# by many powers of ten, and least squares finds no way back: the gradient is all in the growth.
-# Over short windows, each from an initial state of its own, nothing has the time to grow (multiple
-# shooting; Bock, 1983).
+# By windows: if a damping starts with the wrong sign, the simulation over the whole record grows
+# by many powers of ten, and least squares does not recover: all of the gradient is in the growth.
+# Over short windows, each from an initial state of its own, nothing grows (multiple shooting; Bock,
+# 1983).
 
 _FAR_WORSE = 10.0
-"""times the misfit of no model at all from which a start is taken for one that diverges"""
+"""times the misfit of no model above which the simulation diverges at the start"""
 _WINDOWS = 16
 """of the shortest flight, unless they had too few samples each"""
 _PER_STATE = 5
 """samples that a window has at least for each initial state that it brings"""
 _STEPS = 60
-"""of the optimiser over the windows: what has not converged by then is only a start"""
+"""of the optimiser over the windows, whose end is only a start"""
 
 
 def _diverges(at: SearchState) -> bool:
-    """True if the search failed, the simulation diverges at its start and windows are possible."""
+    """Return True if the search failed, its start diverges and windows are possible."""
     problem, guess = at.search.problem, at.guess
     possible = (
         problem.noise_model == "white" and problem.window is None and problem.nuisance.initial_state
@@ -100,32 +100,31 @@ def _by_windows(at: SearchState) -> list[StartPoint]:
     shared = guess.layout.first_nuisance
     z = start_vector(layout, data, cut).at[:shared].set(guess.z[:shared])
     [short] = Search(cut, layout, data, _STEPS).run(guess.noise, z[None, :])
-    # Not whether it converged: half a way out of the growth is enough to begin from.
+    # Converged or not: half the way out of the growth is a good enough start.
     if not (np.isfinite(short.cost) and bool(jnp.all(jnp.isfinite(short.z)))):
         return []
-    # The windows' initial states stay behind: they were free to take up what the parameters missed.
+    # Without the windows' initial states, which could take up what the parameters missed.
     return [(guess.noise, guess.z.at[:shared].set(short.z[:shared]))]
 
 
-# Further starts: a mode far from where it is sought leaves no slope towards it. Relaxation, which
-# weighs several outputs by the noise, ends in the optimum that its first guess of the noise leads
-# to, where a smooth output of little noise has had all the say. In frequency a pole and its mirror
-# image have the same gain, so that where inputs tell little a spectrum which is estimated leaves
-# the likelihood an optimum on either side.
+# Further starts: a mode far from its start leaves no gradient towards it. With several outputs the
+# relaxation of the noise ends in the optimum of its first guess, in which a smooth output of little
+# noise has the most weight. In frequency a pole and its mirror image have the same gain: with weak
+# inputs the likelihood has an optimum on either side.
 
 _LITTLE = 0.5
-"""part of the outputs' variance below which an optimum explains little"""
+"""part of the outputs' variance below which an optimum explains too little"""
 _DRAWN = 5
 
 
 def _needs_further_starts(at: SearchState) -> bool:
-    """True if a linear model explains less than half of the outputs' variance, or became unstable
-    in a search in frequency."""
+    """Return True if a linear model explains less than half of the outputs' variance, or became
+    unstable in a search in frequency."""
     layout, best = at.search.layout, at.best
     if at.drawn is not None or not layout.model.linear or layout.disturbance:
         return False
     if layout.noise_model == "white":
-        # By the noise of the first guess: with the relaxed one each output would leave as much.
+        # By the noise of the first guess: the relaxed one makes all outputs' misfits equal.
         data, noise = at.search.data, at.guess.noise
         left = sum_of_squares(evaluate(layout, data, best.noise, best.best.z).raw, noise)
         outputs = [{n: np.asarray(y) for n, y in f.outputs.items()} for f in data.flights]
@@ -136,7 +135,7 @@ def _needs_further_starts(at: SearchState) -> bool:
 
 
 def left_stability(search: Search, optimum: RelaxedOptimum) -> bool:
-    """True if the start values were stable and an optimum is not."""
+    """Return True if the start values were stable and an optimum is not."""
     problem = search.problem
     values = named_values(search.layout, search.data, optimum.best.z)
     return is_unstable(problem, problem.params_with(values)) and not is_unstable(
@@ -155,29 +154,29 @@ def _further_starts(at: SearchState) -> list[StartPoint]:
             )
         values = {n: regressed.values[n].value for n in problem.free}
         points[0] = _with_values(at, np.array(guess.z), values)
-    # Nothing can be regressed: no state was measured, say.
+    # Without measured states there is no regression.
     except (ValueError, np.linalg.LinAlgError):
         points = points[1:]
     return [(guess.noise, jnp.asarray(z, guess.z.dtype)) for z in points]
 
 
 def _with_values(at: SearchState, z: np.ndarray, values: dict[str, float]) -> np.ndarray:
-    """The unknowns with values of the free parameters; what is out of bounds stays."""
+    """Return the unknowns with values of the free parameters; one out of bounds stays as it is."""
     for i, (name, free) in enumerate(at.search.problem.free.items()):
         coordinate = transforms.coordinate(free, at.guess.layout.kinds[i], values[name])
         z[i] = z[i] if coordinate is None else coordinate
     return z
 
 
-# Same responses: two modes may exchange their parts. A heave mode and an inflow with a slow damping
-# and a quick lag answer a collective like one with a quick damping and a slow lag. A disturbance
-# tells them apart, as it acts through one of them alone; but a search that began on the wrong side
-# ends there, with white innovations and a likelihood that lacks a few units.
+# Same responses: two modes may exchange their parts. Heave and inflow with a slow damping and a
+# quick lag have the same response to collective as with a quick damping and a slow lag. Only the
+# disturbance, which acts through one of them, distinguishes them; but a search that began on the
+# wrong side ends there, with white innovations and a likelihood lower by a few units.
 
 _MOST_PARAMETERS = 8
-"""of which equal responses are sought: more take long"""
+"""of which equal responses are searched: more take long"""
 _OTHERS = 2
-"""other values that a filter is begun from"""
+"""other values that a filter is started from"""
 
 
 def _has_one_disturbance(at: SearchState) -> bool:
@@ -185,7 +184,7 @@ def _has_one_disturbance(at: SearchState) -> bool:
     return (
         bool(best.best.converged)
         and len(layout.sigmas) == 1
-        # Where the record shows no disturbance nothing tells such values apart.
+        # Without a disturbance nothing distinguishes such values.
         and (best.ratio is None or best.ratio > NO_DISTURBANCE)
         and at.search.problem.model.linear
         and len(layout.free) <= _MOST_PARAMETERS
@@ -193,14 +192,14 @@ def _has_one_disturbance(at: SearchState) -> bool:
 
 
 def _same_responses(at: SearchState) -> list[StartPoint]:
-    """Other values with the same responses to the inputs."""
+    """Return other values with the same responses to the inputs."""
     search, best, layout = at.search, at.best, at.search.layout
     here = Solution(layout, search.data, best.noise, best.best.z)
     others = second_solutions(at.search.problem, here, evaluate(*here))
     points = []
     for other in others[:_OTHERS]:
         z = _with_values(at, np.array(best.best.z), other.values)
-        # Initial states are those of the other values too: from zero they follow.
+        # Initial states belong to the other values too: they are estimated again from zero.
         z[layout.first_nuisance :] = 0.0
         z = with_noise_guess(search, best.noise, jnp.asarray(z, best.best.z.dtype))
         e = evaluate(layout, search.data, best.noise, z)
@@ -213,4 +212,4 @@ RESTARTS: tuple[Restart, ...] = (
     Restart("further-starts", _needs_further_starts, _further_starts),
     Restart("same-responses", _has_one_disturbance, _same_responses),
 )
-"""in the order in which they are asked"""
+"""in the order in which they are tried"""

@@ -19,12 +19,11 @@ from heli_jax.identification.validation.metrics import Metrics, Whiteness
 if TYPE_CHECKING:
     import pandas as pd
 
-# Of a fit that converged too: numbers that the data do not determine are no estimates.
 Status = Literal["converged", "not-converged", "not-identifiable"]
 
 
 class Estimate(NamedTuple):
-    """One estimated number; sd and interval are None where it is not identifiable."""
+    """One estimate; sd and interval are None if it is not identifiable."""
 
     value: float
     sd: float | None
@@ -37,12 +36,12 @@ class Estimate(NamedTuple):
     """share of the posterior variance that the priors explain, 0 to 1"""
     at_bound: bool
     sd_white: float | None = None
-    """the Cramer-Rao sd, as if the residuals were white; the same as `sd` where they are"""
+    """Cramér-Rao sd for white residuals"""
     sd_alone: float | None = None
-    """the Cramer-Rao sd if all other unknowns were known: Tischler's insensitivity"""
+    """Cramér-Rao sd if all other unknowns were known: Tischler's insensitivity"""
 
     def without_interval(self) -> "Estimate":
-        """The value alone."""
+        """Return the value without sd and interval."""
         return self._replace(sd=None, lower95=None, upper95=None, sd_white=None, sd_alone=None)
 
 
@@ -60,24 +59,24 @@ class Signals(NamedTuple):
     innovations: dict[str, np.ndarray] | None = None
     """filter error: measured - predicted from all samples before, SI"""
     log_start: float | None = None
-    """time in the log of the first sample [s], from the log's beginning; None without a log"""
+    """time of the first sample [s] from the log's beginning; None without a log"""
 
     @property
     def log_times(self) -> np.ndarray:
-        """Time in the log (N,) [s], as windows and notes count it; from zero without a log."""
+        """Time from the log's beginning (N,) [s]; from zero without a log."""
         return self.times + (self.log_start or 0.0)
 
     def predicted(self, output: str) -> np.ndarray:
-        """One sample ahead, from all samples before (filter error)."""
+        """Return the one-step prediction of filter error (N,)."""
         assert self.innovations is not None
         return self.measured[output] - self.innovations[output]
 
     def residual(self, output: str) -> np.ndarray:
-        """measured - simulated"""
+        """Return measured minus simulated (N,)."""
         return self.measured[output] - self.simulated[output]
 
     def error(self, output: str) -> np.ndarray:
-        """Return the errors that should be white: innovations with filter error, else residuals."""
+        """Return innovations with filter error, else residuals (N,)."""
         return self.residual(output) if self.innovations is None else self.innovations[output]
 
 
@@ -91,12 +90,12 @@ class Check:
     guessed: tuple[str, ...] = ()
     """flights and outputs whose noise nobody stated"""
     findings: tuple[Finding, ...] = ()
-    """what was tested of the record, worst first"""
+    """the most severe first"""
     at_zero: dict[str, tuple[float, str]] = field(default_factory=dict)
-    """by parameter that starts at zero, of which nothing is a part: the size [SI] that its expected
-    sd is relative to, and the unit"""
+    """by parameter that starts at zero, the size [SI] that its expected sd is relative to, and its
+    unit"""
     log_notes: tuple[Finding, ...] = ()
-    """what the readers of the logs assumed or did"""
+    """notes of the readers of the logs"""
 
     def __repr__(self) -> str:
         doubts = sentences(f for f in self.findings if f.bad)

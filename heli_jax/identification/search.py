@@ -3,12 +3,11 @@
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Array
 
 from heli_jax.finding import found
 from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.disturbance_search import significant_disturbances
-from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
+from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.multistart import (
     FirstGuess,
     Progress,
@@ -25,10 +24,11 @@ from heli_jax.identification.estimation.noise_covariance import (
     log_likelihood_of,
     relax_noise_covariance,
 )
-from heli_jax.identification.estimation.starts import coarse_guess, delay_start, draw
+from heli_jax.identification.estimation.output_error import in_time
+from heli_jax.identification.estimation.starts import delay_start, draw, noise_guess_at
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.restarts import RESTARTS, SearchState, left_stability
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, layout_of
+from heli_jax.identification.unknowns.layout import layout_of
 from heli_jax.messages import messages
 
 _FIRST_STEPS = 40
@@ -36,35 +36,23 @@ _FIRST_STEPS = 40
 
 
 def first_guess(problem: Problem) -> FirstGuess:
-    """The problem at its start values, with a first guess of the noise."""
+    """Return the problem at its start values, with a first guess of the noise."""
     layout = layout_of(problem, problem.training)
     data = data_of(problem, problem.training, layout)
     noise = first_noise(problem, problem.training)
     begun = layout.objective.data_at_start(data)
-    z = coarse_guess(layout, begun, noise, start_vector(layout, data, problem))
+    z = start_vector(layout, data, problem)
+    z = noise_guess_at(layout, begun, noise, z) if layout.disturbance else z
+    # From rest at zero no parameter would have any effect on a record without input.
+    if not any(np.ptp(u) > 0 for f in problem.training for u in f.inputs.values()):
+        z = in_time(layout, data, noise, z)
     e = evaluate(layout, data, noise, z)
     level = layout.objective.noise_at_start(layout, data, e, noise)
-    if not any(np.ptp(u) > 0 for f in problem.training for u in f.inputs.values()):
-        z, e = _in_free_motion(layout, data, noise, z, e)
     # The same object if the method keeps the noise: then nothing is evaluated twice.
     if level is not noise:
         noise = level
         e = evaluate(layout, data, noise, z)
     return FirstGuess(layout, data, noise, z, e, begun)
-
-
-def _in_free_motion(
-    layout: Layout, data: Data, noise: Noise, z: Array, e: Evaluation
-) -> tuple[Array, Evaluation]:
-    """Return unknowns with initial states and biases from the record, for records without input:
-    from rest at zero no parameter would have any effect."""
-    own = slice(layout.first_nuisance, layout.size)
-    if not (layout.initial_state and np.isfinite(e.J).all()):
-        return z, e
-    step = np.linalg.lstsq(e.J[:, own], -e.r, rcond=1e-10)[0]
-    moved = z.at[own].add(step)
-    after = evaluate(layout, data, noise, moved)
-    return (moved, after) if after.r @ after.r < e.r @ e.r else (z, e)
 
 
 class SearchResult(NamedTuple):
@@ -99,8 +87,8 @@ def search(
     else:
         points = draw(layout, problem, guess.z, starts, seed)
 
-    # Without a disturbance in the record filter error does not converge: its first run is short,
-    # and goes on only if a disturbance is found.
+    # Without a disturbance in the record filter error does not converge: the first run is short,
+    # and is continued only if there is a disturbance.
     first_steps = min(max_steps, _FIRST_STEPS) if layout.sigmas else max_steps
     over = Search(problem, layout, data, first_steps)
     # Residuals at the first start are those of the first guess.

@@ -31,7 +31,7 @@ class Candidate(NamedTuple):
     aic: float
     bic: float
     white: bool
-    """whether its residuals or innovations look white"""
+    """True if its residuals or innovations are white"""
     estimates: dict[str, float]
 
 
@@ -45,11 +45,12 @@ class Nested(NamedTuple):
     degrees: int
     """unknowns added"""
     p_value: float
-    """of the smaller model; on the safe side where it lies at a bound (sigma_w, kappa >= 0)"""
+    """of the smaller model; too large, so cautious, where that is at a bound (sigma_w, kappa >=
+    0)"""
 
 
 class Choice(NamedTuple):
-    """All candidates, best AIC first, the nested tests, and the outcome in words."""
+    """All candidates, best AIC first, and the nested tests."""
 
     candidates: tuple[Candidate, ...]
     nested: tuple[Nested, ...]
@@ -57,41 +58,81 @@ class Choice(NamedTuple):
 
 
 class Alternatives(NamedTuple):
-    """Problems by name, and which is nested in which: (small, large)."""
+    """Problems by name, and pairs of nested ones: (small, large)."""
 
     problems: dict[str, Problem]
     nested: tuple[tuple[str, str], ...]
 
 
+class _Form(NamedTuple):
+    """What a candidate assumes."""
+
+    axes: tuple[str, ...]
+    """disturbed axes or states"""
+    poles: int
+    stand: bool
+
+
 def alternatives(
     problem: Problem,
     model: Model,
-    axis: str,
+    names: Sequence[str],
     *,
+    stated: Sequence[str] = (),
     without_stand: Model | None = None,
 ) -> Alternatives:
-    """List candidates by filter error: no disturbance, one pole and two poles on `axis`.
+    """List candidates by filter error: no disturbance, one and two poles on the named axes, and of
+    several axes also each one left out.
 
     Args:
+        problem: what it says of disturbances (starts, what is fixed) holds for the candidates that
+            have them.
         model: the model without disturbance.
+        names: axes or states that may be disturbed.
+        stated: those of a configuration, which are a candidate of their own.
         without_stand: the same vehicle without its stand, where that is in question too.
+
+    Raises:
+        ValueError: one of them cannot be disturbed.
     """
-    problems: dict[str, Problem] = {}
-    nested = []
-    vehicles = {"": (model, problem)}
+    names = tuple(names)
+    one, two = "one pole", "two poles"
+    forms = {"no disturbance": _Form((), 1, True)}
+    if len(names) > 1:
+        one, two = (f"all: {', '.join(names)}{end}" for end in ("", "; two poles"))
+        for name in names:
+            rest = tuple(n for n in names if n != name)
+            forms[f"without {name}: {', '.join(rest)}"] = _Form(rest, 1, True)
+        if 0 < len(stated) < len(names) - 1:
+            forms[f"only {', '.join(stated)}"] = _Form(tuple(stated), 1, True)
+    forms |= {one: _Form(names, 1, True), two: _Form(names, 2, True)}
     free = {n: f for n, f in problem.free.items() if n not in ("kappa", "zeta")}
     if without_stand is not None and free:
-        vehicles[", no stand"] = (without_stand, replace(problem, free=free))
-    for ending, (vehicle, base) in vehicles.items():
-        for words, poles in (("no disturbance", 0), ("one pole", 1), ("two poles", 2)):
-            problems[words + ending] = _by_filter_error(base, vehicle, (axis,), poles)
-            # One pole is no special case of two: both of these have the same time constant.
-            if poles:
-                nested.append((f"no disturbance{ending}", words + ending))
-            # Free flight is the stand without stiffness and damping, where these may go to zero.
-            if ending and _stand_may_vanish(problem):
-                nested.append((words + ending, words))
-    return Alternatives(problems, tuple(nested))
+        forms |= {f"{name}, no stand": f._replace(stand=False) for name, f in forms.items()}
+    bare, problems = replace(problem, free=free) if free else problem, {}
+    for name, form in forms.items():
+        base, vehicle = (problem, model) if form.stand else (bare, without_stand)
+        assert vehicle is not None
+        problems[name] = _by_filter_error(
+            base, vehicle, form.axes or names[:1], form.poles if form.axes else 0
+        )
+    vanishes = without_stand is not None and _stand_may_vanish(problem)
+    pairs = [
+        (small, large)
+        for small, a in forms.items()
+        for large, b in forms.items()
+        if small != large and _is_nested(a, b, vanishes)
+    ]
+    return Alternatives(problems, tuple(pairs))
+
+
+def _is_nested(small: _Form, large: _Form, stand_may_vanish: bool) -> bool:
+    """Return True if one form is a special case of another by one assumption."""
+    if small.stand != large.stand:
+        # Free flight is the stand without stiffness and damping, where these may go to zero.
+        return stand_may_vanish and large.stand and small[:2] == large[:2]
+    # One pole is no special case of two: both have the same time constant.
+    return set(small.axes) < set(large.axes) and (not small.axes or small.poles == large.poles)
 
 
 def _by_filter_error(problem: Problem, model: Model, on: Sequence[str], poles: int = 1) -> Problem:
@@ -103,11 +144,11 @@ def _by_filter_error(problem: Problem, model: Model, on: Sequence[str], poles: i
     known = {n: vehicle[n] for n in naming.names(model.Params) if n in vehicle and n not in own}
     if not poles:
         [d] = disturbances_of(model)
-        # Not zero, which has no logarithm: a billionth of the motion moves no digit.
+        # A billionth of the motion: zero has no logarithm.
         known |= {d.sigma: jnp.asarray(1e-9 * problem.motion), d.tau: jnp.asarray(1.0)}
         fixed = (d.sigma, d.tau)
     else:
-        # Starts that were stated for a disturbance hold in every candidate that has it.
+        # A stated start of a disturbance holds in every candidate that has it.
         same = same_parameters(model, problem.model)
         known |= {n: vehicle[m] for n, m in same.items()}
         fixed = tuple(n for n, m in same.items() if m in problem.fixed_noise)
@@ -172,7 +213,7 @@ def choose(
         criteria = f.log_likelihood, f.unknowns, f.aic, f.bic
         candidates[name] = Candidate(name, f.status, *criteria, f.white, values)
     compared = [_test(candidates[a], candidates[b]) for a, b in pairs]
-    # Rounded, since a disturbance that does not show leaves the same model: the one named first.
+    # Rounded: with a disturbance that vanishes two models are the same, and the first counts.
     ranked = tuple(
         sorted(candidates.values(), key=lambda c: (c.status == "not-converged", round(c.aic, 1)))
     )
@@ -181,9 +222,7 @@ def choose(
 
 
 _BELOW = 0.05
-"""log-likelihood by which a model may end below one that is nested in it: the optimiser's rest"""
-_FAR = 10.0
-"""the same for one with the same parameters and another disturbance, which is not nested"""
+"""log-likelihood by which a model may end below one that is nested in it, by convergence"""
 
 
 def _none_below_its_part(
@@ -193,49 +232,36 @@ def _none_below_its_part(
     report: Callable[[str], None],
     fit_options: dict[str, Any],
 ) -> list[str]:
-    """Fit again, from the better optimum, what ended below a model that is nested in it, or far
-    below one that has the same parameters; `fits` is changed, and the words are returned."""
+    """Fit models again that ended below one nested in them, from its optimum; change `fits`, and
+    return sentences."""
     sentences = []
-    for (a, b), least in [*((p, _BELOW) for p in nested), *((p, _FAR) for p in _alike(problems))]:
-        before, other = fits[b].log_likelihood, fits[a].log_likelihood
-        if not before < other - least:
+    for a, b in nested:
+        before, least = fits[b].log_likelihood, fits[a].log_likelihood - _BELOW
+        if not before < least:
             continue
         report(f"comparing models: {b} again, from {a}")
         try:
             again = fit(begun_from(problems[b], problems[a], fits[a]), **fit_options)
         except ValueError:  # it may be unstable at parameters that suit the other one
             again = fits[b]
-        if again.log_likelihood > before + least:
+        if again.log_likelihood > before + _BELOW:
             fits[b] = again
-        reached, part = fits[b].log_likelihood, (a, b) in nested
-        where = f"far below {a}, which has the same parameters"
-        where = f"below {a}, which is nested in it" if part else where
+        reached = fits[b].log_likelihood
+        where = f"below {a}, which is nested in it (log-likelihood {before:.1f} for {least:.1f})"
         if reached > before:
             sentences.append(
-                f"{b} first ended {where} (log-likelihood {before:.1f} for {other:.1f}): begun "
-                f"anew from that optimum it reaches {reached:.1f}."
+                f"{b} first ended {where}: begun anew from that optimum it reaches {reached:.1f}."
             )
-        if part and reached < other - least:
+        if reached < least:
             sentences.append(
-                f"{b} ends {where} (log-likelihood {reached:.1f} for {other:.1f}), also when it "
-                "begins there: its own optimum was not found, and its test means nothing."
+                f"{b} ends {where}, also when it begins there: its own optimum was not found, and "
+                "its test means nothing."
             )
     return sentences
 
 
-def _alike(problems: Mapping[str, Problem]) -> list[tuple[str, str]]:
-    """Return pairs of models with the same parameters and disturbances of another kind on the same
-    states: neither is nested, but a disturbance seldom moves parameters far."""
-    same = {
-        name: (problem.free, {d.state for d in disturbances_of(problem.model)})
-        for name, problem in problems.items()
-        if problem.noise
-    }
-    return [(a, b) for a in same for b in same if a != b and same[a] == same[b]]
-
-
 _ALL_BUT_NOTHING = 1e-3
-"""part of its start at which a parameter begins that the nested model does not have"""
+"""part of the start at which a parameter begins that the nested model lacks"""
 
 
 def begun_from(problem: Problem, nested: Problem, optimum: Fit) -> Problem:
@@ -249,7 +275,7 @@ def begun_from(problem: Problem, nested: Problem, optimum: Fit) -> Problem:
         elif nested.model.name == problem.model.name and getattr(nested.vehicle, name) != 0:
             value = float(getattr(nested.vehicle, name))
         free[name] = parameter._replace(start=_inside(parameter, value))
-    # A disturbance that did not show ended at zero: this one then begins where it always does.
+    # A disturbance that vanished has no value to begin with.
     noise = {
         n: jnp.asarray(optimum.nuisance[m].value)
         for n, m in same_parameters(problem.model, nested.model).items()
@@ -268,7 +294,7 @@ def same_parameters(model: Model, other: Model) -> dict[str, str]:
 
 def _inside(free: Free, value: float) -> float:
     """Return the value, or the nearest that is well inside the bounds."""
-    # An optimum may lie on a bound, where the coordinates of a bounded parameter are at infinity.
+    # An optimum may be at a bound.
     low = -math.inf if free.lower is None else free.lower
     high = math.inf if free.upper is None else free.upper
     size = high - low if math.isfinite(high - low) else abs(value) or abs(free.start)
@@ -320,42 +346,8 @@ def undisturbed_too(model: Model, names: Sequence[str]) -> tuple[str, ...]:
     return (*names, *rest)
 
 
-def disturbed_sets(
-    problem: Problem, model: Model, names: Sequence[str], stated: Sequence[str] = ()
-) -> Alternatives:
-    """List candidates by filter error: no disturbance, each one left out, all, and all with two
-    poles.
-
-    Args:
-        problem: what it says of disturbances (starts, what is fixed) holds for the candidates that
-            have them.
-        model: the model without disturbance.
-        names: two and more axes or states that may be disturbed.
-        stated: those of a configuration, which are a candidate of their own.
-
-    Raises:
-        ValueError: one of them cannot be disturbed, or there are fewer than two.
-    """
-    if len(names) < 2:
-        raise ValueError(f"expected two disturbances or more to choose from, got {len(names)}")
-    smaller = {}
-    for name in names:
-        rest = [n for n in names if n != name]
-        smaller[f"without {name}: {', '.join(rest)}"] = rest, 1
-    if 0 < len(stated) < len(names) - 1:
-        smaller[f"only {', '.join(stated)}"] = stated, 1
-    everything = f"all: {', '.join(names)}"
-    # Two poles are no extension of one: the two are compared by AIC and not by a test.
-    disturbed = {**smaller, everything: (names, 1), f"{everything}; two poles": (names, 2)}
-    nested = [("no disturbance", name) for name in disturbed]
-    nested += [(name, everything) for name in smaller]
-    sets = {"no disturbance": (names[:1], 0), **disturbed}
-    problems = {n: _by_filter_error(problem, model, *of) for n, of in sets.items()}
-    return Alternatives(problems, tuple(nested))
-
-
 APART = 2.0
-"""joint standard deviations from which on two estimates differ"""
+"""joint standard deviations above which two estimates differ"""
 
 
 class MethodResult(NamedTuple):
@@ -365,7 +357,7 @@ class MethodResult(NamedTuple):
     fit: Fit | None
     """None where the method refuses the problem"""
     reason: str
-    """why there are no numbers; empty where there are"""
+    """why there is no result; empty if there is one"""
     seconds: float
 
     @property
@@ -425,7 +417,7 @@ class MethodComparison(NamedTuple):
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Sentences on what agrees and what differs."""
+        """Sentences on agreement and differences."""
         main, *others = self.results
         said = [f"{r.label} has no numbers: {r.reason}" for r in self.results if r.reason]
         if main.fit is None:

@@ -1,5 +1,4 @@
-"""Content of a line figure. From one record the page draws it (uPlot), Matplotlib draws the file,
-and the text alternative is written.
+"""Charts: data of a line figure, which the page draws by uPlot and Matplotlib as a file.
 
 A page holds each array once, in two or four bytes a number, as base64.
 """
@@ -15,14 +14,14 @@ import numpy as np
 from heli_jax.numbers import number
 
 PIXELS = 88.0
-"""of the page in an inch of a figure"""
+"""pixels of the page for an inch of a figure"""
 
 
 class Series(NamedTuple):
-    """A line, points, or what lies between two lines; arrays (n,)."""
+    """A line, points, bars, or a band; arrays (n,)."""
 
     label: str
-    """empty where the axis says it"""
+    """empty if the axis has it"""
     x: np.ndarray
     y: np.ndarray
     """NaN where something is missing; of a band its lower edge"""
@@ -64,7 +63,7 @@ class Chart(NamedTuple):
     note: str = ""
     logarithmic: bool = False
     of: str = ""
-    """what its x belongs to, as a flight: charts of the same share cursor and zoom"""
+    """flight or other owner of its x axis; charts of one owner share cursor and zoom"""
 
 
 def panel(
@@ -92,8 +91,8 @@ def limits_of(series: Sequence[Series], margin: float = 0.05) -> tuple[float, fl
 
 
 def samples(label: str, x: np.ndarray, y: np.ndarray, color: str, width: float) -> Series:
-    """Return the series of a measurement, NaN where it is missing. It is a line, or dots if few
-    samples have neighbours, because a line would show nothing."""
+    """Return the series of a measurement, NaN where it is missing: a line, or dots if few samples
+    have neighbours."""
     seen = ~np.isnan(y)
     beside = np.convolve(seen, [1, 0, 1], "same")[seen] > 0
     if seen.any() and beside.mean() < 0.5:
@@ -113,21 +112,18 @@ def band(x: np.ndarray, low: np.ndarray, high: np.ndarray, color: str, label: st
 
 
 def time_limits(t: np.ndarray) -> tuple[float, float]:
-    """From the first time to the last; a record of one sample has no duration, but an axis has."""
+    """Return the first and the last time; 1 s apart for a single sample."""
     return float(t[0]), float(t[-1] if t.size > 1 else t[0] + 1.0)
 
 
 def thinned(x: np.ndarray, y: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """At most `most` points of a line: the lowest and the highest of each bin.
-
-    No peak is lost, and the first and the last point stay.
+    """Return at most `most` points of a line: ends, and the lowest and highest of each bin.
 
     Args:
         x: (N,), ascending.
         y: (N,)
         most: points to keep, 4 at least.
     """
-    # Not every k-th sample: that aliases an oscillation and misses spikes.
     n = y.size
     if n <= most:
         return x, y
@@ -142,11 +138,11 @@ def thinned(x: np.ndarray, y: np.ndarray, most: int) -> tuple[np.ndarray, np.nda
 
 
 _TOLD = 6
-"""lines of a panel that are told one by one"""
+"""lines of a panel that the text alternative names"""
 
 
 def described(chart: Chart) -> str:
-    """Title, note, and of each panel which lines it has and from where to where they go."""
+    """Return the text alternative: title, note, and the lines of each panel with their ranges."""
     low, high = chart.x_limits
     over = f"Over {chart.x_label}, {number(low, 3)} to {number(high, 3)}" if chart.x_label else ""
     told = [text for p in chart.panels if (text := _panel_in_words(p))]
@@ -167,21 +163,12 @@ def _panel_in_words(panel: Panel) -> str:
 
 
 _BYTES = 380_000
-"""of all lines of a page together: what is longer is thinned, its peaks kept"""
+"""bytes of all lines of a page, above which they are thinned"""
 _LEAST = 2000
-"""points that a line keeps in any case"""
+"""fewest points of a thinned line"""
 _MISSING = 65535
 _STEPS = 65534
-"""resolution of an array's range: far below a pixel, and below a hundredth of a percent"""
-
-
-class Logged(NamedTuple):
-    """Scale of a signal in the log: SI times a factor, plus an offset."""
-
-    unit: str
-    """or the column's name, where the log's numbers have no unit"""
-    factor: float
-    offset: float = 0.0
+"""steps of an array's range"""
 
 
 class Numbers:
@@ -191,25 +178,24 @@ class Numbers:
         self.arrays: list[dict[str, Any]] = []
         self.scenes: list[dict[str, Any]] = []
         self._known: dict[bytes, int] = {}
-        self._charts: list[tuple[Chart, dict[str, Logged]]] = []
+        self._charts: list[Chart] = []
 
-    def add_chart(self, chart: Chart, logged: dict[str, Logged] | None = None) -> int:
+    def add_chart(self, chart: Chart) -> int:
         """Keep a chart; its number on the page."""
-        self._charts.append((chart, logged or {}))
+        self._charts.append(chart)
         return len(self._charts) - 1
 
     def content(self) -> dict[str, Any]:
         """All as plain data for JSON."""
-        # Not before all charts are known: how many points a line may keep depends on how many
-        # lines there are. An input that five charts show counts once.
+        # The points of a line depend on the number of different lines.
         lines = {
             hashlib.sha256(np.ascontiguousarray(s.y).tobytes()).digest(): s.y.size
-            for chart, _ in self._charts
+            for chart in self._charts
             for p in chart.panels
             for s in p.series
         }
         most = _most(list(lines.values()))
-        charts = [self._chart(chart, logged, most) for chart, logged in self._charts]
+        charts = [self._chart(chart, most) for chart in self._charts]
         return {"arrays": self.arrays, "charts": charts, "scenes": self.scenes}
 
     def array(self, values: np.ndarray, *, exact: bool = False) -> int:
@@ -226,13 +212,12 @@ class Numbers:
             self.arrays.append(_uniform(values) or (_single(values) if exact else _coarse(values)))
         return self._known[key]
 
-    def _chart(self, chart: Chart, logged: dict[str, Logged], most: int) -> dict[str, Any]:
+    def _chart(self, chart: Chart, most: int) -> dict[str, Any]:
         panels = []
         for p in chart.panels:
-            name, _, unit = p.label.partition(" [")
-            own = [unit.rstrip("]"), *logged[name]] if name in logged else None
+            name = p.label.partition(" [")[0]
             series = [self._series(s, most, name) for s in p.series if s.x.size]
-            content = {"series": series, "logged": own, "height": round(p.height * PIXELS)}
+            content = {"series": series, "height": round(p.height * PIXELS)}
             panels.append({**p._asdict(), **content})
         return {**chart._asdict(), "panels": panels}
 
@@ -244,16 +229,15 @@ class Numbers:
 
 
 def _most(sizes: list[int]) -> int:
-    """Points that a line may have, so that all together stay within a page's share."""
-    # Two bytes a number, four base64 letters for three bytes; where a line is thinned it has times
-    # of its own, of four bytes.
+    """Return the most points of a line, so that all lines are within the size."""
+    # Two bytes a number, four letters for three bytes; a thinned line has its own times.
     if sum(sizes) * 2 * 4 / 3 <= _BYTES:
         return max([_LEAST, *sizes])
     return max(_LEAST, int(_BYTES / (6 * 4 / 3) / len(sizes)))
 
 
 def _uniform(values: np.ndarray) -> dict[str, Any] | None:
-    """First, step and count of what is equally spaced, as times are; None where it is not."""
+    """Return first value, step and count of an equally spaced array, else None."""
     if values.size < 3 or not np.isfinite(values).all():
         return None
     line, step = np.linspace(values[0], values[-1], values.size, retstep=True)

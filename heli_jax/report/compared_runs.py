@@ -2,7 +2,6 @@
 
 import math
 import os
-import re
 import urllib.parse
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -12,7 +11,7 @@ from heli_jax.errors import InputError
 from heli_jax.finding import Finding, note, sentences
 from heli_jax.identification.result import Estimate
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
-from heli_jax.numbers import NOTHING, lowered, number, vaf_percent, with_sd
+from heli_jax.numbers import NOTHING, number, vaf_percent, with_sd
 from heli_jax.report.origin import origin
 from heli_jax.report.page import filled
 from heli_jax.report.saved_fit import SavedFit, load_fit
@@ -29,12 +28,6 @@ _METRICS: tuple[tuple[str, str, Callable[[float | None], str]], ...] = (
     ("fit", "nrmse_fit_percent", lambda v: vaf_percent(None if v is None else v / 100)),
     ("TIC", "tic", lambda v: number(v, 3)),
 )
-_LATEX = str.maketrans(
-    {"_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "^": r"\^{}", "–": "--", "±": r"$\pm$"}
-    | {"−": "$-$"}
-    | {"$": r"\$", "{": r"\{", "}": r"\}", "~": r"\~{}", "\\": r"\textbackslash{}"}
-)
-_RAISED = re.compile(r"(·10)?([⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)")
 
 
 class ComparedRuns(NamedTuple):
@@ -45,8 +38,8 @@ class ComparedRuns(NamedTuple):
 
     @property
     def estimates(self) -> Table:
-        """Each parameter's estimate and sd by run, those of each combination that a run determines
-        and of what flights share beside them, with the differences from the first."""
+        """Estimate and sd by run of parameters, determined combinations and shared nuisances, with
+        the differences from the first run."""
         first = self.labels[0]
         several = [f"{label} - {first} [sd]" for label in self.labels[1:]]
         rows, of_runs = [], self._by_run()
@@ -57,27 +50,26 @@ class ComparedRuns(NamedTuple):
                 _measured(e, run, with_unit=len(units) > 1)
                 for e, run in zip(estimates, self.runs, strict=True)
             ]
-            # Where an optimiser stopped on its way there is nothing to compare.
             pairs = zip(estimates, self.runs, strict=True)
-            first_one, *others = (e if _arrived(run) else None for e, run in pairs)
+            first_one, *others = (e if _converged(run) else None for e, run in pairs)
             apart = [_difference(first_one, other) for other in others]
             rows.append((name, *cells, *apart, units.pop() if len(units) == 1 else ""))
         return Table(("parameter", *self.labels, *several, "unit"), rows)
 
     def _by_run(self) -> list[dict[str, Estimate]]:
-        """Each run's estimates, the combinations that one of the runs determines, then what all its
-        flights share beside them: gains, a time shift, the disturbance."""
+        """Return each run's estimates, the combinations that one of the runs determines, then
+        gains, the time shift and the disturbance."""
         by_run = []
         for run, combined in zip(self.runs, _combinations(self.runs), strict=True):
-            # What belongs to a flight has FLIGHT/ before its name.
+            # The name of a flight's own nuisance is FLIGHT/NAME.
             shared = {n: e for n, e in run.nuisance.items() if "/" not in n}
             by_run.append({**run.estimates, **combined, **shared})
         return by_run
 
     @property
     def agreement(self) -> Table:
-        """VAF, NRMSE fit and Theil's coefficient of every output by run, the held-out flights by
-        themselves."""
+        """VAF, NRMSE fit and Theil's coefficient by output and run, of fitted and held-out
+        flights."""
         rows = []
         for held_out in (False, True):
             of = [run.validation if held_out else run.metrics for run in self.runs]
@@ -90,15 +82,13 @@ class ComparedRuns(NamedTuple):
 
     @property
     def verdicts(self) -> Table:
-        """By run whether it converged, what the data determine, and whether the model is
-        adequate."""
+        """Convergence, identifiability and adequacy by run."""
         rows = [
             (
                 label,
                 run.model,
                 method_of(run),
                 run.status,
-                # What the data determine is a property of an optimum.
                 "No optimum was reached."
                 if run.status == "not-converged"
                 else " ".join(filter(None, (run.verdict, run.distrust))),
@@ -111,30 +101,24 @@ class ComparedRuns(NamedTuple):
 
     @property
     def notes(self) -> tuple[Finding, ...]:
-        """Notes on the differences and doubts about runs; subjects are labels of runs."""
+        """Notes and doubts; their subjects are labels of runs."""
         words = (
             "± is one standard deviation (sd), a 95 % interval about twice as far. Differences are "
-            "from the first run, in the sd that the two have together if nothing is common to them."
+            "from the first run, in the joint sd of independent estimates: runs that share a log "
+            "have correlated estimates, which differ by less by chance."
         )
-        notes, first, label = [note("compared.joint-sd", words)], self.runs[0], self.labels[0]
-        for other, run in zip(self.labels[1:], self.runs[1:], strict=True):
-            if _share_a_log(first, run):
-                words = (
-                    f"{label} and {other} share a log: their estimates are correlated, and differ "
-                    "by less than that by chance."
-                )
-                notes.append(note("compared.one-log", words, label, other))
+        notes, first = [note("compared.joint-sd", words)], self.runs[0]
         for label, run in zip(self.labels, self.runs, strict=True):
             doubts = {}
-            if not _arrived(run):
+            if not _converged(run):
                 doubts["not-converged"] = " did not converge: its numbers are no result."
                 if run is first:
                     doubts["not-converged"] += " Name one first that did: differences are from it."
             elif run.distrust:
                 doubts["not-trusted"] = f": {run.distrust}"
-            if _arrived(run) and run.adequate is False:
+            if _converged(run) and run.adequate is False:
                 doubts["not-adequate"] = " is not adequate: its intervals may be too narrow."
-            elif _arrived(run) and run.overconfident:
+            elif _converged(run) and run.overconfident:
                 doubts["overconfident"] = ": its sd are too small: its residuals are not white."
             notes += [
                 Finding(f"compared.{what}", "doubt", f"{label}{words}", subjects=(label,))
@@ -143,38 +127,22 @@ class ComparedRuns(NamedTuple):
         return tuple(notes)
 
     def to_dataframe(self) -> "pd.DataFrame":
-        """Long: a row for each run and parameter, and for each combination that a run determines;
-        NaN where the data do not determine it or the fit did not converge."""
+        """Return a row for each run and parameter, or determined combination; NaN if it is not
+        identifiable or the fit did not converge."""
         from heli_jax.exports import runs_frame
 
         estimates = self._usable()
         return runs_frame(dict(zip(self.labels, estimates, strict=True)))
 
     def to_csv(self) -> str:
-        """As `to_dataframe`, as text; cells of what is not determined are empty, and those of fits
-        that did not converge."""
+        """Return `to_dataframe` as CSV."""
         return self.to_dataframe().to_csv(index=False, lineterminator="\n")
 
-    def to_latex(self) -> str:
-        """The estimates as a table for a paper, with booktabs; its first line says what ± is."""
-        head, rows = self.estimates
-        lines = [
-            "% estimate ± one standard deviation; [sd]: difference in joint standard deviations",
-            r"\begin{tabular}{l" + "r" * (len(head) - 2) + "l}",
-            r"\toprule",
-            " & ".join(map(_latex, head)) + r" \\",
-            r"\midrule",
-            *(" & ".join(map(_latex, row)) + r" \\" for row in rows),
-            r"\bottomrule",
-            r"\end{tabular}",
-        ]
-        return "\n".join(lines) + "\n"
-
     def _usable(self) -> list[dict[str, Estimate]]:
-        """By run what `_by_run` has, without intervals where the optimiser stopped on its way."""
+        """Return `_by_run` without intervals of runs that did not converge."""
         none = {"sd": None, "lower95": None, "upper95": None}
         return [
-            of_run if _arrived(run) else {name: e._replace(**none) for name, e in of_run.items()}
+            of_run if _converged(run) else {name: e._replace(**none) for name, e in of_run.items()}
             for run, of_run in zip(self.runs, self._by_run(), strict=True)
         ]
 
@@ -191,10 +159,10 @@ class ComparedRuns(NamedTuple):
 
 
 def compare_runs(runs: Sequence[str | Path | SavedFit]) -> ComparedRuns:
-    """Fits side by side.
+    """Compare fits.
 
     Args:
-        runs: run directories, or what `load_fit` read; two at least. Differences are from the
+        runs: run directories, or results of `load_fit`; two at least. Differences are from the
             first.
 
     Raises:
@@ -213,15 +181,14 @@ def _labels(directories: Sequence[Path]) -> tuple[str, ...]:
         labels = ["/".join(p[-depth:]) for p in paths]
         if len(set(labels)) == len(labels):
             return tuple(labels)
-    # The same directory twice: by their place.
+    # The same directory twice.
     return tuple(f"{p[-1]} ({i})" for i, p in enumerate(paths, 1))
 
 
 def _combinations(runs: Sequence[SavedFit]) -> list[dict[str, Estimate]]:
-    """By run the combinations that any of them determines without determining their parts.
+    """Return for each run the combinations that any of them determines.
 
-    A run that determines the parts themselves has them by its estimates, their correlations, and
-    the constants that it took as known; one that has neither lacks that entry.
+    A run that determines the parameters has them by its estimates, correlations and constants.
     """
     stated = [_stated(run) for run in runs]
     every = {n: c for of in stated for n, c in of.items()}
@@ -245,10 +212,10 @@ _NUMBERS = ("value", "sd", "lower95", "upper95")
 
 # Any: what fit.json holds.
 def _stated(run: SavedFit) -> dict[str, dict[str, Any]]:
-    """Return the combinations that a fit states to be determined; nothing without an optimum."""
+    """Return the determined combinations of a fit; none if it did not converge."""
     every = run.content.get("determined_combinations") or ()
     known = (c for c in every if all(c.get(key) is not None for key in _NUMBERS))
-    return {c["name"]: c for c in known if _arrived(run)}
+    return {c["name"]: c for c in known if _converged(run)}
 
 
 # Any: mappings of estimates or of metrics by name.
@@ -257,22 +224,22 @@ def _in_order(mappings: Any) -> list[str]:
 
 
 def method_of(run: SavedFit) -> str:
-    """The method, and by which inputs' instruments: such a fit is another estimator."""
+    """Return the method with the inputs that were taken by their instruments."""
     inputs = run.content.get("instruments") or ()
     return f"{run.method} by instrument ({', '.join(inputs)})" if inputs else run.method
 
 
-def _arrived(run: SavedFit) -> bool:
+def _converged(run: SavedFit) -> bool:
     return run.status != "not-converged"
 
 
 def _measured(e: Estimate | None, run: SavedFit, *, with_unit: bool) -> str:
     if e is None:
         return NOTHING
-    if not _arrived(run):
+    if not _converged(run):
         return NOT_CONVERGED
     if e.sd is None:
-        # Of a disturbance that does not show the size is zero.
+        # An insignificant disturbance has size zero.
         return "0" if e.at_bound and e.value == 0.0 else NOT_DETERMINED
     return with_sd(e.value, e.sd) + (f" {pretty(e.unit)}" if with_unit else "")
 
@@ -293,38 +260,11 @@ def _agreement(m: Metrics | None, key: str, text: Callable[[float | None], str])
     return text(getattr(m, key, None))
 
 
-def _share_a_log(first: SavedFit, second: SavedFit) -> bool:
-    """True if both runs were fitted to the same samples of a log, or to some of them."""
-    ours, others = (
-        [f for f in run.content["data"] if f.get("sha256") and not f.get("hold_out")]
-        for run in (first, second)
-    )
-    return any(
-        a["sha256"] == b["sha256"] and _overlap(a.get("window"), b.get("window"))
-        for a in ours
-        for b in others
-    )
-
-
-def _overlap(a: list[float] | None, b: list[float] | None) -> bool:
-    """True if two windows of a log overlap, or if one of them was not stored."""
-    return a is None or b is None or min(a[1], b[1]) > max(a[0], b[0])
-
-
-def _latex(text: str) -> str:
-    """Text of a page for LaTeX, as the copy button of a page's tables writes it."""
-
-    def raised(m: re.Match[str]) -> str:
-        return f"${r'\cdot 10' if m[1] else ''}^{{{lowered(m[2])}}}$"
-
-    return _RAISED.sub(raised, text.translate(_LATEX)).replace("·", r"$\cdot$")
-
-
 _FILES = ("report.html", "fit.json", "signals.csv", "config.yaml")
 
 
 def write_page(path: Path, compared: ComparedRuns) -> None:
-    """The page, self-contained."""
+    """Write the self-contained page."""
 
     def link(file: Path) -> str:
         return urllib.parse.quote(os.path.relpath(file.absolute(), path.absolute().parent))

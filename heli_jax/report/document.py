@@ -1,8 +1,8 @@
-"""fit.json: one table of its keys, by which it is written, checked when it is read, and documented.
+"""fit.json: one table of its keys, by which it is written, checked and documented.
 
 A section is a class whose fields are keys. The value of a key is the attribute of its name, unless
-`Annotated` states another attribute or a function. `model_of` makes a section's pydantic model,
-which writes and checks it. A number that is not finite is null in the file, whatever its kind.
+`Annotated` states another attribute or a function. `model_of` makes the pydantic model of a
+section. A number that is not finite is null in the file.
 """
 
 import functools
@@ -37,7 +37,6 @@ from heli_jax.identification.equation_error.start import (
     Equation,
     EquationErrorStart,
     StartValue,
-    Step,
 )
 from heli_jax.identification.estimation.multistart import StartRow
 from heli_jax.identification.fit import Fit
@@ -61,7 +60,7 @@ from heli_jax.report.card import Gate, card
 from heli_jax.versions import versions
 
 ABSENT = object()
-"""what a source returns where the file lacks the key"""
+"""value of a source for a key that the file lacks"""
 
 
 class VerdictContent(TypedDict):
@@ -70,33 +69,33 @@ class VerdictContent(TypedDict):
     text: str
     """in a sentence"""
     identifiable: bool
-    """whether they determine every free parameter"""
+    """true if they determine every free parameter"""
     rank: int
     """directions that are determined, priors included"""
     rank_without_priors: int
     condition_number: Annotated[float, "condition"]
     singular_values: list[float]
-    """of the whitened sensitivities in relative coordinates: one over the sd of a direction"""
+    """singular values of the whitened sensitivities in relative coordinates: one over the sd of a
+    direction"""
     null_directions: list[dict[str, float]]
-    """by parameter, in relative coordinates, along which nothing changes"""
+    """by parameter, in relative coordinates, that the data do not determine"""
     determined_combinations: Annotated[list[Combination], "combinations"]
     """combinations that the data determine, if not every parameter"""
     strong_pairs: Annotated[list[Pair], "pairs"]
-    """parameters that the data hardly tell apart"""
+    """strongly correlated parameters"""
     without_effect: list[str]
     """parameters that no output shows"""
     resting_on_priors: Annotated[list[str], "resting"]
     """parameters that the priors determine, and not the data"""
     exchangeable_nuisances: Annotated[list[str], "exchangeable"]
-    """nuisances, as `flight 1/bias p`, that make up for what is not determined"""
+    """nuisances, as `flight 1/bias p`, that are exchangeable with parameters"""
     other_solutions: Annotated[list[dict[str, float]], lambda v: [s.values for s in v.second]]
     """other values of the free parameters that fit as well [SI]"""
     names: list[str]
     """the order of `correlation` and `covariance_log`"""
     correlation: list[list[float]]
     covariance_log: Annotated[list[list[float]], "covariance"]
-    """in relative coordinates (a logarithm, or the value over a scale); what is not determined is
-    left out of it"""
+    """in relative coordinates (a logarithm, or the value over a scale), without null directions"""
 
 
 class AdequacyAgainst(TypedDict):
@@ -114,19 +113,19 @@ class AdequacyContent(TypedDict):
     """the answer in a few words, as the statement on adequacy has it"""
     judged: Annotated[list[OutputAdequacy], "adequacy.judged"]
     by_chance: Annotated[bool, "adequacy.by_chance"]
-    """whether nothing measured stands out of the noise, so that any optimum is one of chance"""
+    """true if no output differs from noise, so that the optimum is arbitrary"""
     ahead: Annotated[float | None, "adequacy.ahead"]
-    """[s] that is predicted at most where that, and no simulation, was judged"""
+    """longest prediction [s], if predictions were judged in place of a simulation"""
     against: Annotated[AdequacyAgainst, lambda fit: fit]
 
 
 class Fixed(TypedDict):
-    """Beside the fields of the class."""
+    """Further keys beside the fields of the class."""
 
     value: float | list[float] | None
-    """the estimate; null where it is not determined; of what flights state a number of each"""
+    """the estimate, null if it is not determined; a number for each flight if these state it"""
     fixed: Annotated[bool, lambda _: False]
-    """true if flights state it and it was not free; then there is nothing else"""
+    """true if flights state it; then the other keys are missing"""
 
 
 class Residuals(TypedDict):
@@ -134,7 +133,7 @@ class Residuals(TypedDict):
 
     white: bool
     overconfident: bool
-    """whether intervals count samples as news that repeat each other"""
+    """true if the intervals ignore that residuals are autocorrelated"""
     note: Annotated[str, lambda fit: _whiteness_note(fit)]
     """consequence if they are not white"""
     by_output: Annotated[dict[str, Whiteness], "whiteness"]
@@ -145,7 +144,7 @@ class FeedbackToo(TypedDict):
     """Beside the fields of the class."""
 
     present: bool
-    """whether the input follows the response: the p value is below the level"""
+    """true if the input follows the response: the p value is below the level"""
     level: Annotated[float, lambda _: LEVEL]
 
 
@@ -175,7 +174,7 @@ class MethodContent(TypedDict):
     """as above, or refused"""
     verdict: str
     reason: str | None
-    """why it was refused, or is no result"""
+    """reason why it was refused, or is no result"""
     seconds: float
     parameters: dict[str, Estimate]
     difference_joint_sd: dict[str, float]
@@ -222,7 +221,7 @@ class Compatibility(TypedDict):
     verdict: str
     doubts: list[Finding]
     shows: Annotated[dict[str, str], lambda s: {r[0]: r[s.head.index("shows")] for r in s.errors}]
-    """by error of a sensor whether it shows"""
+    """by sensor error: yes or no"""
 
 
 class Continuous(TypedDict):
@@ -232,7 +231,7 @@ class Continuous(TypedDict):
     """coefficients, highest power of s first"""
     den: Annotated[list[float], "continuous_den"]
     exact: bool
-    """whether it is that of the discrete one with a zero-order hold"""
+    """true if its zero-order hold equivalent is the discrete one"""
     note: str
 
 
@@ -283,14 +282,6 @@ class HandlingToo(TypedDict):
     """null where no response was asked for"""
 
 
-class Stepwise(TypedDict):
-    """The terms that stepwise regression chose."""
-
-    selected: list[str]
-    steps: list[Step]
-    f_ratios: dict[str, float]
-
-
 class EquationErrorContent(TypedDict):
     """First guesses by equation error."""
 
@@ -298,8 +289,7 @@ class EquationErrorContent(TypedDict):
     equations: list[Equation]
     smoothing_half_width_s: Annotated[float, "half_width"]
     not_measured: Annotated[list[str], "hidden"]
-    """states that nothing measured shows"""
-    stepwise: Annotated[Stepwise | None, "selection"]
+    """states that no output determines"""
     sentences: Annotated[list[str], lambda start: sentences(start.findings)]
 
 
@@ -317,7 +307,7 @@ class SignalSource(TypedDict, total=False):
     """Source of a model's signal."""
 
     signal: str
-    """the channel of the log; without one a constant stands there"""
+    """channel of the log; missing for a constant"""
     constant: float
     unit: str
     scale: float
@@ -363,7 +353,7 @@ class HoldContent(TypedDict):
 
 
 def _start(kind: type) -> Callable[[Any], Any]:
-    """Starts that were found so: where the fit began, not its result."""
+    """Return the source of start values of one method."""
 
     def found(analysis: Any) -> Any:
         guess = analysis.problem.first_guess
@@ -376,7 +366,7 @@ _NOISE = ("white", "coloured residuals")
 
 
 VERSION = 1
-"""of the format: a key that is removed, or that changes its meaning, makes another"""
+"""version of the format; it changes if a key is removed or changes its meaning"""
 
 
 class FitFile(TypedDict):
@@ -396,9 +386,9 @@ class FitFile(TypedDict):
     n_samples: Annotated[int, "fit.n_samples"]
     """measured numbers that were fitted"""
     identifiable: Annotated[bool, "fit.verdict.identifiable"]
-    """whether the data and the priors determine every free parameter"""
+    """true if the data and the priors determine every free parameter"""
     adequate: Annotated[bool | None, lambda a: _adequate(a.fit)]
-    """whether the model explains the record; null where that was not judged"""
+    """true if the model explains the record; null if that was not judged"""
     adequacy: Annotated[AdequacyContent, "fit"]
     null_directions: Annotated[list[dict[str, float]], "fit.verdict.null_directions"]
     """as in `verdict`"""
@@ -411,11 +401,11 @@ class FitFile(TypedDict):
     parameters: Annotated[dict[str, Estimate], lambda a: _parameters(a)]
     """the free ones, and those that flights state [SI]"""
     constants: Annotated[dict[str, float], lambda a: _constants(a.fit, a.problem)]
-    """the vehicle's numbers that the fit took as known [SI]"""
+    """constants of the vehicle [SI]"""
     nuisance: Annotated[dict[str, Estimate], lambda a: _shown(a.fit.nuisance, a.fit.status)]
     """gains, delays, disturbances, initial states, biases; of one flight as `flight/name`"""
     noise_sd: Annotated[dict[str, float], "fit.noise"]
-    """of the measurements, by `flight/output` [SI]"""
+    """sd of the measurement noise by `flight/output` [SI]"""
     metrics: Annotated[dict[str, Metrics], "fit.metrics"]
     """by output, of the flights that were fitted, simulated"""
     validation: Annotated[dict[str, Metrics], "fit.validation"]
@@ -426,7 +416,7 @@ class FitFile(TypedDict):
     """predicted one sample ahead, of the flights that were fitted"""
     one_step_validation: Annotated[dict[str, Metrics], "fit.one_step_validation"]
     """the same of flights held out"""
-    acceptance: Annotated[list[Gate], lambda a: card(a.problem, a.fit, a.supplementary.responses)]
+    acceptance: Annotated[list[Gate], lambda a: card(a.fit, a.supplementary.responses)]
     """the lines of the acceptance card"""
     models: Annotated[CandidatesCompared | None, "supplementary.choice"]
     methods: Annotated[MethodsCompared | None, "supplementary.methods"]
@@ -438,18 +428,18 @@ class FitFile(TypedDict):
     aic: Annotated[float, "fit.aic"]
     bic: Annotated[float, "fit.bic"]
     covariance: Annotated[Literal["white", "coloured residuals"], lambda a: _NOISE[a.fit.coloured]]
-    """what the intervals take the residuals for"""
+    """assumption of the intervals on the residuals"""
     residuals: Annotated[Residuals, "fit"]
     feedback: Annotated[list[Feedback], "fit.feedback"]
     """by flight and input that moves freely"""
     untrusted: Annotated[dict[str, Distrust], "fit.distrusts"]
-    """by parameter, why its interval may not be used"""
+    """by parameter, the reason why its interval may not be used"""
     distrust: Annotated[str, "fit.distrust"]
     """the same in a sentence; empty where all is trusted"""
     responses: Annotated[ResponseAgreement | None, "fit.responses"]
     """result of a fit of frequency responses"""
     held_out_frequency: Annotated[HeldOutFrequency | None, "fit.held_out_frequency"]
-    """of a fit in frequency what flights held out say there"""
+    """agreement of held-out flights with a fit in frequency"""
     baseline_rls: Annotated[BaselineContent | None, "baseline"]
     handling_qualities: Annotated[list[HandlingPair], lambda a: _handling(a)]
     equation_error_start: Annotated[EquationErrorContent | None, _start(EquationErrorStart)]
@@ -470,14 +460,14 @@ class FitFile(TypedDict):
     seed: Annotated[int, "fit.seed"]
 
 
-TOO: dict[type, type] = {
+ADDED_KEYS: dict[type, type] = {
     Estimate: Fixed,
     Feedback: FeedbackToo,
     ResponseAgreement: ResponsesToo,
     Number: QualityToo,
     HandlingPair: HandlingToo,
 }
-"""what the file has beside the fields of a class, or in their place"""
+"""further keys of a class, or other sources of its fields"""
 
 
 def _whiteness_note(fit: Fit) -> str:
@@ -489,13 +479,14 @@ def _whiteness_note(fit: Fit) -> str:
 
 
 def _shown(estimates: Mapping[str, Estimate], status: Status) -> dict[str, Any]:
-    """The estimates, without numbers for what the data do not determine."""
-    # Where the optimiser stopped in a direction that nothing determines is an accident, and a
-    # program that reads the file would take it for an estimate. A status that says that nothing is
-    # a result leaves them: whoever goes on from there has to know where it is.
+    """Return the estimates, without values of parameters that are not identifiable."""
+    # A value along a null direction is arbitrary. Values of a fit that did not converge stay: they
+    # may be the start of another.
     none: dict[str, Any] = dict.fromkeys(("value", "sd_white", "sd_alone"))
-    arrived = status != "not-converged"
-    return {n: e._replace(**none) if arrived and e.sd is None else e for n, e in estimates.items()}
+    converged = status != "not-converged"
+    return {
+        n: e._replace(**none) if converged and e.sd is None else e for n, e in estimates.items()
+    }
 
 
 def _adequate(fit: Fit) -> bool | None:
@@ -508,8 +499,7 @@ def _parameters(analysis: Any) -> dict[str, Any]:
 
 
 def _fixed(problem: Problem) -> dict[str, Any]:
-    """The parameters a user might look for that were not free: those that flights replace."""
-    # A list, since each flight may have a value of its own; null where it has none.
+    """Return the parameters that flights state."""
     return {
         n: {"value": [f.known.get(n) for f in problem.flights], "fixed": True}
         for n in sorted({n for f in problem.flights for n in f.known})
@@ -517,10 +507,10 @@ def _fixed(problem: Problem) -> dict[str, Any]:
 
 
 def _constants(fit: Fit, problem: Problem) -> dict[str, float]:
-    """The vehicle's numbers that the fit took as known [SI]: those that no flight replaces."""
+    """Return the constants of the vehicle that no flight states [SI]."""
     others = {*fit.estimates, *fit.nuisance, *_fixed(problem)}
     params = {n: np.asarray(v) for n, v in naming.asdict(fit.params).items() if n not in others}
-    # A model of a user's own may have parameters that are no single numbers.
+    # Parameters of a user's model may be arrays.
     return {n: float(v) for n, v in params.items() if v.size == 1 and v.dtype.kind in "fiu"}
 
 
@@ -534,7 +524,7 @@ def _starts(fit: Fit) -> list[StartRow]:
 
 
 def _methods(compared: MethodComparison) -> dict[str, Any]:
-    """By method its estimates, and how far they are from those of the first."""
+    """Return the estimates by method, and their differences from the first."""
     results = {}
     for r in compared.results:
         found = {n: e for n in compared.names if (e := compared.estimate(r, n)) is not None}
@@ -556,7 +546,7 @@ def _handling(analysis: Any) -> list[dict[str, Any]]:
 
 
 def handling_content(entries: Sequence[Handling]) -> list[dict[str, Any]]:
-    """Plain data: by response what model and data say, numbers in SI (and deg, dB)."""
+    """Return handling qualities of model and data by response, in SI, deg and dB."""
     mappings = [
         {**h.pair._asdict(), "model": _qualities(h.model), "data": _qualities(h.data)}
         for h in entries
@@ -567,7 +557,7 @@ def handling_content(entries: Sequence[Handling]) -> list[dict[str, Any]]:
 def _qualities(of: HandlingQualities | str | None) -> dict[str, Any] | None:
     if of is None or isinstance(of, str):
         return None if of is None else {"numbers": {}, "sentences": [of]}
-    # What is not determined is null, and not left out: programs ask by name.
+    # A number that is not determined is null.
     known = {name: n for name, n in of.numbers.items() if n.known}
     numbers = {
         name: {**known[name]._asdict(), "unit": UNITS[name]} if name in known else None
@@ -578,7 +568,6 @@ def _qualities(of: HandlingQualities | str | None) -> dict[str, Any] | None:
 
 def _flight(flight: Flight) -> dict[str, Any]:
     source = flight.source
-    # A flight that was given in memory: `null`, so that nobody looks for a file.
     content = {
         "path": source.path if source else None,
         "sha256": source.sha256 if source else None,
@@ -601,15 +590,15 @@ def _flight(flight: Flight) -> dict[str, Any]:
 
 
 def _holds(flight: Flight) -> dict[str, dict[str, str]]:
-    """By input what it is taken to do between samples, and what of the log spoke for it."""
+    """Return the hold of each input, with its reason."""
     reason = flight.hold_reason
     return {n: {"hold": h, "reason": reason.get(n, "as stated")} for n, h in flight.hold.items()}
 
 
 class _Section(BaseModel):
-    """The pydantic model of a section: made of a mapping, or of an object by the keys' sources.
+    """Base of a section's pydantic model, made of a mapping or of an object.
 
-    Keys may be missing, or be none of the table: another version has others.
+    Another version may have other keys.
     """
 
     model_config = ConfigDict(extra="allow", arbitrary_types_allowed=True, protected_namespaces=())
@@ -626,7 +615,7 @@ class _Section(BaseModel):
 
 @functools.cache
 def model_of(section: Any) -> type[_Section]:
-    """The pydantic model of a section of the table, or of a class whose fields are keys."""
+    """Return the pydantic model of a section, or of a class whose fields are keys."""
     fields = _fields(section)
     made = {n: (_read(kind).checked | None, None) for n, (kind, _) in fields.items()}
     model = create_model(section.__name__, __base__=_Section, **made)  # type: ignore[call-overload]
@@ -635,13 +624,13 @@ def model_of(section: Any) -> type[_Section]:
 
 
 class _Read(NamedTuple):
-    """A kind of the table, read."""
+    """A kind of value."""
 
     words: str
     checked: Any
-    """as pydantic has it; in place of any number there may be null"""
+    """type for pydantic, in which null may stand for any number"""
     sections: tuple[tuple[Any, str], ...] = ()
-    """those within it, and what stands between its path and their keys"""
+    """inner sections, each with the path from this kind to its keys"""
 
     def within(self, between: str) -> tuple[tuple[Any, str], ...]:
         return tuple((section, between + rest) for section, rest in self.sections)
@@ -687,10 +676,10 @@ def _read(kind: Any) -> _Read:
 
 @functools.cache
 def _fields(section: Any) -> dict[str, tuple[Any, Callable[[Any], Any]]]:
-    """By key its kind, and what finds its value."""
+    """Return by key its kind and the source of its value."""
     hints = typing.get_type_hints(section, include_extras=True)
-    if section in TOO:
-        hints |= typing.get_type_hints(TOO[section], include_extras=True)
+    if section in ADDED_KEYS:
+        hints |= typing.get_type_hints(ADDED_KEYS[section], include_extras=True)
     fields = {}
     for name, kind in hints.items():
         source: Any = name
@@ -701,11 +690,11 @@ def _fields(section: Any) -> dict[str, tuple[Any, Callable[[Any], Any]]]:
 
 
 def written(kind: Any, value: Any) -> Any:
-    """A value as plain data for JSON; a number that is not finite becomes None.
+    """Return a value as plain data for JSON; a number that is not finite becomes None.
 
     Args:
-        kind: of the table; a section, or a mapping or list of such.
-        value: what has its keys as attributes, or in a mapping as they stand in the file.
+        kind: a section, or a mapping or list of sections.
+        value: an object with the sources of the keys, or a mapping of the keys.
     """
     adapter = TypeAdapter(_read(kind).checked)
     made = adapter.validate_python(value)
@@ -713,23 +702,21 @@ def written(kind: Any, value: Any) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """Only what JSON has, and records as they are; a number that is not finite becomes None."""
+    """Return plain data for JSON, with records unchanged; None for a number that is not finite."""
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple | np.ndarray | map) and not hasattr(value, "_fields"):
         return [plain(v) for v in value]
     if isinstance(value, np.generic):
         value = value.item()
-    # Infinite counts as missing too: strict JSON has neither, and a reader has one case to think
-    # of.
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def checked(data: bytes) -> dict[str, Any]:
-    """The content of a fit.json; keys may be missing, or be none of the table.
+    """Return the content of a fit.json, which may lack keys or have others.
 
     Raises:
-        ValueError: it is no JSON object, or a value is of another kind than the table says.
+        ValueError: it is no JSON object, or a value is of the wrong kind.
     """
     try:
         model_of(FitFile).model_validate_json(data, strict=True)
@@ -746,29 +733,31 @@ class Key(NamedTuple):
     path: str
     """in full: `parameters.NAME.sd`"""
     kind: str
-    """what stands there, in words"""
+    """kind of the value in words"""
     meaning: str
-    """empty where the name says it all"""
+    """empty if the name is enough"""
 
 
 def fit_keys() -> list[Key]:
-    """All keys, each before what stands in it."""
+    """Return all keys, each before its inner keys."""
     return list(_walk(FitFile, ""))
 
 
 def matching(text: str) -> list[Key]:
-    """The keys whose path holds a text, in any case; else those whose meaning does."""
+    """Return the keys whose path contains a text, else those whose meaning does."""
     words, every = text.strip().lower(), fit_keys()
     by_path = [k for k in every if words in k.path.lower()]
     return by_path or [k for k in every if words in k.meaning.lower()]
 
 
 def _walk(section: Any, path: str) -> Iterator[Key]:
-    stated = naming.texts(section) | (naming.texts(TOO[section]) if section in TOO else {})
+    stated = naming.texts(section) | (
+        naming.texts(ADDED_KEYS[section]) if section in ADDED_KEYS else {}
+    )
     for name, (kind, _) in _fields(section).items():
         place, read = f"{path}.{name}" if path else name, _read(kind)
         yield Key(place, read.words, stated.get(name, ""))
-        # `verdict_before` has the keys of `verdict`: told once.
+        # `verdict_before` has the keys of `verdict`.
         if name not in ("verdict_before", "determined_combinations") or path == "verdict":
             for inner, between in read.sections:
                 yield from _walk(inner, place + between)

@@ -1,5 +1,4 @@
-"""The report of a fit: one HTML file that holds everything, its figures, their words, and the three
-statements at its head."""
+"""The report of a fit: one HTML file with figures, captions and the three statements."""
 
 import functools
 import math
@@ -10,8 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heli_jax import units
-from heli_jax.flights.flight import Signal
 from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.identifiability.verdict import FACTOR
 from heli_jax.identification.problem import Problem
@@ -25,7 +22,7 @@ from heli_jax.identification.validation.metrics import metrics
 from heli_jax.numbers import measured, percent, vaf_percent
 from heli_jax.report import figures, tables
 from heli_jax.report.card import card, summary
-from heli_jax.report.charts import Logged, Numbers
+from heli_jax.report.charts import Numbers
 from heli_jax.report.figures.estimates import MOST
 from heli_jax.report.files import Analysis as Analysis
 from heli_jax.report.fitted_responses import FittedPair
@@ -62,11 +59,10 @@ def write_report(
     """
     folder = directory / "figures"
     folder.mkdir(parents=True, exist_ok=True)
-    numbers, shown, logged = Numbers(), list[Picture](), logged_units(analysis)
-    # Drawn here, one after the other: of many flights' figures one canvas is in memory at a time.
+    numbers, shown = Numbers(), list[Picture]()
+    # One after the other, for memory.
     for name, draw in drawings(analysis).items():
-        units = logged.get(name)
-        made = picture(name, draw, numbers, folder=folder, logged=units, png=png)
+        made = picture(name, draw, numbers, folder=folder, png=png)
         if made is not None:
             shown.append(made._replace(alt=alt_text(made, analysis)))
     page = render(analysis, title, vehicle_constants, shown, numbers, origin)
@@ -95,7 +91,7 @@ def render(
         problem=problem,
         baseline=analysis.baseline,
         more=analysis.supplementary,
-        card=card(problem, fit, analysis.supplementary.responses),
+        card=card(fit, analysis.supplementary.responses),
         summary=summary,
         # The template asks this module for its rows.
         lines=lines(fit),
@@ -136,11 +132,11 @@ GROUPS = {
     "intervals' sd; 95 % of it lie within a curve. Where the dots do not follow it, neither do "
     "intervals and correlations.",
 }
-"""what a figure shows, after its title, by what its name begins with"""
+"""caption of a figure after its title, by the beginning of its name"""
 
 
 def worst_output(fit: Fit) -> tuple[Signals, str] | None:
-    """The fitted flight and output that the simulation explains least; None where none moves."""
+    """Return the fitted flight and output with the smallest VAF; None if none moves."""
     shares = {
         (i, output): metrics(measured, s.simulated[output]).vaf
         for i, s in enumerate(fit.signals)
@@ -155,8 +151,7 @@ def worst_output(fit: Fit) -> tuple[Signals, str] | None:
 
 
 def drawings(analysis: Analysis) -> dict[str, Draw]:
-    """Every figure of the report by its file name, not yet drawn."""
-    # Drawn when it is asked for: `FitRun.figure` wants one of them and draws no other.
+    """Return functions that draw the figures, by file name."""
     later = functools.partial
     fit, problem, baseline, supplementary = analysis
     model, drawings = problem.model, dict[str, Draw]()
@@ -170,7 +165,6 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
         s, part = fit.signals[i], parts[i]
         for output in s.measured:
             drawings[f"response{part}_{output}"] = later(figures.response, s, output, model)
-            # The fit did nothing to make the residuals of a flight held out white.
             if not s.hold_out:
                 drawings[f"residual{part}_{output}"] = later(
                     figures.residual_correlation,
@@ -201,8 +195,7 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
 
 
 def _drawn(hold_out: list[bool]) -> list[int]:
-    """Return the indices of the flights that get figures. If there are too many, half of them
-    are held-out flights, although the fitted ones come first."""
+    """Return the indices of the flights with figures, at most half of them held out."""
     held = [i for i, out in enumerate(hold_out) if out][: MOST_FLIGHTS // 2]
     fitted = [i for i, out in enumerate(hold_out) if not out][: MOST_FLIGHTS - len(held)]
     rest = [i for i in range(len(hold_out)) if i not in {*held, *fitted}]
@@ -210,11 +203,10 @@ def _drawn(hold_out: list[bool]) -> list[int]:
 
 
 def _parts(flights: list[str]) -> list[str]:
-    """Return the parts that tell the flights' file names apart; nothing for one flight."""
+    """Return the parts of file names by flight; empty for one flight."""
     if len(flights) == 1:
         return [""]
-    # Names come from logs and may hold slashes, and two may be equal but for what is left out: the
-    # number keeps their files apart.
+    # Names of logs may have any letters; the number makes them unique.
     return [
         f"_{i + 1}_{re.sub('[^A-Za-z0-9]+', '-', f).strip('-')[:40]}".rstrip("_")
         for i, f in enumerate(flights)
@@ -223,45 +215,6 @@ def _parts(flights: list[str]) -> list[str]:
 
 def _of(baseline: Baseline | None, pair: FittedPair) -> bool:
     return baseline is not None and (baseline.input, baseline.output) == (pair.input, pair.output)
-
-
-def logged_units(analysis: Analysis) -> dict[str, dict[str, Logged]]:
-    """By figure and signal how the log has it; signals that it has in SI are left out."""
-    fit, problem, _, _ = analysis
-    # In the order of the signals: the fitted flights first.
-    flights = [*problem.training, *(f for f in problem.flights if f.hold_out)]
-    parts, by_figure = _parts([s.flight for s in fit.signals]), {}
-    for signals, flight, part in zip(fit.signals, flights, parts, strict=True):
-        if flight.source is None:
-            continue
-        listed = {**flight.source.inputs, **flight.source.outputs}
-        factors = {n: logged for n, s in listed.items() if (logged := as_logged(s))}
-        for output in signals.measured:
-            own = factors.get(output)
-            # A difference of two numbers has no offset.
-            residual = {"residual": own._replace(offset=0.0)} if own else {}
-            by_figure[f"response{part}_{output}"] = factors | residual
-    return by_figure
-
-
-def as_logged(signal: Signal) -> Logged | None:
-    """Return the scale of a signal in the log; None if it is constant, or logged in SI."""
-    if signal.constant is not None:
-        return None
-    if signal.scale == 1.0 and not signal.offset and not signal.invert:
-        factor = from_si(signal)
-        return None if factor == 1.0 else Logged(signal.unit, factor)
-    # The configuration's unit is not the log's, as metres of a pulse width: the column says which.
-    zero, one = map(float, signal.from_si(np.array([0.0, 1.0])))
-    return Logged(signal.name, one - zero, zero)
-
-
-def from_si(signal: Signal) -> float:
-    """Return the factor from SI to the unit that the configuration states for a signal."""
-    try:
-        return 1.0 / units.factor(signal.unit, signal.si)
-    except ValueError:  # of no known unit: it was never converted
-        return 1.0
 
 
 def caption(picture: Picture) -> str:
@@ -302,11 +255,11 @@ class Line(NamedTuple):
 
 
 _SPEAK_AGAINST = ("adequacy", "dynamics", "units", "timing", "quality")
-"""topics whose doubts speak against a model that is adequate"""
+"""topics of doubts about an adequate model"""
 
 
 def lines(fit: Fit) -> tuple[Line, Line, Line]:
-    """Did the optimiser converge; what do the data determine; is the model adequate."""
+    """Return the statements on convergence, identifiability and adequacy."""
     if fit.status == "not-converged":
         stopped = "The optimiser stopped before an optimum, and these numbers are no result."
         return (
@@ -349,9 +302,7 @@ def lines(fit: Fit) -> tuple[Line, Line, Line]:
 
 
 def model_remark(problem: Problem) -> str:
-    """Remark that an inertia found with the paper's model is a number of that model; empty for
-    other models."""
-    # A model with parameters of its own need not have the paper's equations 14 and 15.
+    """Return a remark on inertias of the paper's model; empty for other models."""
     if not of_helicopter(problem.model.Params):
         return ""
     factor = float(np.asarray(problem.vehicle.cyclic_moment))

@@ -1,4 +1,4 @@
-"""Responses of a fitted model beside those of the flights that it was fitted to, both with errors.
+"""Frequency responses of a fitted model and of its flights, both with errors.
 
 The measured ones are conditioned: inputs that move together are separated, and all flights count
 (`heli_jax.analysis.flight_responses`).
@@ -34,62 +34,63 @@ from heli_jax.analysis.spectra import octave_mean
 from heli_jax.dynamics.model import Model
 from heli_jax.finding import Finding, note
 from heli_jax.identification.fit import Fit
+from heli_jax.identification.identifiability.verdict import Z95
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate
 from heli_jax.simulation.simulate import substeps_for
 
 MOST_PAIRS = 6
-"""of input and output that get a figure"""
-_Z95 = 1.959963984540054
+"""pairs of input and output with a figure"""
+
 _BEYOND = 4.0
-"""times the last frequency of the data, up to which a model's phase is followed"""
+"""last frequency of the model over that of the data"""
 
 
 class FittedPair(NamedTuple):
-    """An output's response to an input; arrays (k,), those of the model at the same frequencies."""
+    """Measured and modelled response of an output to an input; arrays (k,)."""
 
     input: str
     output: str
     omega: np.ndarray
     """[rad/s]"""
     H: np.ndarray
-    """measured, without what the input does between samples; NaN where it is not known"""
+    """measured, without the hold of the input; NaN where it is not known"""
     sd: np.ndarray
-    """of its real and of its imaginary part"""
+    """of the real and of the imaginary part of H"""
     coherence: np.ndarray
     model: Point
-    """of the vehicle in continuous time"""
-    half95: float = _Z95
-    """half of a 95 % interval of what was measured, in sd"""
+    """in continuous time"""
+    half95: float = Z95
+    """half of the 95 % interval of H, in sd"""
 
 
 NO_RESPONSES = "responses.none-of-fit"
-"""code of flights of which none could be taken"""
+"""code of the note on flights without a response"""
 
 
 class FittedResponses(NamedTuple):
-    """All that is shown of a fit's responses."""
+    """Responses of a fit and its flights."""
 
     pairs: tuple[FittedPair, ...]
-    """those with a coherence worth showing, the highest first"""
+    """the most coherent pairs"""
     left_out: int
-    """as many more"""
+    """number of further coherent pairs"""
     handling: tuple[Handling, ...]
     about: str
-    """where the model was linearised, in words; empty for a linear one"""
+    """point of the linearisation in words; empty for a linear model"""
     notes: tuple[Finding, ...]
     incoherent: tuple[str, ...] = ()
-    """those without a coherence worth showing, as `lat to p`; they have no figure"""
+    """pairs without coherence, as `lat to p`"""
     held_out: tuple[FittedPair, ...] = ()
-    """of the flights held out, as many as are shown"""
+    """pairs of the held-out flights"""
     coherence: Mapping[str, tuple[str, float]] = {}
-    """by output its most coherent input, and the highest mean coherence over an octave"""
+    """by output the most coherent input, and its mean coherence over an octave"""
 
 
 def fitted_responses(
     fit: Fit, problem: Problem, settings: Settings, asked: Sequence[HandlingPair]
 ) -> FittedResponses:
-    """The responses of a fit and of its flights, and handling qualities of both."""
+    """Return the responses of a fit and of its flights, and handling qualities of both."""
     try:
         responses = flight_responses(problem.training, settings)
     except ValueError as e:
@@ -110,7 +111,6 @@ def fitted_responses(
     handling = tuple(
         Handling(p, _of_model(curves, p), measured_handling(responses, p))
         for p in asked
-        # One that is fixed, or that does not move, is no part of the fit.
         if p.input in responses.holds and p.output in responses.outputs
     )
     left_out = max(len(pairs) - MOST_PAIRS, 0)
@@ -136,7 +136,7 @@ def at_record(model: Model, params: Any, fit: Fit) -> OperatingPoint:
     """Return the operating point of a fit's first flight at which the model is linearised, with
     the estimated gains."""
     signals = fit.signals[0]
-    # What acts is gain times what was logged: the mean of the log would be another point.
+    # The vehicle receives gain times the logged input.
     gains = {n: fit.nuisance.get(f"gain {n}") for n in signals.inputs}
     inputs = {
         n: np.asarray(u) * (1.0 if (gain := gains[n]) is None else gain.value)
@@ -156,7 +156,7 @@ class _Curves(NamedTuple):
     band: tuple[float, float]
 
     def curve(self, input: str, output: str) -> Curve:
-        """One of them."""
+        """Return the response of an output to an input."""
         names = (*self.free, f"gain {input}", "time_shift")
         root = _root(self.fit, names)
         gain, shift = (self.fit.nuisance.get(n) for n in names[-2:])
@@ -178,8 +178,8 @@ class _Curves(NamedTuple):
 
 
 def _root(fit: Fit, names: Sequence[str]) -> np.ndarray:
-    """(q, r) R with R R' the covariance of the estimates; NaN where one is not identifiable, zero
-    where one was not estimated."""
+    """Return R (q, r), where R R' is the covariance of the estimates; NaN for those that are not
+    identifiable, zero for those that were not estimated."""
     known = {**fit.nuisance, **fit.estimates}
     order = [fit.verdict.names.index(n) if n in known else None for n in names]
     rows = np.zeros((len(names), len(fit.verdict.names)))
@@ -192,7 +192,7 @@ def _root(fit: Fit, names: Sequence[str]) -> np.ndarray:
 
 
 def _sd(estimate: Estimate, fit: Fit) -> float:
-    """As wide as the interval that is reported, which allows for what is known of the noise."""
+    """Return the sd of the reported interval."""
     e = estimate
     if fit.status == "not-converged" or e.sd is None or e.lower95 is None or e.upper95 is None:
         return np.nan
@@ -200,12 +200,12 @@ def _sd(estimate: Estimate, fit: Fit) -> float:
         half = 0.5 * abs(e.value * np.log(e.upper95 / e.lower95))
     else:
         half = 0.5 * (e.upper95 - e.lower95)
-    # An interval that a bound cuts off is no measure of the error.
-    return max(half / _Z95, e.sd)
+    # A bound may cut the interval.
+    return max(half / Z95, e.sd)
 
 
 def _octave_means(responses: FlightResponses) -> dict[tuple[str, str], np.ndarray]:
-    """By input and output the mean coherence (k,) over an octave."""
+    """Return the mean coherence over an octave (k,) by input and output."""
     return {
         (input, name): octave_mean(responses.omega, pair.coherence)
         for name, output in responses.outputs.items()
@@ -216,8 +216,7 @@ def _octave_means(responses: FlightResponses) -> dict[tuple[str, str], np.ndarra
 def _pairs(
     responses: FlightResponses, curves: _Curves, means: Mapping[tuple[str, str], np.ndarray]
 ) -> list[FittedPair]:
-    """Return the pairs of input and output that are coherent anywhere, by the sum of their
-    coherence."""
+    """Return the coherent pairs of input and output, in order of their sums of coherence."""
     ranked = []
     for (input, name), mean in means.items():
         total = float(np.sum(mean[mean >= COHERENT]))
@@ -236,7 +235,7 @@ def _pairs(
 def _of_held_out(
     problem: Problem, settings: Settings, curves: _Curves
 ) -> tuple[tuple[FittedPair, ...], tuple[Finding, ...]]:
-    """The responses of the flights held out, as many as are shown, and why there is none."""
+    """Return the responses of the held-out flights, or the reason why there is none."""
     held = tuple(f for f in problem.flights if f.hold_out)
     if not held:
         return (), ()

@@ -6,7 +6,7 @@ A figure of lines is there as numbers, which the page draws, and as words for wh
 import contextlib
 import functools
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -15,7 +15,7 @@ import markupsafe
 
 from heli_jax.numbers import page_sentence
 from heli_jax.report import style
-from heli_jax.report.charts import Chart, Logged, Numbers, as_base64, described
+from heli_jax.report.charts import Chart, Numbers, as_base64, described
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -69,7 +69,7 @@ class Picture(NamedTuple):
     name: str
     title: str
     alt: str
-    """what the figure shows, in words and numbers"""
+    """text alternative"""
     chart: int | None = None
     """its number among the page's charts; None of an image"""
     image: str = ""
@@ -95,7 +95,6 @@ def picture(
     numbers: Numbers,
     *,
     folder: Path | None = None,
-    logged: Mapping[str, Logged] | None = None,
     png: bool = False,
 ) -> Picture | None:
     """Draw a figure for a page; None where there is nothing to draw.
@@ -111,9 +110,9 @@ def picture(
         return None
     file = f"{folder.name}/{name}.svg" if folder else ""
     if isinstance(made, Chart):
-        number = numbers.add_chart(made, dict(logged or {}))
+        number = numbers.add_chart(made)
         return Picture(name, made.title, described(made), number, file=file)
-    title, size = made.axes[0].get_title("left"), made.get_size_inches()
+    title, size = made.get_suptitle().partition("\n")[0], made.get_size_inches()
     width, height = (round(96 * v) for v in size)
     image = _address("svg+xml", svg) if svg else ""
     return Picture(name, title, title, None, image, (width, height), file)

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from heli_jax.analysis.attitude_responses import Handling
 from heli_jax.analysis.flight_responses import FlightResponses, Pair, Wanted, forgets
@@ -310,36 +309,23 @@ def _measured(c: Coefficient, factor: float = 1.0) -> str:
     return with_sd(c.value * factor, c.sd * factor)
 
 
-def longest_band(
-    hz: Float[np.ndarray, " k"], good: Bool[np.ndarray, " k"]
-) -> tuple[float, float] | None:
-    """Return the widest band (in octaves) without a hole; None where nothing is good.
-
-    Args:
-        hz: rising, any unit.
-    """
-    edges = np.diff(np.concatenate([[0], good.astype(int), [0]]))
-    begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
-    if not begins.size:
-        return None
-    widest = int(np.argmax(hz[ends] / hz[begins]))
-    return float(hz[begins[widest]]), float(hz[ends[widest]])
-
-
 def useful_band(omega: np.ndarray, pair: Pair) -> tuple[str, str, str]:
-    """Mean coherence, and the widest band in which it stays above 0.6 and the error below what that
-    makes of few averages, as text."""
+    """Return as text the mean coherence, and the widest band with coherence above 0.6 and a small
+    random error."""
     seen = np.isfinite(pair.coherence)
     if not seen.any():
         return "not determined", "–", "–"
     mean = f"{np.mean(pair.coherence[seen]):.2f}"
-    # On the flanks of a sine coherence is high, and the window brings it from another frequency.
+    # Beside a sine the window's leakage is coherent too.
     with np.errstate(invalid="ignore"):
         sure = pair.sd < _SURE * np.abs(pair.H)
-    band = longest_band(omega, (np.where(seen, pair.coherence, 0.0) > COHERENT) & sure)
-    if band is None:
+    good = (np.where(seen, pair.coherence, 0.0) > COHERENT) & sure
+    bands = np.ma.clump_masked(np.ma.array(omega, mask=good))
+    if not bands:
         return mean, "–", "–"
-    low, high = (number(float(w) / (2.0 * np.pi), 3) for w in band)
+    # The widest in octaves.
+    widest = max((omega[band] for band in bands), key=lambda w: w[-1] / w[0])
+    low, high = (number(float(w) / (2.0 * np.pi), 3) for w in (widest[0], widest[-1]))
     return mean, low, high
 
 

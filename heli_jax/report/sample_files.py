@@ -2,14 +2,14 @@
 
 import importlib.util
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from heli_jax.errors import InputError
-from heli_jax.identification.result import Fit, Signals
+from heli_jax.identification.result import Fit
 from heli_jax.identification.uncertainty.bootstrap import Bootstrap
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.uncertainty.nuts import Posterior
@@ -42,11 +42,10 @@ type _Variables = dict[str, tuple[Any, np.ndarray, dict[str, str]]]
 
 
 def sample_files(comparison: Intervals | None) -> tuple[str, ...]:
-    """The names of the files that `write_samples` writes."""
+    """Return the names of the files that `write_samples` writes."""
     if comparison is None:
         return ()
     posterior = (POSTERIOR,) if comparison.posterior is not None else ()
-    # Of no record that could be fitted there is nothing to keep.
     booted = comparison.bootstrap is not None and comparison.bootstrap.records
     return posterior + ((BOOTSTRAP,) if booted else ())
 
@@ -54,8 +53,7 @@ def sample_files(comparison: Intervals | None) -> tuple[str, ...]:
 def write_samples(
     folder: Path, fit: Fit, comparison: Intervals | None, origin: Origin, config: str
 ) -> None:
-    """Write posterior.nc (NetCDF 4, for arviz) and bootstrap.nc (NetCDF 3), where there are draws
-    and samples.
+    """Write posterior.nc (NetCDF 4, for arviz) and bootstrap.nc (NetCDF 3), if sampled.
 
     Raises:
         InputError: h5netcdf is not installed (extra `bayes`).
@@ -84,14 +82,11 @@ def write_samples(
     if comparison.bootstrap is not None and BOOTSTRAP in names:
         about = {"what": _WHAT[BOOTSTRAP], **attributes}
         dataset = bootstrap_dataset(fit, comparison.bootstrap, about)
-        # The old format, which needs nothing beside scipy: the file has no groups.
         dataset.to_netcdf(folder / BOOTSTRAP, engine="scipy")
 
 
 def posterior_tree(fit: Fit, posterior: Posterior, attributes: Mapping[str, str]) -> "xr.DataTree":
-    """The draws with what arviz looks for beside them: groups posterior, sample_stats,
-    observed_data (outputs as measured) and constant_data (inputs).
-    """
+    """Return the draws as arviz reads them, in the groups posterior and sample_stats."""
     import xarray as xr
 
     dims = ("chain", "draw")
@@ -110,18 +105,16 @@ def posterior_tree(fit: Fit, posterior: Posterior, attributes: Mapping[str, str]
     chains, count = next(iter(posterior.draws.values())).shape
     coordinates = {"chain": np.arange(chains), "draw": np.arange(count)}
     groups = {
-        # The attributes at each group too: arviz takes a group by itself.
+        # arviz takes a group by itself, so each has the attributes.
         "/": xr.Dataset(attrs=dict(attributes)),
         "posterior": xr.Dataset(draws, coordinates, dict(attributes)),
         "sample_stats": xr.Dataset(statistics, coordinates, dict(attributes)),
-        "observed_data": _records(fit, lambda s: s.measured),
-        "constant_data": _records(fit, lambda s: s.inputs),
     }
-    return xr.DataTree.from_dict({n: g for n, g in groups.items() if n == "/" or g.data_vars})
+    return xr.DataTree.from_dict(groups)
 
 
 def bootstrap_dataset(fit: Fit, booted: Bootstrap, attributes: Mapping[str, str]) -> "xr.Dataset":
-    """The samples of the bootstrap, each parameter over `record`, the number of the record."""
+    """Return the samples of the bootstrap by parameter over the number of the record."""
     import xarray as xr
 
     variables: _Variables = {
@@ -133,24 +126,8 @@ def bootstrap_dataset(fit: Fit, booted: Bootstrap, attributes: Mapping[str, str]
     return xr.Dataset(variables, {"record": record}, {**attributes, **counts})
 
 
-def _records(fit: Fit, signals_of: Callable[[Signals], Mapping[str, np.ndarray]]) -> "xr.Dataset":
-    """Signals of the fitted flights, SI, each over its flight's time."""
-    import xarray as xr
-
-    flights = [s for s in fit.signals if not s.hold_out]
-    variables: _Variables = {}
-    times: _Variables = {}
-    for i, s in enumerate(flights):
-        # Flights differ in length: of several each has a time of its own.
-        end = f"_{i + 1}" if len(flights) > 1 else ""
-        times[f"time{end}"] = (f"time{end}", s.times, {"units": "s", "flight": s.flight})
-        for name, values in signals_of(s).items():
-            variables[name + end] = (f"time{end}", np.asarray(values), {"flight": s.flight})
-    return xr.Dataset(variables, times)
-
-
 def _variable(name: str, taken: Mapping[str, Any]) -> str:
-    """A name that every reader of NetCDF takes: without slashes, which would begin a group."""
+    """Return a name without slashes, which would begin a NetCDF group."""
     plain = re.sub(r"\W+", "_", name).strip("_") or "nuisance"
     plain = f"_{plain}" if plain[0].isdigit() else plain
     unique, k = plain, 2

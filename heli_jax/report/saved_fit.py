@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _LIMIT_BYTES = 1_000_000_000
-"""of each file: more is none that a fit wrote, and would fill the memory"""
+"""largest size of each file"""
 
 
 class SavedFit(NamedTuple):
@@ -31,10 +31,10 @@ class SavedFit(NamedTuple):
     method: str
     status: str
     verdict: str
-    """what the data determine, in words"""
+    """text of the identifiability analysis"""
     identifiable: bool
     adequate: bool | None
-    """whether the model explains what was measured; None where that was not judged"""
+    """True if the model explains the record; None if that was not judged"""
     estimates: dict[str, Estimate]
     nuisance: dict[str, Estimate]
     intervals: dict[str, dict[str, tuple[float, float]]]
@@ -58,7 +58,7 @@ class SavedFit(NamedTuple):
 
     @property
     def distrust(self) -> str:
-        """`Not trusted: ...`, as the fit had it; empty where nothing speaks against it."""
+        """`Not trusted: ...`; empty if all intervals are trusted."""
         return self.content.get("distrust") or ""
 
     @property
@@ -67,10 +67,10 @@ class SavedFit(NamedTuple):
         return bool((self.content.get("residuals") or {}).get("overconfident", False))
 
     def to_dataframe(self, *, nuisance: bool = False) -> "pd.DataFrame":
-        """The estimates as a pandas data frame, as `Fit.to_dataframe`.
+        """Return the estimates as a pandas data frame, as `Fit.to_dataframe`.
 
         Args:
-            nuisance: whether initial states, biases, gains and offsets follow the parameters.
+            nuisance: True to append initial states, biases, gains and offsets.
         """
         from heli_jax.exports import estimates_frame
 
@@ -127,7 +127,7 @@ def load_fit(directory: str | Path) -> SavedFit:
 
 
 def _saved(directory: Path, content: dict[str, Any], table: str) -> SavedFit:
-    # Fixed ones are listed for who looks for them; they are no estimates.
+    # Fixed parameters are no estimates.
     free = {n: e for n, e in content["parameters"].items() if not e.get("fixed", False)}
     estimates = _records(Estimate, free)
     by_method = {n: {"gaussian": (e.lower95, e.upper95)} for n, e in estimates.items()}
@@ -160,8 +160,8 @@ def _saved(directory: Path, content: dict[str, Any], table: str) -> SavedFit:
 def _records[R: (Estimate, Metrics)](
     kind: type[R], saved: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, R]:
-    """By name; by these fields alone, since a later version may have added keys."""
-    # JSON has no NaN: what the data do not determine is null in fit.json.
+    """Return records by name, from the keys of their fields."""
+    # null stands for NaN.
     numbers = ("value", *Metrics._fields)
     made = {}
     for name, e in saved.items():
@@ -175,8 +175,7 @@ def _number(value: float | None) -> float:
 
 
 def _signals(text: str, content: Mapping[str, Any]) -> tuple[Signals, ...]:
-    """The flights of signals.csv, as the fit had them; NaN where a cell is empty."""
-    # The table itself does not say which flights were held out.
+    """Return the flights of signals.csv; NaN where a cell is empty."""
     held_out = {flight["flight"]: flight.get("hold_out", False) for flight in content["data"]}
     # An output may have been measured in the flights held out alone.
     outputs = list(dict.fromkeys([*content["metrics"], *content["validation"]]))
@@ -185,7 +184,6 @@ def _signals(text: str, content: Mapping[str, Any]) -> tuple[Signals, ...]:
     head = next(lines, [])
     if head[:2] != ["flight", "time"]:
         raise ValueError(f"signals.csv: expected the columns flight and time, got {head[:2]}")
-    # Flights lie one after the other; rows are told apart by name and not by place.
     rows: dict[str, list[list[str]]] = {}
     for line in lines:
         rows.setdefault(line[0], []).append(line[1:])
@@ -208,5 +206,5 @@ def _flight(
     times = columns.pop("time")
     log = columns.pop("log_time", None)  # of earlier versions, and without a log, there is none
     start = None if log is None else float(log[0] - times[0])
-    # What is left is no time and of no output: the inputs.
+    # The other columns are inputs.
     return Signals(name, hold_out, times, columns, measured, simulated, innovations or None, start)

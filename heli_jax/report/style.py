@@ -2,6 +2,7 @@
 
 import io
 import re
+import textwrap
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -66,11 +67,6 @@ STYLE: dict[Any, Any] = {
 
 WIDTH = 7.4
 """width of a figure [inch]"""
-ROW = 15.0 / 72.0
-"""height of a row above the axes [inch]: title, note, legend"""
-_BOTTOM, _GAP = 0.48, 0.22
-"""below the last panel, and between two of them [inch]"""
-_LEFT, _RIGHT = 0.82, 0.2
 _POINTS, _CORNERS = 800, 4000
 """of a drawn line at most (lowest and highest of every 1.5 pixels), and of all lines of a figure"""
 _DPI = 110
@@ -80,62 +76,44 @@ _NOT_XML = bytes(set(range(32)) - {9, 10, 13})
 """control characters"""
 
 
-def figure(height: float, width: float = WIDTH, *, constrained: bool = False) -> "Figure":
-    """An empty figure with its own canvas; `constrained`: laid out by Matplotlib, which is slow and
-    gives labels of any length their room."""
-    # Without pyplot, which keeps every figure alive in a global list, and is not for threads.
+def figure(height: float, width: float = WIDTH) -> "Figure":
+    """Return an empty figure with its own canvas [inch]."""
+    # Without pyplot, which keeps all figures in a global list, and is not for threads.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    drawing = Figure(figsize=(width, height), layout="constrained" if constrained else None)
+    drawing = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(drawing)
     return drawing
 
 
-def figure_of(chart: Chart) -> "Figure":
-    """A chart as Matplotlib draws it for a file; within `in_style`."""
-    from matplotlib.transforms import ScaledTranslation
+def head(drawing: "Figure", title: str, note: str = "") -> None:
+    """Write a title, and a note below it."""
+    text = "\n".join(filter(None, (title, textwrap.fill(note, 105))))
+    drawing.suptitle(text, x=0.01, ha="left", fontsize=9)
 
-    panels, n = chart.panels, len(chart.panels)
-    named = [tuple(s.label for s in p.series if s.label) for p in panels]
-    # Panels that show the same by the same names share the legend of the first.
-    legends = [len(names) > 1 and (k == 0 or names != named[0]) for k, names in enumerate(named)]
-    heads = [1 + bool(chart.note) + legends[0], *legends[1:]]
-    gap = _GAP + ROW * any(legends[1:])
-    top = ROW * heads[0] + 0.08
-    height = top + sum(p.height for p in panels) + gap * (n - 1) + _BOTTOM
-    drawing = figure(height)
+
+def figure_of(chart: Chart) -> "Figure":
+    """Return a chart as Matplotlib draws it for a file; within `in_style`."""
+    panels = chart.panels
+    drawing = figure(0.9 + 1.1 * sum(p.height for p in panels))
     ratios = [p.height for p in panels]
-    axes = drawing.subplots(n, 1, sharex=True, squeeze=False, height_ratios=ratios)[:, 0]
-    # Margins are fixed: a layout engine draws every tick twice more and takes half the report's
-    # time. Matplotlib takes margins as parts of the figure, and gaps as parts of a mean panel.
-    drawing.subplots_adjust(
-        left=_LEFT / WIDTH,
-        right=1.0 - _RIGHT / WIDTH,
-        top=1.0 - top / height,
-        bottom=_BOTTOM / height,
-        hspace=gap * n / sum(ratios),
-    )
+    grid = drawing.subplots(len(panels), 1, sharex=True, squeeze=False, height_ratios=ratios)
+    axes = grid[:, 0]
     lines = sum(2 if s.kind == "step" else 1 for p in panels for s in p.series)
     most = max(4, min(_POINTS, _CORNERS // max(lines, 1)))
-    for ax, p, legend in zip(axes, panels, legends, strict=True):
-        # As far away in every figure, whatever the tick labels' widths.
-        at = ax.transAxes + ScaledTranslation(-0.57, 0.0, drawing.dpi_scale_trans)
-        ax.yaxis.set_label_coords(0.0, 0.5, transform=at)
+    for ax, p in zip(axes, panels, strict=True):
         _draw(ax, p, most)
-        if legend:
-            place = {"loc": "lower right", "bbox_to_anchor": (1.005, 1.0), "ncols": 6}
-            ax.legend(borderaxespad=0.2, handlelength=1.6, columnspacing=1.2, **place)
-    first, above = axes[0], 72.0 * ROW * legends[0]
-    first.set_title(chart.title, loc="left", pad=6 + above + 13 * bool(chart.note))
-    if chart.note:
-        subtitle(first, chart.note, above=above)
+        if sum(bool(s.label) for s in p.series) > 1:
+            ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=6, borderaxespad=0.2)
+    head(drawing, chart.title, chart.note)
     if chart.logarithmic:
-        first.set_xscale("log")
-    first.set_xlim(*chart.x_limits)
+        axes[0].set_xscale("log")
+    axes[0].set_xlim(*chart.x_limits)
     if chart.logarithmic:
-        plain_log_ticks(first)
+        plain_log_ticks(axes[0])
     axes[-1].set_xlabel(chart.x_label)
+    drawing.align_ylabels(axes)
     return drawing
 
 
@@ -186,12 +164,6 @@ def label(name: str, unit: str | None) -> str:
     return f"{name} [{pretty(unit)}]" if unit is not None else name
 
 
-def subtitle(ax: "Axes", text: str, *, above: float = 0.0) -> None:
-    """A quiet line between the title and the axes, `above` them [points]."""
-    place: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points"}
-    ax.annotate(text, (0, 1), xytext=(0, 6 + above), fontsize=8, color=GREY, **place)
-
-
 _NAME = 26
 """letters of a name in a title"""
 
@@ -216,12 +188,12 @@ def plain_log_ticks(ax: "Axes", which: Literal["x", "y"] = "x") -> None:
     axis.set_minor_locator(NullLocator())
 
 
-def few_ticks(ax: "Axes", which: Literal["x", "y"], most: int, *, integer: bool = False) -> None:
-    """At most so many numbers at an axis; `integer`: whole ones alone."""
+def few_ticks(ax: "Axes", which: Literal["x", "y"], most: int) -> None:
+    """Set the most ticks of an axis."""
     from matplotlib.ticker import MaxNLocator
 
     axis = ax.xaxis if which == "x" else ax.yaxis
-    axis.set_major_locator(MaxNLocator(nbins=most, integer=integer))
+    axis.set_major_locator(MaxNLocator(nbins=most))
 
 
 @contextmanager
@@ -252,10 +224,9 @@ def save(
         drawn = styled(draw)
         if drawn is None:
             return None
-        if drawn.get_layout_engine() is not None:
-            # Once, and not for each of the files.
-            drawn.draw_without_rendering()
-            drawn.set_layout_engine("none")
+        # The layout once, for both files.
+        drawn.draw_without_rendering()
+        drawn.set_layout_engine("none")
         buffer = io.BytesIO()
         # Without a date: the same fit gives the same file.
         drawn.savefig(buffer, format="svg", metadata={"Date": None})

@@ -1,16 +1,13 @@
-"""Quick-look figures of a sweep, a Dataset over `element` in, Matplotlib Figures out; and its page.
+"""Figures of a sweep, from a Dataset over `element`, and its page.
 
-Elements that are not ok, and values that are not finite, count in no median and no histogram; the
-former are marked in red where their axes are finite. A result of several flights is drawn as its
-mean over them. Draw within `matplotlib.rc_context(style.STYLE)`, as `write_figures` does, to get
-the report's look.
+Medians leave out elements that are not ok, which are marked in red, and values that are not finite.
+A result of several flights is drawn as its mean over them.
 """
 
 import functools
 import itertools
 import json
 import re
-import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -21,7 +18,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+from matplotlib.ticker import FuncFormatter, NullLocator
 from numpy.typing import ArrayLike
 from scipy.stats import binned_statistic_2d
 
@@ -35,7 +32,7 @@ from heli_jax.sweeps.datasets import chunks_of
 RESULTS = 6
 """results with figures of their own"""
 DRAWN = 1 << 16
-"""elements that are drawn at most, by lot: more change no quantile that the eye could see"""
+"""elements that are drawn at most, a random choice"""
 _DOTS, _MARKS = 2000, 300
 """dots and red marks of a panel at most"""
 _SLICES, _PAIRS = 8, 6
@@ -43,13 +40,11 @@ _SLICES, _PAIRS = 8, 6
 _TICKS = 6
 """of an axis at most"""
 _WIDE = 30.0
-"""Factor over which numbers of one sign are drawn logarithmically: on a linear scale the lower half
-of that range, in decades, would lie within a sixth of the panel."""
+"""range of positive numbers, as a factor, from which on an axis is logarithmic"""
 _BINS, _A_BIN = 20, 5
-"""bins of an axis at most, and elements in each at least: a band of fewer is their range"""
+"""bins of an axis at most, and elements in each at least"""
 _CELLS, _GRID = 24, 180
-"""cells along an axis at most, and distinct values that are cells of their own: a grid is seen at
-its own resolution"""
+"""cells along an axis at most, and distinct values of a grid that have their own cells, at most"""
 _DPI = 160
 """of what is pixels in an SVG"""
 _OK = 0
@@ -59,7 +54,7 @@ type Which = Literal["x", "y"]
 
 
 class Column:
-    """An axis or a result: a number (n,) for each element drawn, NaN where it is not finite."""
+    """An axis or a result: a number (n,) for each drawn element, NaN if it is not finite."""
 
     def __init__(
         self, variable: xr.DataArray, elements: np.ndarray, ok: np.ndarray, *, axis: bool
@@ -74,22 +69,21 @@ class Column:
         self.finite = np.isfinite(self.values)
         self.used = self.finite & ok
         self.axis = axis
-        self.whole = variable.dtype.kind in "biu" and not flights
-        # An axis shows where elements failed, too; of a result the failed have no value.
+        # An axis shows failed elements too.
         seen = np.sort(self.values[self.finite if axis else self.used])
         self.empty = not seen.size
         if self.empty:
             return
         self.distinct = np.unique(seen)
-        # Values that were chosen come twice; those of a continuous axis do not.
-        chosen = (axis or self.whole) and 2 * self.distinct.size <= seen.size
+        # The values of a grid come twice at least.
+        chosen = axis and 2 * self.distinct.size <= seen.size
         self.few = self.distinct.size == 1 or (chosen and self.distinct.size <= _GRID)
         low, high = float(seen[0]), float(seen[-1])
-        # A result by its bulk: single elements would press the others flat.
+        # The bulk of a result sets its view.
         first, last = (low, high) if axis else np.quantile(seen, [0.01, 0.99])
         declared = axis and variable.attrs.get("scale") == "log"
         wide = max(abs(first), abs(last)) > _WIDE * min(abs(first), abs(last))
-        self.log = low > 0.0 and (declared or (wide and (axis or not self.whole)))
+        self.log = low > 0.0 and (declared or wide)
         if not (axis or self.log):
             beyond = 0.3 * (last - first)
             low, high = max(low, first - beyond), min(high, last + beyond)
@@ -116,15 +110,13 @@ class Column:
         if self.log:
             ax.set(**{f"{which}scale": "log"})
             style.plain_log_ticks(ax, which)
-        elif self.whole and self.distinct.size <= _TICKS:
-            axis.set_major_locator(FixedLocator([float(v) for v in self.distinct]))
         else:
-            style.few_ticks(ax, which, _TICKS, integer=self.whole)
+            style.few_ticks(ax, which, _TICKS)
         axis.set_label_text(style.label(style.short(self.name), self.unit))
 
 
 class Table:
-    """Results of a sweep to draw, read once: all of them, or a random part of many."""
+    """Results of a sweep, read once; a random choice of the elements if there are many."""
 
     def __init__(self, ds: xr.Dataset) -> None:
         self._ds = ds
@@ -160,8 +152,7 @@ class Table:
         lot = f"{self.elements.size} drawn, by lot" if self.elements.size < self.size else ""
         marks = "red marks: not ok" + (f" ({_MARKS} of {failed})" if failed > _MARKS else "")
         words = "; ".join(filter(None, (lot, *notes, marks if failed else "")))
-        title = f"{style.short(what)}: {self.n_ok} of {self.size} elements ok"
-        figure.suptitle(f"{title}\n{textwrap.fill(words, 105)}", x=0.01, ha="left", fontsize=9)
+        style.head(figure, f"{style.short(what)}: {self.n_ok} of {self.size} elements ok", words)
 
     @property
     def nothing(self) -> str:
@@ -350,7 +341,7 @@ def _medians(x: Column, y: Column, z: Column, grid: tuple[np.ndarray, np.ndarray
 def _panels(count: int, columns: int, height: float) -> tuple[Figure, list[Axes]]:
     """Panels in rows, each of a height [inch]."""
     rows = -(-count // columns)
-    figure = style.figure(0.6 + rows * height, constrained=True)
+    figure = style.figure(0.6 + rows * height)
     every = figure.subplots(rows, columns, squeeze=False).ravel()
     for ax in every[count:]:
         ax.remove()

@@ -57,13 +57,13 @@ def pairs(content: Mapping[str, object], unit: str = "") -> Table:
 
 
 class Bar(NamedTuple):
-    """An estimate with its 95 % interval as a bar; places in percent of the bar's width."""
+    """An estimate with its 95 % interval as a bar; ends in percent of the bar's width."""
 
     name: str
     value: str
     unit: str
     low: float | None
-    """None where there is no interval"""
+    """None without an interval"""
     high: float | None
     words: str
     """the interval as text"""
@@ -74,12 +74,11 @@ class Bars(NamedTuple):
 
     rows: tuple[Bar, ...]
     reach: str
-    """of the axis to either side; empty where there is no bar"""
+    """half range of the axis; empty without a bar"""
 
 
 def bars(fit: Fit) -> Bars:
-    """The free parameters, and the combinations that the data determine in place of them, each
-    with its interval in parts of its estimate."""
+    """Return free parameters and determined combinations with their relative intervals."""
     stopped = fit.status == "not-converged"
     rows = [(n, e, pretty(e.unit)) for n, e in fit.estimates.items()]
     rows += [(c.name, c, "") for c in determined(fit)]
@@ -89,7 +88,7 @@ def bars(fit: Fit) -> Bars:
         ends = [end / e.value - 1.0 for end in (e.lower95, e.upper95) if known and end is not None]
         parts.append(sorted(ends) if len(ends) == 2 and all(map(math.isfinite, ends)) else None)
     most = max((abs(v) for pair in parts if pair for v in pair), default=0.0)
-    # A vague one must not press the others flat: beyond the axis a bar is cut off.
+    # Longer bars are cut off.
     reach = next((r for r in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5) if most <= r), 1.0)
     placed = []
     for (name, e, unit), pair in zip(rows, parts, strict=True):
@@ -106,11 +105,10 @@ def determined(fit: Fit) -> Sequence[Combination]:
 
 
 def correlation(fit: Fit) -> list[tuple[str, list[tuple[str, float]]]]:
-    """Rows of the matrix of correlations: name, and the text and number of each cell."""
+    """Return rows of the correlation matrix: name, and text and number of each cell."""
     rows = []
     for name, values in zip(fit.verdict.names, fit.verdict.correlation, strict=True):
-        # 0.996 and 0.99996 differ by a factor of ten in what an interval gains from the other
-        # parameter, sqrt(1 - r^2); at two digits both are 1.00.
+        # Five digits near 1, where sqrt(1 - r^2) counts.
         numbers = [float(r) if math.isfinite(r) else 0.0 for r in values]
         cells = [(_signed(r, 5 if 0.995 < abs(r) < 1.0 else 2), r) for r in numbers]
         rows.append((name, cells))
@@ -118,7 +116,7 @@ def correlation(fit: Fit) -> list[tuple[str, list[tuple[str, float]]]]:
 
 
 def parameters(fit: Fit) -> Table:
-    """The free parameters; where the data do not determine one, that is said in place of it."""
+    """Return the table of the free parameters."""
     head = ("parameter", "estimate", "sd", "sd / value", fit.interval, "unit", "start")
     stopped, rows = fit.status == "not-converged", []
     for name, e in fit.estimates.items():
@@ -126,8 +124,6 @@ def parameters(fit: Fit) -> Table:
         cells = _cells(e, stopped=stopped)
         row = (name, *cells, pretty(e.unit), number(e.start, 5), share, bound)
         if fit.coloured:
-            # What the sd would be if residuals were white, so that the price of their
-            # autocorrelation can be seen.
             white = NOTHING if e.sd_white is None else measured(e.sd_white, e.sd_white)[0]
             row = (*row, white)
         rows.append(row)
@@ -135,19 +131,18 @@ def parameters(fit: Fit) -> Table:
 
 
 def _cells(e: Estimate | Combination, *, stopped: bool = False) -> tuple[str, str, str, str]:
-    """Value, sd, sd over value and interval."""
+    """Return value, sd, sd over value and interval."""
     value, sd, interval = cells_of(e, stopped=stopped)
     share = relative(e.sd, e.value) if sd else NOTHING
     return value, sd or NOTHING, share, interval or NOTHING
 
 
 def _signed(value: float | None, digits: int) -> str:
-    # With a minus sign, not a hyphen, as everywhere on the page.
     return NOTHING if value is None else f"{value:+.{digits}f}".replace("-", "−")
 
 
 def nuisances(fit: Fit) -> tuple[Table, Table]:
-    """Gains, time shifts and biases; and initial states, of which windows have many."""
+    """Return the tables of gains, time shifts and biases, and of initial states."""
     head = ("unknown", "estimate", "sd", "95 % interval", "unit")
     rows = []
     for name, e in fit.nuisance.items():
@@ -173,13 +168,13 @@ _METHODS = {
 
 
 def intervals(comparison: Intervals, fit: Fit) -> Table:
-    """95 % intervals by parameter and method."""
+    """Return 95 % intervals by parameter and method."""
     present = [m for m in _METHODS if any(m in by for by in comparison.by_parameter.values())]
     rows = []
     for name, by_method in comparison.by_parameter.items():
         cells = []
         for m in present:
-            # All to the digits of the Gaussian sd, so that the ends can be compared by eye.
+            # With the digits of the Gaussian sd.
             ends = by_method.get(m, (math.nan, math.nan))
             low, high, _ = measured(fit.estimates[name].sd, *ends)
             cells.append(f"{low} to {high}" if m in by_method else NOTHING)
@@ -203,7 +198,7 @@ def sampling(posterior: Posterior) -> Table:
 
 
 def verdict(fit: Fit) -> Table:
-    """The verdict's numbers at the start values and at the estimates."""
+    """Return the numbers of the identifiability analysis at start values and estimates."""
     n = len(fit.verdict.names)
     columns = [
         (
@@ -211,10 +206,8 @@ def verdict(fit: Fit) -> Table:
             f"{v.rank_without_priors} of {n}",
             number(v.condition, 3),
             ", ".join(number(float(s), 3) for s in v.singular_values),
-            # Five digits: beyond 0.99 it is the last ones that count.
             "; ".join(f"{p.first}, {p.second}: {_signed(p.correlation, 5)}" for p in v.pairs)
             or "none",
-            # Components of up to 0.005 would be printed as 0.00: the direction does not have them.
             "; ".join(
                 ", ".join(f"{n} {_signed(x, 2)}" for n, x in d.items() if abs(x) > 0.005)
                 for d in v.null_directions
@@ -247,14 +240,12 @@ def starts(fit: Fit) -> Table:
         )
         for i, s in enumerate(fit.starts)
     ]
-    # Starts beside ends: whether equal costs come from equal parameters is what several starts are
-    # for.
     ends = [*(f"{n}, start" for n in names), *(f"{n}, end" for n in names)]
     return Table(("", *ends, "cost", "steps", "led to", "run of"), rows)
 
 
 def agreement(fit: Fit, baseline: Baseline | None) -> Table:
-    """The same metrics for fit, held-out flights and RLS, output by output."""
+    """Return the metrics of fit, held-out flights and RLS by output."""
     head = ("output", "of", "VAF", "fit", "RMSE", "Theil")
     rows = []
     sources = (
@@ -263,10 +254,9 @@ def agreement(fit: Fit, baseline: Baseline | None) -> Table:
         ("held out, simulated", fit.validation),
         (_IN_ONE_PIECE, fit.validation_free_run),
         ("held out, one step ahead", fit.one_step_validation),
-        # With its flight, since it saw that one alone and the fit all.
+        # RLS uses one flight.
         *([(f"RLS ({b.flight})", {b.output: b.metrics})] if (b := baseline) else ()),
     )
-    # An output may have been measured in the flights held out alone.
     for output in dict.fromkeys([*fit.metrics, *fit.validation]):
         for of, metrics in sources:
             if (m := metrics.get(output)) is None:
@@ -277,8 +267,6 @@ def agreement(fit: Fit, baseline: Baseline | None) -> Table:
                 number(m.tic, 3),
             )
             if of == _IN_ONE_PIECE and diverges(m):
-                # Its numbers grow with the length of the record: they would say nothing of the
-                # model.
                 cells = ("diverges", *[NOTHING] * (len(cells) - 1))
             rows.append((output, of, *cells))
     return Table(head, rows)
@@ -288,7 +276,7 @@ _IN_ONE_PIECE = "held out, in one piece"
 
 
 def responses(agreement: ResponseAgreement | None) -> Table | None:
-    """The model's frequency responses against the measured ones, where these were fitted."""
+    """Return the agreement of fitted frequency responses; None for other methods."""
     if agreement is None:
         return None
     usual = f"J (usual: < {USUAL_J:g})"
@@ -312,7 +300,7 @@ def responses(agreement: ResponseAgreement | None) -> Table | None:
 
 
 def held_out_flights(held: HeldOutFrequency | None) -> Table | None:
-    """Estimates and explained shares of the flights held out; None where nothing was judged."""
+    """Return estimates and explained shares of held-out flights; None if there are none."""
     if held is None or not held.flights:
         return None
     rows = []
@@ -327,8 +315,7 @@ def held_out_flights(held: HeldOutFrequency | None) -> Table | None:
 
 
 def choice(selection: Choice) -> Table:
-    """The models compared, best AIC first."""
-    # Differences from the best: the criteria themselves grow with the record and mean nothing.
+    """Return the candidate models, best AIC first."""
     best_aic = min(c.aic for c in selection.candidates)
     best_bic = min(c.bic for c in selection.candidates)
     rows = [
@@ -347,19 +334,18 @@ def choice(selection: Choice) -> Table:
     return Table(head, rows)
 
 
-def acceptance(lines: tuple[Gate, ...]) -> Table:
-    """The acceptance card: what, of what, value, gate, passed or failed, remark."""
-    words = {True: "✓ passed", False: "✗ failed", None: NOTHING}
+def acceptance(gates: tuple[Gate, ...]) -> Table:
+    """Return the acceptance card: name, subject, value, limit, passed or failed."""
     rows = [
-        (g.what, g.of, page_sentence(shown(g)), g.gate or NOTHING, words[g.passed], g.remark)
-        for g in lines
+        (g.what, g.of, page_sentence(shown(g)), g.gate, "✓ passed" if g.passed else "✗ failed")
+        for g in gates
     ]
-    return Table(("", "of", "value", "gate", "", "remark"), rows)
+    return Table(("", "of", "value", "gate", ""), rows)
 
 
 def residuals(fit: Fit, problem: Problem) -> Table:
-    """Noise and whiteness of every flight and output."""
-    # strict=False: behind the signals of the fitted flights come those held out, without noise.
+    """Return noise and whiteness by flight and output."""
+    # Signals of held-out flights follow those of the fitted ones.
     stated = {
         f"{s.flight}/{name}": sd
         for s, f in zip(fit.signals, problem.training, strict=False)
@@ -386,10 +372,9 @@ def residuals(fit: Fit, problem: Problem) -> Table:
 
 
 def baseline_ratios(fit: Fit, baseline: Baseline) -> Table:
-    """a/Ixx and the like: as the RLS has them and as the fit has them."""
+    """Return the ratios of RLS, such as a/Ixx, beside those of the fit."""
     rows = []
     for name, value in baseline.combinations.items():
-        # A ratio may be determined where neither of its two is: those come with an sd of their own.
         of = next((c for c in fit.verdict.combinations if c.name == name), None) or _ratio(
             fit, name
         )
@@ -402,7 +387,7 @@ def baseline_ratios(fit: Fit, baseline: Baseline) -> Table:
 
 
 def _ratio(fit: Fit, name: str) -> Estimate | None:
-    """`x/y` by the estimates; None where it is not determined or not of the model."""
+    """Return the ratio `x/y` of estimates; None if it is not determined or unknown."""
     over, _, under = name.partition("/")
     v, powers = fit.verdict, {over: 1.0, under: -1.0}
     params = naming.asdict(fit.params)
@@ -418,7 +403,7 @@ def product(
     names: Sequence[str],
     correlation: Any,
 ) -> Estimate | None:
-    """A product of powers of estimates and constants.
+    """Return a product of powers of estimates and constants.
 
     Args:
         powers: by estimate or constant.
@@ -426,8 +411,7 @@ def product(
         correlation: between the estimates, (q, q).
 
     Returns:
-        `sd` is None where an estimate is not determined; None where a part is missing, and of a
-        number below zero, whose power may not exist.
+        `sd` is None if an estimate is not determined. None if a part is missing or not positive.
     """
     free = [n for n in powers if n in estimates]
     if not free or any(n not in estimates and n not in constants for n in powers):
@@ -443,8 +427,7 @@ def product(
             return None
         at = [list(names).index(n) for n in free]
         among = np.asarray(correlation, float)[np.ix_(at, at)]
-    # Of logarithms, in which a product is a sum. Both parts may be vague where a ratio is sharp:
-    # its sd takes their correlation.
+    # The sd of the logarithm, with the correlations.
     logs = np.array([powers[n] * (estimates[n].sd or 0.0) / values[n] for n in free])
     sd = math.sqrt(max(float(logs @ among @ logs), 0.0))
     value = math.prod(values[n] ** power for n, power in powers.items())
@@ -455,13 +438,12 @@ def product(
 def combination(
     value: float, sd: float | None, lower: float | None, upper: float | None
 ) -> Estimate:
-    """A product of powers as an estimate; its unit has no name."""
+    """Return a combination as an estimate."""
     return Estimate(value, sd, lower, upper, "SI", math.nan, 0.0, False)
 
 
 def baseline_facts(b: Baseline) -> Table:
     """Return the facts of the recursive least squares."""
-    # The slowest first, and conjugates side by side.
     poles = [_complex(p) for p in sorted(b.poles, key=lambda p: (-abs(p), p.imag))]
     rows = [
         ("from, to", f"{b.input} to {b.output}, {b.flight}"),
@@ -505,16 +487,12 @@ def first_guess(start: Start) -> Table:
     """Return the table of start values, with the method that found each."""
     rows = []
     for name, v in start.values.items():
-        shown = with_sd(v.value, v.sd) if v.sd else number(v.value, 4)
-        ratio = NOTHING
-        if start.selection is not None and name in start.selection.f_ratios:
-            ratio = number(start.selection.f_ratios[name], 3)
-        rows.append((name, shown, v.unit, v.origin, ratio))
-    return Table(("parameter", "start", "unit", "from", "F-ratio"), rows)
+        rows.append((name, number(v.value, 4), v.unit, v.origin))
+    return Table(("parameter", "start", "unit", "from"), rows)
 
 
 def methods(comparison: MethodComparison) -> Table:
-    """Estimates with 95 % intervals by parameter and method, differences in joint sd."""
+    """Return estimates with 95 % intervals by method, and differences in joint sd."""
     main, *others = comparison.results
     head = ["", main.label]
     verdicts, times = ["verdict", main.word], ["time", _seconds(main)]
@@ -560,11 +538,11 @@ _NO_RESULT = (
     "reached."
 )
 _AS_READ = {"s": ("ms", 1e3)}
-"""by SI unit the one that is shown, and how many make it: delays are milliseconds"""
+"""displayed unit by SI unit, with its factor"""
 
 
 def handling(entries: Sequence[Handling]) -> Table:
-    """A row for each number of each response, with the columns that were asked for."""
+    """Return a row for each number of each response."""
     sources = _sources(entries)
     rows = []
     for entry in entries:
@@ -582,7 +560,6 @@ def _cell(of: HandlingQualities | str | None, name: str) -> str:
     value = of.numbers.get(name) if isinstance(of, HandlingQualities) else None
     if value is None or not value.known:
         return NOT_DETERMINED
-    # Pilots' criteria count in rad/s, rotors and filters in Hz.
     hz = f", {number(value.value / (2.0 * np.pi), 3)} Hz" if UNITS[name] == "rad/s" else ""
     return _shown(value, _unit(name)[1]) + hz
 
@@ -612,8 +589,7 @@ def handling_sentences(entries: Sequence[Handling]) -> list[str]:
 
 
 def origins(fit: Fit, problem: Problem) -> list[tuple[str, Table, list[str]]]:
-    """Name, facts and notes of each flight, in order: the fitted ones first."""
-    # The order of fit.signals, which is not that of the configuration.
+    """Return name, facts and notes of each flight, fitted ones first."""
     flights = [*problem.training, *(f for f in problem.flights if f.hold_out)]
     listed = []
     for signals, flight in zip(fit.signals, flights, strict=True):
@@ -627,13 +603,11 @@ def origins(fit: Fit, problem: Problem) -> list[tuple[str, Table, list[str]]]:
         if source:
             start, end = flight.window
             rows.append(("window", f"{start:.6g} s to {end:.6g} s from the log's beginning"))
-            # An autopilot's clock rarely begins at zero: by this a moment is found in the raw log.
             first = f"{source.first_time:.15g} s of the log's own clock"
             rows.append(("log's beginning", first))
         if flight.known:
             values = ", ".join(f"{n} = {number(v, 6)}" for n, v in flight.known.items())
             rows.append(("differs in", values))
-        # Only what was read off the log has a reason; the rest was stated in the configuration.
         rows += [
             (f"{n} between samples", f"{hold} ({flight.hold_reason.get(n, 'as stated')})")
             for n, hold in flight.hold.items()
@@ -650,10 +624,9 @@ def origins(fit: Fit, problem: Problem) -> list[tuple[str, Table, list[str]]]:
 
 
 def constants(problem: Problem, vehicle_constants: Mapping[str, Constant]) -> Table:
-    """The vehicle as it was given: value in SI, unit, meaning, source."""
+    """Return the constants of the vehicle: value [SI], unit, meaning, source."""
     rows = []
     for name, c in vehicle_constants.items():
-        # The value is SI, as the model's unit is; the one in the file may be another.
         unit = naming.unit(problem.model.Params, name) or c.unit
         role = "estimated, this is the file's value" if name in problem.free else "fixed"
         meaning = naming.meaning(problem.model.Params, name)

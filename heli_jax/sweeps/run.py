@@ -106,7 +106,7 @@ def sweep(
         reduce: results of each run by name.
         out: a directory for sweep.zarr and summary.json; in memory by default.
         **options: fields of `RunOptions`: solver, substeps, precision, trajectories, trimmed,
-        pilot; and of `Options`: resume, chunk, lanes, backend, devices, client, progress.
+            pilot; and of `Options`: resume, chunk, lanes, backend, devices, client, progress.
 
     Returns:
         A Dataset over `element`, with axes and `status` as coordinates.

@@ -55,7 +55,7 @@ def test_what_cannot_be_told_is_refused():
     t = np.arange(2000) / 50
     rng = np.random.default_rng(0)
     noise = [signal(t, rng.standard_normal(t.size)) for _ in range(2)]
-    with pytest.raises(NotAligned, match="hardly agree"):
+    with pytest.raises(NotAligned, match="hardly correlated"):
         lag_between(*noise)
     waves = [signal(t, np.sin(6 * t) + 0.1 * rng.standard_normal(t.size)) for _ in range(2)]
     with pytest.raises(NotAligned, match="explain nearly the same"):

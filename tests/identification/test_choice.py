@@ -28,7 +28,7 @@ def test_the_stand_is_asked_for_only_where_it_is_free(disturbed):
     model, start, flight = disturbed
     free = FREE | {"zeta": Free(0.3)}
     problem = Problem(model, start, [flight], free, method="filter-error")
-    rivals = alternatives(problem, models.roll_on_stand, "roll", without_stand=models.roll)
+    rivals = alternatives(problem, models.roll_on_stand, ["roll"], without_stand=models.roll)
     assert "kappa" not in rivals.problems["one pole, no stand"].free
     assert ("one pole, no stand", "one pole") in rivals.nested
 
@@ -44,7 +44,7 @@ def test_a_damping_that_is_fixed_is_no_part_of_a_machine_without_stand(disturbed
     ):
         vehicle = naming.replace(start, zeta=jnp.asarray(zeta))
         problem = Problem(model, vehicle, [flight], free, method="filter-error")
-        pairs = alternatives(problem, models.roll_on_stand, "roll", **rolls).nested
+        pairs = alternatives(problem, models.roll_on_stand, ["roll"], **rolls).nested
         assert (("one pole, no stand", "one pole") in pairs) == nested
         assert ("no disturbance, no stand", "one pole, no stand") in pairs
 

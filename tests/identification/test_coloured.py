@@ -21,8 +21,8 @@ def case(r, J):
     return layout, SimpleNamespace(flights=(flight,)), SimpleNamespace(r=r.ravel(), J=rows)
 
 
-def inflation(layout, data, e, along=None):
-    return sandwich(layout, data, e).inflation(along)
+def inflation(layout, data, e):
+    return sandwich(layout, data, e).inflation
 
 
 def ar1(rho, seed=0, n=N):
@@ -67,7 +67,7 @@ def test_prior_rows_keep_their_weight():
     assert inflation(layout, data, e)[0] == pytest.approx(1.0, rel=1e-6)
 
 
-def test_a_combination_may_be_wider_than_its_parts():
+def test_only_slow_effects_suffer_from_slow_noise():
     rho, rng = 0.95, np.random.default_rng(5)
     r = ar1(rho)[None]
     J = np.stack([np.ones((1, N)), rng.standard_normal((1, N))], axis=-1)
@@ -76,9 +76,6 @@ def test_a_combination_may_be_wider_than_its_parts():
     # The first column is the mean, which suffers; the second is white and does not.
     assert parts[0] > 4.0
     assert parts[1] == pytest.approx(1.0, abs=0.3)
-    np.testing.assert_allclose(inflation(layout, data, e, np.eye(2)), parts)
-    both = inflation(layout, data, e, np.array([[1.0, 1.0]]))[0]
-    assert parts[1] < both < parts[0]
 
 
 def test_deviations_and_intervals_hold_with_missing_samples():
@@ -100,8 +97,8 @@ def test_deviations_and_intervals_hold_with_missing_samples():
         e.r = np.nan_to_num(e.r)
         found = sandwich(layout, data, e)
         errors.append(estimate)
-        sds.append(found.inflation() * np.sqrt(np.diag(np.linalg.inv(J.T @ J))))
-        quantiles.append(found.quantile())
+        sds.append(found.inflation * np.sqrt(np.diag(np.linalg.inv(J.T @ J))))
+        quantiles.append(found.quantile)
     errors, sds, quantiles = np.array(errors), np.array(sds), np.array(quantiles)
     # Six columns: the mean over them, since one sd of 200 runs is known to 5 % only.
     ratio = np.median(sds, axis=0) / np.sqrt(np.mean(errors**2, axis=0))
@@ -112,9 +109,9 @@ def test_deviations_and_intervals_hold_with_missing_samples():
 def test_few_independent_parts_want_a_larger_quantile():
     slow = ar1(0.99, 3, 2000)
     layout, data, e = case(slow[None], np.ones((1, 2000, 1)))
-    assert sandwich(layout, data, e).quantile()[0] > 2.1
+    assert sandwich(layout, data, e).quantile[0] > 2.1
     layout, data, e = case(ar1(0.0, 3)[None], np.ones((1, N, 1)))
-    assert sandwich(layout, data, e).quantile()[0] == pytest.approx(1.96, abs=0.01)
+    assert sandwich(layout, data, e).quantile[0] == pytest.approx(1.96, abs=0.01)
 
 
 def test_residuals_and_effects_of_any_size_have_the_same_intervals():
@@ -124,12 +121,12 @@ def test_residuals_and_effects_of_any_size_have_the_same_intervals():
     plain = sandwich(*case(r, J))
     for noise, effect in ((1e60, 1.0), (1e-80, 1.0), (1.0, 1e-80), (1e60, 1e90)):
         found = sandwich(*case(noise * r, effect * J))
-        np.testing.assert_allclose(found.inflation(), noise * plain.inflation(), rtol=1e-9)
-        np.testing.assert_allclose(found.quantile(), plain.quantile(), rtol=1e-5)
+        np.testing.assert_allclose(found.inflation, noise * plain.inflation, rtol=1e-9)
+        np.testing.assert_allclose(found.quantile, plain.quantile, rtol=1e-5)
     for nothing in (0.0 * r, np.eye(1, 400, 200)):
         found = sandwich(*case(nothing, J))
-        assert np.all(np.diag(found.covariance()) >= 0.0)
-        assert np.isfinite(found.quantile()).all()
+        assert np.all(np.diag(found.covariance) >= 0.0)
+        assert np.isfinite(found.quantile).all()
 
 
 def test_two_flights_are_independent():
@@ -139,7 +136,7 @@ def test_two_flights_are_independent():
     flights = [SimpleNamespace(dt=DT, outputs={"0": part}) for part in (half, other)]
     layout = SimpleNamespace(outputs=(("0",), ("0",)))
     e = SimpleNamespace(r=r, J=np.ones((N, 1)))
-    found = sandwich(layout, SimpleNamespace(flights=tuple(flights)), e).inflation()[0]
+    found = sandwich(layout, SimpleNamespace(flights=tuple(flights)), e).inflation[0]
     assert found == pytest.approx(whole, rel=0.1)
 
 
@@ -149,8 +146,8 @@ def test_curvature_of_the_residuals_widens():
     r = rng.standard_normal(N)
     J = np.ones((1, N, 1))
     layout, data, e = case(r[None], J)
-    plain = sandwich(layout, data, e).inflation()[0]
-    halved = sandwich(layout, data, e, np.array([[-0.5 * N]])).inflation()[0]
+    plain = sandwich(layout, data, e).inflation[0]
+    halved = sandwich(layout, data, e, np.array([[-0.5 * N]])).inflation[0]
     assert halved == pytest.approx(2.0 * plain, rel=1e-9)
 
 

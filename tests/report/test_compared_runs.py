@@ -62,7 +62,6 @@ def test_differences_are_in_the_joint_sd(tmp_path: Path) -> None:
     assert rows["If"][1:3] == ("–", "–")
     assert rows["a"][0] == "not determined"
     assert rows["a"][2] == "–"
-    assert r"K\_1" in compared.to_latex()
     read = list(csv.DictReader(io.StringIO(compared.to_csv())))
     undetermined = next(r for r in read if r["run"] == "a" and r["parameter"] == "a")
     assert (undetermined["value"], undetermined["sd"]) == ("", "")
@@ -78,17 +77,6 @@ def test_what_did_not_converge_is_not_compared_and_one_log_is_said(tmp_path: Pat
     assert compared.estimates.rows[0][3] == "–"
     said = [(n.code, n.subjects) for n in compared.notes]
     assert ("compared.not-converged", ("a2",)) in said
-    assert ("compared.one-log", ("a1", "a2")) in said
-
-
-@pytest.mark.parametrize(("window", "shared"), [([10.0, 20.0], False), ([9.0, 20.0], True)])
-def test_parts_of_a_log_without_a_common_sample_are_independent(tmp_path, window, shared) -> None:
-    def run(name: str, part: list[float]) -> Path:
-        data = [{"flight": "flight 1", "hold_out": False, "sha256": "a", "window": part}]
-        return write_run(tmp_path / name, {"Ixx": (0.02, 0.001)}, data=data)
-
-    compared = compare_runs([run("a", [0.0, 10.0]), run("b", window)])
-    assert ("compared.one-log" in {n.code for n in compared.notes}) == shared
 
 
 def test_what_is_not_to_be_trusted_is_said_of_compared_and_listed_fits(tmp_path, capsys) -> None:
@@ -198,15 +186,3 @@ def test_damaged_signals_end_in_a_sentence(tmp_path: Path, signals: bytes) -> No
     (run / "signals.csv").write_bytes(signals)
     with pytest.raises(InputError):
         load_fit(run)
-
-
-def test_latex_has_powers_of_ten_and_no_bare_special_characters(tmp_path: Path) -> None:
-    runs = [tmp_path / "a_1", tmp_path / "b%2"]
-    for k, run in enumerate(runs):
-        write_run(run, {"K_1": (1.7e-4 * (1 + k), 1.2e-5)})
-    table = compare_runs(runs).to_latex()
-    assert r"1.70$\cdot 10^{-4}$ $\pm$ 0.12$\cdot 10^{-4}$" in table
-    assert r"a\_1" in table
-    assert r"b\%2" in table
-    body = table.split("\n", 1)[1]
-    assert body.count("$") % 2 == 0

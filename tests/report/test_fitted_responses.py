@@ -71,14 +71,14 @@ def test_they_are_drawn_told_and_written(sound, shown):
 
 def test_the_card_asks_each_output_for_a_coherent_input(sound, shown):
     fit, problem, _ = sound
-    [gate] = [g for g in card(problem, fit, shown) if g.what == "coherence"]
+    [gate] = [g for g in card(fit, shown) if g.what == "coherence"]
     assert (gate.of, gate.passed) == ("x_roll to roll", True)
     dead = 0.1 * np.random.default_rng(1).standard_normal(problem.flights[0].n_samples)
     flight = dataclasses.replace(problem.flights[0], outputs={"roll": dead})
     of_noise = fitted_responses(
         fit, dataclasses.replace(problem, flights=(flight,)), Settings(window=10.0), ()
     )
-    [gate] = [g for g in card(problem, fit, of_noise) if g.what == "coherence"]
+    [gate] = [g for g in card(fit, of_noise) if g.what == "coherence"]
     assert gate.passed is False
     assert of_noise.incoherent == ("x_roll to roll",)
 

@@ -1,17 +1,15 @@
 """What all pages share: log time, numbers that can be read, one number for one thing."""
 
 import csv
-import math
 
 import numpy as np
 import pytest
 
 from heli_jax import compare_runs, models
-from heli_jax.flights.flight import Signal
 from heli_jax.identification.result import Signals
 from heli_jax.identification.validation.metrics import whiteness
 from heli_jax.numbers import percent
-from heli_jax.report import compared_runs, figures, fit_page
+from heli_jax.report import compared_runs, figures
 from heli_jax.report.files import write_signals
 from heli_jax.report.saved_fit import load_fit
 from tests.report.test_compared_runs import write_run
@@ -71,18 +69,6 @@ def test_card_and_figure_give_one_number_where_samples_are_missing():
     # The stems that are drawn outside the band are those that the number counts.
     inside, outside = (s.y.size for s in chart.panels[0].series[1:])
     assert outside / (inside + outside) == pytest.approx(test.outside)
-
-
-def test_a_pulse_width_is_shown_as_logged_beside_si():
-    pwm = Signal("aileron_pwm", "m", "m", offset=1496.0, scale=6e-9, invert=True)
-    as_logged = fit_page.as_logged(pwm)
-    assert as_logged is not None
-    x = 6e-9 * (1496.0 - 1436.0)  # the log's 1436, inverted
-    assert x * as_logged.factor + as_logged.offset == pytest.approx(1436.0)
-    assert as_logged.unit == "aileron_pwm"
-    assert fit_page.as_logged(Signal("roll", "rad", "rad")) is None
-    degrees = fit_page.as_logged(Signal("roll", "deg", "rad"))
-    assert degrees == ("deg", pytest.approx(180.0 / math.pi), 0.0)
 
 
 def test_runs_side_by_side_have_files_and_configurations(tmp_path):

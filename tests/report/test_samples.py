@@ -61,7 +61,7 @@ def sampled(white):
 
 def test_the_tree_has_the_groups_and_units_that_arviz_looks_for(white, sampled):
     tree = posterior_tree(white[0], sampled.posterior, {"what": "draws"})
-    assert set(tree.children) == {"posterior", "sample_stats", "observed_data", "constant_data"}
+    assert set(tree.children) == {"posterior", "sample_stats"}
     Ixx = tree["posterior"]["Ixx"]
     assert Ixx.dims == ("chain", "draw")
     assert Ixx.attrs == {"units": "kg m^2", "role": "parameter"}
@@ -72,7 +72,6 @@ def test_the_tree_has_the_groups_and_units_that_arviz_looks_for(white, sampled):
     assert set(white[0].nuisance) <= names
     assert not any("/" in str(n) for n in tree["posterior"].data_vars)
     assert int(tree["sample_stats"]["diverging"].sum()) == 1
-    assert tree["observed_data"]["roll"].sizes["time"] == white[0].signals[0].times.size
 
 
 def test_draws_are_read_back_by_arviz(white, sampled, tmp_path):

@@ -111,7 +111,7 @@ def test_few_values_of_an_axis_are_bins_and_equal_values_stay_in_one():
     ax = slices(ds).axes[2]
     x, y = counted(ds, "seed", "misfit")
     along, median = drawn(ax, "median")
-    assert along.tolist() == ax.get_xticks().tolist() == [1, 2, 3, 4, 5, 6]
+    assert along.tolist() == [1, 2, 3, 4, 5, 6]
     assert median == pytest.approx([np.median(y[x == k]) for k in along])
     x = np.repeat(np.arange(300.0), 3)
     y = np.random.default_rng(1).random(900)

@@ -109,8 +109,8 @@ def test_figures_show_everything_and_shade_what_was_left():
     t = 0.02 * np.arange(300)
     run = flown(z=np.sin(t), Omega=150 + t)
     for chart, labels in (
-        (figures.motion(run, HELICOPTER), ["attitude", "rates", "position", "velocity"]),
-        (figures.sticks(run, HELICOPTER), ["sticks [mm]", "sticks [–]", "rotor speed [rad/s]"]),
+        (figures.motion(run, HELICOPTER), ["[rad]", "[rad/s]", "[m]", "[m/s]"]),
+        (figures.sticks(run, HELICOPTER), ["[mm]", "[–]", "rotor_speed [rad/s]"]),
     ):
         assert len(chart.panels) == len(labels)
         for panel, text in zip(chart.panels, labels, strict=True):
@@ -163,7 +163,7 @@ def test_a_part_of_the_helicopter_has_figures_only(tmp_path, bench30):
     assert text.count("<figure data-chart=") == 2
     assert "needs the whole helicopter" in words(text)
     [panel] = figures.sticks(run, model).panels
-    assert panel.label == "x_roll [µm]"
+    assert panel.label == "x_roll [mm]"
 
 
 def test_what_is_nearly_constant_is_not_blown_up_to_its_panel():

@@ -1,13 +1,11 @@
-"""Expected standard deviations before a fit, from what parts of a record tell at the start values.
+"""Expected standard deviations before a fit, by parts of a record at the start values.
 
-Rows of the whitened Jacobian are samples, so the information of a part of the record (some outputs,
-a window) is that of its rows, with what belongs to the part alone (initial states, biases, input
-offsets) projected out. Information is carried as a triangle R, where R'R is Fisher's matrix: that
-of two parts together is the triangle of both, one above the other.
+Rows of the whitened Jacobian are samples. The information of a window is that of its rows, with its
+own initial states, biases and input offsets projected out. It is carried as a factor R of Fisher's
+matrix R'R; the factor of two parts together is that of both, one above the other.
 """
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +13,6 @@ from jaxtyping import Float
 
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of
-from heli_jax.finding import Finding, found
 from heli_jax.identification.estimation.evaluation import Evaluation, deviations
 from heli_jax.identification.identifiability.analysis import relative_rows
 from heli_jax.identification.identifiability.directions import projected
@@ -25,7 +22,7 @@ from heli_jax.identification.unknowns.layout import Layout
 from heli_jax.identification.unknowns.transforms import scale
 
 FREE = 1e-3
-"""weight of a weak prior that holds nothing up; not zero, where directions would be rounding"""
+"""weight of a weak prior that counts for nothing; not zero, where directions would be rounding"""
 
 
 class Sensitivity(NamedTuple):
@@ -34,7 +31,7 @@ class Sensitivity(NamedTuple):
     unknowns: tuple[Unknown, ...]
     """the parameters of interest"""
     shared: Float[np.ndarray, "n s"]
-    """by the parameters of interest, and what filter error estimates of the noise after them"""
+    """by the parameters of interest, then by the noise's parameters of filter error"""
     own: Float[np.ndarray, "n k"]
     """by initial states, biases and input offsets, in sds of their weak priors"""
 
@@ -46,16 +43,16 @@ class Sensitivity(NamedTuple):
 def sensitivity_at(problem: Problem, layout: Layout, e: Evaluation) -> Sensitivity:
     """Return the rows of the data of an evaluation."""
     unknowns, rows = relative_rows(problem, layout, e)
-    # Of the unknowns that are no parameter of interest the first are shared by all flights.
+    # The first of the other unknowns are shared by all flights.
     count = layout.first_nuisance - len(unknowns)
     shared = np.hstack([rows.sensitivity, rows.nuisances[:, :count]])
     return Sensitivity(unknowns, shared, rows.nuisances[:, count:])
 
 
 def triangle(s: Sensitivity) -> Float[np.ndarray, "s s"]:
-    """Return what the rows say of the shared unknowns, where all else is free but for its weak
-    prior."""
-    # What these rows do not feel is no unknown of theirs: in long records that is nearly all.
+    """Return the factor of the information on the shared unknowns, with all others free but for
+    their weak priors."""
+    # Without the unknowns that have no effect on these rows: nearly all of a long record.
     own = s.own[:, np.any(s.own != 0.0, axis=0)]
     priors = np.eye(own.shape[1])
     nothing = np.zeros((len(priors), s.shared.shape[1]))
@@ -63,43 +60,30 @@ def triangle(s: Sensitivity) -> Float[np.ndarray, "s s"]:
 
 
 def together(*triangles: np.ndarray) -> Float[np.ndarray, "s s"]:
-    """Return the triangle of several parts of the data, whose shared unknowns are the same."""
+    """Return the factor of several parts of the data with the same shared unknowns."""
     return np.linalg.qr(np.vstack(triangles), mode="r")
 
 
 def expected_sd(
     unknowns: tuple[Unknown, ...], R: Float[np.ndarray, "s s"]
 ) -> Float[np.ndarray, " q"]:
-    """Return expected standard deviations of the parameters of interest, in relative coordinates
-    (of log |value| where they have a sign); infinite where the data and the priors say nothing.
-    """
+    """Return expected standard deviations of the parameters of interest in relative coordinates;
+    infinite for those that data and priors do not determine."""
     q = len(unknowns)
-    # A parameter's prior is a measurement of itself.
     prior = np.hstack([np.diag([u.prior for u in unknowns]), np.zeros((q, R.shape[1] - q))])
     rows = np.vstack([R, prior])
-    # What filter error estimates of the noise may leave no trace: it is then no unknown.
+    # Parameters of the noise without effect are no unknowns.
     felt = np.any(rows != 0.0, axis=0) | (np.arange(R.shape[1]) < q)
     return deviations(rows[:, felt])[:q]
 
 
 GUESSED = "guessed: too small where the log was smoothed; state the output's sd"
-"""of a noise that nobody stated"""
-_TOO_GOOD = 1e-3
-"""relative sd below which no parameter of a helicopter is known: models and sensors are worse"""
-
-
-def too_good(sds: Sequence[float] | np.ndarray) -> Finding | None:
-    """Return a finding if expected sds, relative ones, are too small to be true."""
-    least = float(np.min(sds, initial=np.inf))
-    if not least < _TOO_GOOD:
-        return None
-    return found("accuracy.guessed-noise", value=least, percent=100.0 * least)
+"""remark on a noise that nobody stated"""
 
 
 def starting_at_zero(problem: Problem) -> dict[str, tuple[float, str]]:
-    """Return, by free parameter that starts at zero, the size [SI] that its expected sd is relative
-    to, and its unit.
-    """
+    """Return the unit of the relative coordinate [SI], and its name, of each free parameter that
+    starts at zero."""
     return {
         n: (scale(f), naming.unit(problem.model.Params, n) or "1")
         for n, f in problem.free.items()
@@ -108,7 +92,7 @@ def starting_at_zero(problem: Problem) -> dict[str, tuple[float, str]]:
 
 
 def unstated_gusts(problem: Problem) -> list[str]:
-    """Return the sizes of disturbances that nobody stated; none without process noise."""
+    """Return the sizes of disturbances that are not stated; none without process noise."""
     if problem.noise_model != "disturbance":
         return []
     sizes = [d.sigma for d in disturbances_of(problem.model)]

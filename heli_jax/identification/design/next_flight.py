@@ -1,8 +1,7 @@
-"""The manoeuvre to add to a record, by Fisher's information at the start values.
+"""The best manoeuvre to add to a record, by Fisher's information at the start values.
 
-Candidates of the duration and amplitude of the record are flown, one input at a time: doublets,
-3-2-1-1 steps and a chirp, and the record once more for comparison (input design over a few
-manoeuvres that a pilot can fly: Mehra, 1974; Jategaonkar, 2006, chapter 2).
+Candidates are doublets, 3-2-1-1 steps and a chirp of one input, with the duration and amplitude of
+the record; the record once more is for comparison (Mehra, 1974; Jategaonkar, 2006, chapter 2).
 """
 
 from dataclasses import replace
@@ -35,7 +34,7 @@ from heli_jax.simulation.inputs import chirp, multistep_3211
 _STEPS = (0.2, 0.5, 1.0)
 """lengths of the shortest step of a candidate [s]"""
 _LONGEST = 20.0
-"""duration of a candidate at most [s]: of a longer record several in a row"""
+"""duration of a candidate at most [s]; it is repeated for a longer record"""
 _BAND = (0.1, 5.0)
 """of the chirp [Hz]"""
 
@@ -45,9 +44,9 @@ class Candidate(NamedTuple):
 
     input: str
     words: str
-    """as a pilot reads it: `3-2-1-1 steps of 0.5 s`"""
+    """such as `3-2-1-1 steps of 0.5 s`"""
     values: Float[np.ndarray, " m"]
-    """what is added to the input, SI"""
+    """added to the input, SI"""
 
 
 class Plan(NamedTuple):
@@ -55,43 +54,46 @@ class Plan(NamedTuple):
 
     parameter: str
     before: float
-    """its expected sd relative to its value (of its logarithm); inf where it is not determined"""
+    """its expected relative sd; inf if it is not determined"""
     again: float
-    """with the same record once more; inf where it does not determine the parameter"""
+    """with the same record once more"""
     best: Candidate
     after: float
-    """with the best candidate, flown for as long as the record"""
+    """with the best candidate, as long as the record"""
     duration: float
-    """of the record, and of the flight that is compared [s]"""
+    """of the record and of the candidates [s]"""
     amplitude: float
     """of the best candidate, SI"""
     left_out: tuple[str, ...]
-    """inputs that do not move in the record, of which no amplitude is known"""
+    """inputs that do not move in the record"""
 
 
 def plan_next_flight(problem: Problem, at: Solution, e: Evaluation) -> Plan | None:
-    """Compare manoeuvres; None where nothing can be compared."""
+    """Compare manoeuvres; None if there is nothing to compare."""
     layout = at.layout
-    # A filter of a nonlinear model would be compiled for every candidate by itself. Rows at
-    # frequencies weigh all flights together, and do not say what one more would add.
+    # A filter of a nonlinear model would be compiled for every candidate. Rows at frequencies weigh
+    # all flights together.
     comparable = layout.noise_model == "white" or layout.model.linear
     if not comparable or layout.noise_model == "spectrum" or not np.isfinite(e.J).all():
         return None
     flight = max(problem.training, key=lambda f: f.n_samples)
     i = problem.training.index(flight)
-    # With windows one of them is simulated: no model that needs windows can be longer.
+    # With multiple shooting a candidate is one window.
     m = at.layout.windows[i][1]
     m = min(m, max(round(_LONGEST / flight.dt), 3 * len(problem.free)))
     candidates = _candidates(flight, m)
     if not candidates:
         return None
-    now, each = sensitivity_at(problem, at.layout, e), _flown(problem, at, i, candidates, m)
+    now, each = (
+        sensitivity_at(problem, at.layout, e),
+        _candidate_rows(problem, at, i, candidates, m),
+    )
     flights = layout.objective.tags(layout, at.data, len(now.shared)).flight
     once_more = now.part(flights == i)
     lacking = verdict_of(problem, layout, e).not_identifiable
     absent = np.array([u.name in lacking for u in now.unknowns])
     if lacking:
-        # What only weak priors of biases and offsets hold up is not known: neither now nor then.
+        # Weak priors do not count.
         now, *each = [s._replace(own=s.own / FREE) for s in (now, *each)]
     R, unknowns = triangle(now), now.unknowns
     before = expected_sd(unknowns, R)
@@ -99,7 +101,6 @@ def plan_next_flight(problem: Problem, at: Solution, e: Evaluation) -> Plan | No
     times, sds = flight.n_samples / m, []
     for s in each:
         after = expected_sd(unknowns, together(R, np.sqrt(times) * triangle(s)))
-        # Parameters that are not determined now take part in one another.
         lost = np.any(after[absent] >= DETERMINES)
         sds.append(np.inf if lost else float(after[widest]))
     best = int(np.argmin(sds))
@@ -116,19 +117,17 @@ def plan_next_flight(problem: Problem, at: Solution, e: Evaluation) -> Plan | No
     )
 
 
-def _flown(
+def _candidate_rows(
     problem: Problem, at: Solution, i: int, candidates: list[Candidate], m: int
 ) -> list[Sensitivity]:
-    """The rows of each candidate, a flight of m samples that begins as the i-th one does."""
+    """Return the rows of each candidate, a flight of m samples that begins as the i-th one does."""
     flight, numbers, model = problem.training[i], at.data.flights[i], problem.model
     dtype, whole, places = at.z.dtype, np.asarray(at.z), flight_places(at.layout)[i]
-    # Held between samples: steps are, and of a chirp it makes no difference to the comparison.
     signals = (dict.fromkeys(s, np.zeros(m)) for s in (flight.inputs, flight.outputs))
     names = ("inputs", "outputs", "instruments", "hold", "hold_reason")
     alone = replace(flight, **dict(zip(names, (*signals, {}, {}, {}), strict=True)))
     layout = replace(layout_of(problem, (alone,)), windows=((1, m),), continuity=None)
-    # A linear model is at rest with neutral sticks alone, and would respond to others as to a step;
-    # another begins in the state and with the sticks that the record begins with.
+    # A linear model begins at rest with neutral sticks, a nonlinear one as the record does.
     moves = 0.0 if model.linear else 1.0
     rest = {k: np.full(m, moves * float(u[0])) for k, u in flight.inputs.items()}
     shared, begin = whole[: at.layout.first_nuisance], moves * whole[places.states[0]]
@@ -148,16 +147,15 @@ def _flown(
 
 
 def _candidates(flight: Flight, m: int) -> list[Candidate]:
-    """Manoeuvres of m samples, of the amplitude that each input has in the record."""
+    """Return manoeuvres of m samples, with the amplitude that each input has in the record."""
     candidates, rng = [], np.random.default_rng(0)
     for name, u in flight.inputs.items():
         amplitude = 0.5 * float(np.ptp(u))
         if amplitude == 0:
             continue
         for step in _STEPS:
-            # At least one whole doublet in the candidate.
             if 3 * step <= m * flight.dt:
-                # One side, the other, and as long of neutral, over and over.
+                # One side, the other, neutral, repeated.
                 phase = np.arange(m) // max(1, round(step / flight.dt)) % 3
                 doublets = amplitude * np.array([1.0, -1.0, 0.0])[phase]
                 candidates.append(Candidate(name, f"doublets, {step:g} s a side", doublets))

@@ -1,11 +1,12 @@
 """Windows of a record with the most information (Fisher) on the free parameters.
 
-The record is cut into windows side by side, each with an initial state of its own, as multiple
-shooting does; with filter error a window is its part of the one filter. One Jacobian at the start
-values has the rows of all windows. The windows that gain most are taken, one after another.
+The record is cut into adjacent windows, each with its own initial state, as in multiple shooting;
+with filter error a window is its part of the one filter. One Jacobian at the start values has the
+rows of all windows. The windows that add most information are taken, one after another (Mehra,
+1974).
 
-A part must not say more than the whole. So a window begins where the record's simulation is at that
-instant, and its share of the weak priors is its share of the samples.
+A window begins in the state of the record's simulation at that instant, and has the share of the
+weak priors that it has of the samples, so that windows have no more information than the record.
 """
 
 import dataclasses
@@ -44,23 +45,21 @@ from heli_jax.identification.unknowns.layout import (
 
 ENOUGH = 0.9
 """D-efficiency of the windows that are taken: the q-th root of the determinant of their information
-over that of all windows, about the part of all that is known of a parameter"""
+over that of all windows"""
 DETERMINES = 1.0
-"""relative sd below which a parameter counts as determined: a factor of e either way"""
+"""relative sd below which a parameter is determined"""
 _RAILS = 0.05
-"""part of a window's samples at an end of a signal's range, from which on it is left out"""
+"""share of a window's samples at an end of a signal's range from which on it is left out"""
 _GAP = 0.25
-"""seconds without a sample of an output, and five of its usual steps, that are a gap"""
+"""a gap: so many seconds without a sample of an output, and five of its usual steps"""
 _PARTS = 12
 """windows in a record, unless their length is stated"""
 _SHORTEST, _LONGEST = 2.0, 20.0
 """length of a window [s], unless it is stated"""
-_PER_PARAMETER = 3
-"""samples of a window for each free parameter, at least (`Problem` asks that of a flight)"""
-_FEWEST = 8
-"""samples of a window, at least"""
+_PER_PARAMETER, _FEWEST = 3, 8
+"""samples of a window for each free parameter, and in all, at least"""
 _MOST = 200
-"""windows: each has unknowns of its own, so that time and memory grow with their square"""
+"""windows; time and memory grow with the square of their number"""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -68,7 +67,7 @@ class Window:
     """One window of a flight."""
 
     flight: int
-    """its number among the flights that are fitted"""
+    """index among the fitted flights"""
     label: str
     first: int
     last: int
@@ -79,7 +78,7 @@ class Window:
     sd: Float[np.ndarray, " q"]
     """expected by this window alone, relative; inf where it does not determine a parameter"""
     excluded: str
-    """why it is not to be used; empty where it may be"""
+    """reason why it is not used; empty if it may be"""
 
 
 class Choice(NamedTuple):
@@ -90,7 +89,6 @@ class Choice(NamedTuple):
     """D-efficiency of all that are taken up to it"""
     sd: Float[np.ndarray, " q"]
     """expected by all that are taken up to it"""
-    reason: str
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -101,25 +99,25 @@ class Ranking:
     length: float
     """[s]"""
     windows: tuple[Window, ...]
-    """in the order of time, those that are excluded too"""
+    """in the order of time, excluded ones too"""
     taken: tuple[Choice, ...]
-    """the most telling first"""
+    """the most informative first"""
     all_sd: Float[np.ndarray, " q"]
     """expected by all windows that may be used"""
     undetermined: tuple[str, ...]
-    """parameters that the whole record does not determine, as `check` says; their sd is inf"""
+    """parameters that the whole record does not determine; their sd is inf"""
     guessed: tuple[str, ...]
-    """flights and outputs whose noise was guessed, and is that of `noise`"""
+    """flights and outputs whose noise was guessed"""
     noise: Mapping[str, float]
     """sd by `flight/output`, SI"""
     notes: tuple[Finding, ...] = ()
     """on sizes of gusts that nobody stated"""
     record: tuple[Finding, ...] = ()
-    """what speaks against the whole record, as `check` says it: rates, and what inputs excite"""
+    """doubts about the whole record, of `check`: rates and excitation"""
 
 
 def window_samples(problem: Problem, length: float | None = None) -> int:
-    """Return the samples of a window; those of multiple shooting are not cut.
+    """Return the samples of a window, a multiple of those of multiple shooting.
 
     Args:
         length: [s]; a twelfth of the longest flight unless given, between 2 s and 20 s.
@@ -154,7 +152,7 @@ def window_samples(problem: Problem, length: float | None = None) -> int:
 def rank_windows(
     problem: Problem, at: Solution, e: Evaluation, length: float | None = None
 ) -> Ranking:
-    """Rank the windows of the flights that are fitted, and take those that together say enough.
+    """Rank the windows of the fitted flights, and take those that reach the D-efficiency.
 
     Raises:
         ValueError: the length fits no flight, the simulation diverges, or no window may be used.
@@ -176,14 +174,13 @@ def rank_windows(
         if layout.noise_model == "white":
             cut = tuple((-(-f.n_samples // m), m) for f, m in zip(flights, sizes, strict=True))
             layout = dataclasses.replace(layout, windows=cut, initial_state=True)
-            e = evaluate(layout, at.data, at.noise, _on_record(layout, at))
+            e = evaluate(layout, at.data, at.noise, _window_states(layout, at))
     s = sensitivity_at(problem, layout, e)
     s = s._replace(own=s.own / _prior_weights(layout, flights, samples, shooting=shooting))
     unknown = np.array([u.name in lacking for u in s.unknowns])
     number, _, sample, _ = layout.objective.tags(layout, at.data, len(s.shared))
     windows = []
     for i, (flight, size) in enumerate(zip(flights, sizes, strict=True)):
-        # A flight is later than its log where it is a part of it, or where a topic begins late.
         later = 0.0 if flight.source is None else flight.t0 - flight.source.first_time
         # A rest of less than half a window is none.
         for first in range(0, max(flight.n_samples - size // 2, 1), size):
@@ -197,7 +194,7 @@ def rank_windows(
     if not usable:
         excluded = windows[0][0].excluded
         raise ValueError(f"no window of {samples} samples may be used: {excluded}")
-    taken, all_sd = _chosen(s.unknowns, usable, unknown)
+    taken, all_sd = _take_windows(s.unknowns, usable, unknown)
     sds = list(zip(every, flights, at.noise.sd, strict=True))
     return Ranking(
         tuple(u.name for u in s.unknowns),
@@ -212,12 +209,11 @@ def rank_windows(
 
 
 def why_excluded(flight: Flight, first: int, last: int) -> str:
-    """Return in words why a window of a flight is not to be used; empty where it may be."""
+    """Return the reason why a window of a flight is not used; empty if it may be."""
     for name, y in flight.outputs.items():
         seen = np.flatnonzero(np.isfinite(y))
         here = seen[(seen >= first) & (seen < last)]
         longest = float(np.max(np.diff(np.r_[first - 1, here, last])))
-        # A sensor slower than the flight's rate leaves samples out that are no gap.
         if longest > max(5.0 * float(np.median(np.diff(seen))), _GAP / flight.dt):
             return f"{name} has a gap of {longest * flight.dt:.2g} s"
     for (name, _), whole in flight.facts.items():
@@ -231,8 +227,8 @@ def why_excluded(flight: Flight, first: int, last: int) -> str:
     return ""
 
 
-def _on_record(layout: Layout, at: Solution) -> Float[Array, " q"]:
-    """The unknowns, each window's initial state being that of the simulation of the record."""
+def _window_states(layout: Layout, at: Solution) -> Float[Array, " q"]:
+    """Return the unknowns with each window's initial state from the simulation of the record."""
     z, every = np.asarray(at.z), naming.names(layout.model.State)
     own, of_states = [z[: layout.first_nuisance]], [every.index(n) for n in layout.states]
     runs = eqx.filter_jit(predict)(at.layout, at.data, unpack(at.layout, at.data, at.z))
@@ -247,10 +243,10 @@ def _on_record(layout: Layout, at: Solution) -> Float[Array, " q"]:
 def _prior_weights(
     layout: Layout, flights: tuple[Flight, ...], samples: int, *, shooting: bool
 ) -> Float[np.ndarray, " k"]:
-    """By own unknown the part of its weak prior (as 1 / sd) that a window has."""
+    """Return a window's share of the weak prior of each of its own unknowns, as 1 / sd."""
     weights: list[np.ndarray] = []
     for flight, places in zip(flights, flight_places(layout), strict=True):
-        # Without shooting a state has a prior at the beginning of the record alone.
+        # Without shooting only the first initial state has a prior.
         states = np.full(places.states.shape, 1.0 if shooting else FREE)
         states[:1] = 1.0
         share = min(samples / flight.n_samples, 1.0) ** 0.5
@@ -258,54 +254,37 @@ def _prior_weights(
     return np.concatenate(weights)
 
 
-def _chosen(
+def _take_windows(
     unknowns: tuple[Unknown, ...],
     usable: list[tuple[Window, np.ndarray]],
     unknown: Float[np.ndarray, " q"],
 ) -> tuple[tuple[Choice, ...], Float[np.ndarray, " q"]]:
-    """The windows, the one that gains most first, until they say enough (Mehra, 1974), and the sds
-    expected of all.
-    """
-    left, R, taken = list(usable), np.zeros_like(usable[0][1]), []
-    before, log_dets = np.full(len(unknowns), np.inf), []
+    """Return the windows in order of their gain until they reach the D-efficiency, and the sds
+    expected by all."""
+    left, R, taken = list(usable), np.zeros((0, usable[0][1].shape[1])), []
+    sd, log_dets = np.full(len(unknowns), np.inf), []
     while left:
-        # The first of equal ones: the same record gives the same windows.
         gains = [_log_det(unknowns, together(R, T)) for _, T in left]
         window, T = left.pop(int(np.argmax(gains)))
         R = together(R, T)
         sd = np.where(unknown, np.inf, expected_sd(unknowns, R))
-        taken.append(Choice(window, 0.0, sd, _reason(unknowns, before, sd)))
+        taken.append(Choice(window, 0.0, sd))
         log_dets.append(max(gains))
-        before = sd
     efficiencies = np.exp((np.array(log_dets) - log_dets[-1]) / len(unknowns))
     taken = [c._replace(efficiency=float(f)) for c, f in zip(taken, efficiencies, strict=True)]
-    return tuple(taken[: 1 + int(np.argmax(efficiencies >= ENOUGH))]), before
+    return tuple(taken[: 1 + int(np.argmax(efficiencies >= ENOUGH))]), sd
 
 
 def _log_det(unknowns: tuple[Unknown, ...], R: np.ndarray) -> float:
-    """Logarithm of the determinant of what is known of the parameters of interest."""
+    """Return the log determinant of the information on the parameters of interest."""
     q = len(unknowns)
-    # What nothing tells yet has the sd of its interval or of a factor of e, so that the determinant
-    # is never zero; of the noise's own unknowns, which are eliminated, that is an sd of ten.
-    weak = np.diag([max(u.prior, 1.0 / u.scale) for u in unknowns] + [0.1] * (len(R) - q))
+    # Weak information on all, so that the determinant is not zero.
+    weak = np.diag([max(u.prior, 1.0 / u.scale) for u in unknowns] + [0.1] * (R.shape[1] - q))
     whole = np.linalg.qr(np.vstack([R, weak]), mode="r")
-    # With the parameters last their corner of the triangle is what is left without the others.
+    # With the parameters last, the corner of the factor has the others eliminated.
     whole = np.linalg.qr(np.hstack([whole[:, q:], whole[:, :q]]), mode="r")
-    corner = np.abs(np.diag(whole)[len(R) - q :])
+    corner = np.abs(np.diag(whole)[R.shape[1] - q :])
     return 2.0 * float(np.sum(np.log(np.maximum(corner, 1e-300))))
-
-
-def _reason(unknowns: tuple[Unknown, ...], before: np.ndarray, after: np.ndarray) -> str:
-    """Return in words the parameters that a window determines, else the one that it tells most."""
-    if (new := (after < DETERMINES) & (before >= DETERMINES)).any():
-        return (
-            f"determines {', '.join(u.name for u, one in zip(unknowns, new, strict=True) if one)}"
-        )
-    known = after < DETERMINES
-    if not known.any():
-        return ""
-    i = int(np.argmax(np.where(known, before / after, 0.0)))
-    return f"{unknowns[i].name}: sd {100 * before[i]:.2g} % to {100 * after[i]:.2g} %"
 
 
 def window_flights(problem: Problem, ranking: Ranking) -> dict[int, tuple[Flight, ...]]:
@@ -321,7 +300,6 @@ def window_flights(problem: Problem, ranking: Ranking) -> dict[int, tuple[Flight
             value=ranking.taken[-1].efficiency,
             begin=w.start,
             end=w.end,
-            reason=choice.reason,
             count=len(ranking.taken),
             length=ranking.length,
         )

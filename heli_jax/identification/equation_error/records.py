@@ -1,8 +1,8 @@
-"""Flights made ready for regression: smoothed signals, and what of the states these show.
+"""Flights for regression: smoothed signals, their derivatives, and the states that outputs show.
 
 A signal x is smoothed by a short kernel of unit area, w(s) = c (1 - s^2)^4, and differentiated by
 parts, (w * x)' = w' * x (modulating functions: M. Shinbrot, NACA TN 3288, 1954). A linear equation
-x' = A x + B u then holds for the smoothed signals exactly, however much is smoothed.
+x' = A x + B u holds exactly for the smoothed signals, whatever the kernel's width.
 """
 
 import itertools
@@ -26,21 +26,21 @@ from heli_jax.numerics.white_noise import noise_guess
 ORDERS = 3
 """a signal, its first and its second derivative"""
 _HALF_WIDTHS = (4, 6, 8, 12, 16, 24, 32, 48, 64)
-"""of the kernel, in samples, of which one is taken"""
+"""candidates, of the kernel [samples]"""
 _MOST_LEFT_OUT = 0.05
-"""part of a signal's motion that smoothing may take away beside the noise"""
+"""part of a signal's sd that smoothing may remove beside the noise"""
 _BRIDGED = 3
 """missing samples in a row that are interpolated; more end a segment"""
 _LOST = 2.5
 """usual steps of a slow sensor that are interpolated: one lost sample, with jitter"""
 _DETERMINED = 1e-8
-"""part of a unit vector that may lie outside the span of what is measured"""
+"""largest residual of a unit vector in the span of the measured outputs"""
 _SEGMENTS = 20
-"""of a flight at most, the longest: each has an initial state of its own for what is hidden"""
+"""of a flight at most, the longest: each adds initial values of hidden states"""
 _RESOLVED = 4
-"""samples to a half width of the kernel that are kept: what is smoothed moves no faster"""
+"""samples that are kept, in a half width of the kernel"""
 
-# With its first three derivatives it vanishes at the ends: integration by parts leaves no terms.
+# The kernel and its first three derivatives vanish at the ends.
 _SHAPE = Polynomial([1.0, 0.0, -1.0]) ** 4
 _AREA = 2.0 * _SHAPE.integ()(1.0)
 _KERNEL = tuple(p / _AREA for p in (_SHAPE.integ(), *map(_SHAPE.deriv, range(ORDERS))))
@@ -48,29 +48,27 @@ _KERNEL = tuple(p / _AREA for p in (_SHAPE.integ(), *map(_SHAPE.deriv, range(ORD
 
 
 def margin(half: int) -> int:
-    """Return the samples at either end of a segment that smoothing takes away."""
-    return half + 2  # two more: a delayed and held input reaches further back
+    """Return the samples at either end of a segment that smoothing removes."""
+    return half + 2  # a delayed and held input needs two more
 
 
 def shortest(half: int) -> int:
-    """Return the samples of the shortest segment that is worth smoothing: three widths of the
-    kernel are left between the margins."""
+    """Return the samples of the shortest segment: three widths of the kernel between margins."""
     return 2 * margin(half) + 6 * half
 
 
 def smoothed(
     y: Float[np.ndarray, " N"], dt: float, half: int, *, held: bool = False, late: float = 0.0
 ) -> Float[np.ndarray, "r n"]:
-    """Return a sampled signal smoothed, and its derivatives per second, (3, N - 2 `margin`).
+    """Return the smoothed signal and its derivatives per second, (3, N - 2 `margin`).
 
     Args:
-        y: all seen.
+        y: without missing samples.
         half: half width of the kernel [samples].
-        held: True for an input that stays between samples; else a straight line joins them.
-        late: how late it acts [s].
+        held: True for an input with a zero-order hold; else it is linear between samples.
+        late: delay [s].
     """
-    # Whole samples of the delay by index, the rest within the weights. Before the record a signal
-    # is as at its beginning.
+    # Whole samples of the delay by index, the rest by the weights.
     whole, rest = divmod(late / dt, 1.0)
     y = y[np.clip(np.arange(y.size) - int(whole), 0, y.size - 1)]
     j = np.arange(-margin(half), margin(half) + 1) - rest
@@ -83,7 +81,7 @@ def smoothed(
         )
     else:
         weights = scale / half * np.stack([_kernel(r + 1, s) for r in range(ORDERS)])
-        # A sum is not quite the integral: a constant, a line and a parabola keep their derivatives.
+        # Corrected so that sums have the exact derivatives of parabolas.
         weights[0] /= weights[0].sum()
         weights[1] -= weights[1].sum() * weights[0]
         weights[1] /= -(weights[1] @ j)
@@ -98,7 +96,7 @@ def _kernel(which: int, s: np.ndarray) -> np.ndarray:
 
 
 def segments(outputs: Mapping[str, np.ndarray]) -> tuple[list[slice], dict[str, np.ndarray]]:
-    """Return where all outputs are seen, and the outputs with short gaps interpolated."""
+    """Return the segments without missing outputs, and the outputs with short gaps filled."""
     bridged = {name: _bridged(y) for name, y in outputs.items()}
     seen = np.all([np.isfinite(y) for y in bridged.values()], axis=0)
     return np.ma.clump_masked(np.ma.array(seen, mask=seen)), bridged
@@ -120,8 +118,8 @@ def _bridged(y: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
 
 
 def kernel_width(flights: Sequence[Flight]) -> int:
-    """Return the half width [samples] of the widest kernel that takes little more than noise from
-    every output of all flights."""
+    """Return the half width [samples] of the widest kernel that removes little more than noise from
+    every output."""
     signals = []
     for flight in flights:
         parts, bridged = segments(flight.outputs)
@@ -130,8 +128,7 @@ def kernel_width(flights: Sequence[Flight]) -> int:
             sd = {n: flight.sd.get(n) or noise_guess(y) for n, y in flight.outputs.items()}
             signals += [(y[longest], sd[n]) for n, y in bridged.items()]
 
-    # A short record would be left with little to regress by a wide kernel. A little of the motion
-    # may go as well as the noise: the two add as independent variances do.
+    # A short record needs a narrow kernel.
     def passes(half: int) -> bool:
         inner = slice(margin(half), -margin(half))
         return all(
@@ -151,14 +148,13 @@ def _stacked(model: Model, names: tuple[str, ...], base: dict[str, Any], values:
         A, B, C, D = jacobians(model, params)
         return jnp.block([[A, B], [C, D]])
 
-    # Forward: a matrix has more entries than a model has parameters.
     return matrix(values), jax.jacfwd(matrix)(values)
 
 
 def coefficients(
     model: Model, base: Mapping[str, float], names: Sequence[str], values: np.ndarray
 ) -> Float[np.ndarray, "r c 1+q"]:
-    """Return [A B; C D] of a linear model, and beside it its derivatives by the parameters `names`.
+    """Return [A B; C D] of a linear model, then its derivatives by the parameters `names`.
 
     Args:
         base: all parameters by name, SI.
@@ -174,63 +170,62 @@ def coefficients(
 
 
 def generic(count: int) -> Float[np.ndarray, " q"]:
-    """Return numbers (count,) at which nothing cancels by chance."""
+    """Return random numbers (count,), at which no terms cancel."""
     return np.random.default_rng(11).uniform(0.5, 1.5, count)
 
 
 class Structure(NamedTuple):
-    """The states of a model that a flight's measured outputs show."""
+    """States that measured outputs determine, and the equations to regress."""
 
     states: tuple[str, ...]
     signals: tuple[str, ...]
     """measured outputs, then inputs: the columns of `shown`"""
     shown: dict[int, Float[np.ndarray, "r z"]]
-    """coefficients of each derivative of each signal that make a state"""
+    """by state, coefficients of each derivative of each signal"""
     equations: tuple[str, ...]
     """the states and outputs of `rows`"""
     rows: tuple[int, ...]
-    """of `coefficients` the equations to be regressed: of states, and of outputs that show none"""
+    """rows of `coefficients` to regress: of states, and of outputs that determine none"""
 
     @property
     def hidden(self) -> tuple[int, ...]:
-        """The states that nothing measured shows."""
+        """The states that no output determines."""
         return tuple(i for i in range(len(self.states)) if i not in self.shown)
 
 
 def structure(model: Model, both: Float[np.ndarray, "r c q"], outputs: Sequence[str]) -> Structure:
-    """Return what is measured of the states, and which equations there are to regress.
+    """Return the measured states and the equations to regress.
 
-    A state is measured where an output is that state, or where outputs are a linear image of it
-    with known coefficients; or where it is the derivative of one, as a rate is of an angle.
+    A state is measured if outputs determine it with known coefficients, or if it is the derivative
+    of such a state, as a rate of an angle.
 
     Args:
-        both: of `coefficients`, by the free parameters, at `generic` values of these.
+        both: `coefficients` at `generic` values of the free parameters, with derivatives by these.
     """
     value, depends = both[..., 0], (both[..., 1:] != 0).any(axis=-1)
     states, inputs = naming.names(model.State), naming.names(model.Inputs)
     n, p, names = len(states), len(outputs), naming.names(model.Outputs)
     rows = [n + names.index(y) for y in outputs]
-    # y - D u = C x, with coefficients that are known; other outputs become equations to regress.
+    # y - D u = C x with known coefficients; other outputs are equations to regress.
     known = [i for i, row in enumerate(rows) if not depends[row].any()]
     right = np.zeros((len(known), ORDERS, p + len(inputs)))
     for k, i in enumerate(known):
         right[k, 0, i] = 1.0
         right[k, 0, p:] = -value[rows[i], n:]
     shown = _solved(value[[rows[i] for i in known], :n], right)
-    # x_i' - A_ik x_k - B_i u = A_ij x_j, with the shown k and the others j, gives further states.
+    # x_i' - A_ik x_k - B_i u = A_ij x_j, with measured k, gives further states j.
     rest = [j for j in range(n) if j not in shown]
     equations = [i for i in shown if not depends[i].any() and np.any(value[i, rest] != 0)]
     sides = []
     for i in equations:
-        # One order up: the time derivative. The highest order, which the outputs left empty, comes
-        # round to the front.
+        # Rolled by one order: the time derivative.
         side = np.roll(shown[i], 1, axis=0)
         side[0, :] = 0.0
         side -= sum(value[i, k] * shown[k] for k in shown)
         side[0, p:] -= value[i, n:]
         sides.append(side)
     if sides:
-        # Once only: each derivative more has so much more noise.
+        # Once only: each derivative adds noise.
         more = _solved(value[np.ix_(equations, rest)], np.stack(sides))
         shown = {**shown, **{rest[j]: columns for j, columns in more.items()}}
     hidden = [i for i in range(n) if i not in shown]
@@ -247,7 +242,7 @@ def _solved(
     if not left.size:
         return {}
     inverse = np.linalg.pinv(left, rcond=1e-10)
-    # Where a row of A^+ A is that of the identity this unknown is determined.
+    # An unknown is determined if its row of A^+ A is that of the identity.
     alone = np.abs(inverse @ left - np.eye(left.shape[1])).max(axis=1) < _DETERMINED
     solution = np.tensordot(inverse, right, axes=1)
     return {int(i): solution[i] for i in np.flatnonzero(alone)}
@@ -256,11 +251,11 @@ def _solved(
 def hidden_constants(
     model: Model, base: Mapping[str, float], structures: Sequence[Structure]
 ) -> set[str]:
-    """Return the parameters that are delays, or time constants or frequencies of hidden states: at
-    a wrong eigenvalue least squares fits the rest to a wrong signal.
+    """Return the parameters that are delays, or set eigenvalues of hidden states, on which the
+    signals of the regression depend.
 
     Args:
-        base: all parameters by name; NaN of one that is not given, other values do not matter.
+        base: all parameters by name; NaN if not given, other values do not matter.
     """
     names = tuple(n for n in naming.names(model.Params) if not np.isnan(base[n]))
     both = coefficients(model, base, names, generic(len(names)))
@@ -268,8 +263,8 @@ def hidden_constants(
     for hidden in {s.hidden for s in structures}:
         block = both[np.ix_(hidden, hidden)]
         depends = block[..., 1:] != 0
-        # An entry sets an eigenvalue on the diagonal, or where entries that are plain numbers close
-        # a loop with it, as a stiffness does with the rate that is the angle's derivative.
+        # An entry sets an eigenvalue if it is on the diagonal, or if constant entries close a loop
+        # with it, as for a stiffness.
         plain = (block[..., 0] != 0) & ~depends.any(axis=-1)
         loop = np.linalg.matrix_power(np.eye(len(hidden)) + plain.T, len(hidden)) > 0
         constants |= {names[j] for j in np.flatnonzero((depends & loop[..., None]).any((0, 1)))}
@@ -277,10 +272,10 @@ def hidden_constants(
 
 
 class Segment(NamedTuple):
-    """A stretch without gaps, smoothed: arrays (signals, n), SI."""
+    """A segment without gaps, smoothed: arrays (signals, n), SI."""
 
     known: Float[np.ndarray, "k n"]
-    """the states that are shown, in the order of `Structure.shown`, then the inputs"""
+    """the measured states, in the order of `Structure.shown`, then the inputs"""
     left: Float[np.ndarray, "e n"]
     """the left-hand sides of the equations: derivatives per second, or outputs"""
     step: float
@@ -298,18 +293,18 @@ class Record(NamedTuple):
 def record(
     model: Model, flight: Flight, structure: Structure, half: int, late: Mapping[str, float]
 ) -> Record:
-    """Return a flight smoothed by a kernel of half width `half` [samples], with inputs that act
+    """Return a flight smoothed by a kernel of half width `half` [samples], with inputs delayed by
     `late` [s]."""
     flight = without_jumps(flight)
     parts, bridged = segments(flight.outputs)
     parts = [p for p in parts if p.stop - p.start >= shortest(half)]
     parts = sorted(parts, key=lambda p: p.start - p.stop)[:_SEGMENTS]
-    # Neighbours within a kernel are made of the same samples: fewer of them lose next to nothing.
+    # Neighbours within a kernel have the same samples.
     every = max(1, half // _RESOLVED)
     inputs, shown, made = naming.names(model.Inputs), structure.shown, []
     for part in parts:
         signals = {n: smoothed(y[part], flight.dt, half) for n, y in bridged.items()}
-        # Inputs are known before the segment too, where a delayed one comes from.
+        # A delayed input begins before the segment.
         length = part.stop - part.start
         before = np.clip(np.arange(part.start - length, part.stop), 0, None)
         for name in inputs:

@@ -1,8 +1,8 @@
-"""Kim and Tilbury's way (1997): recursive least squares, and from Hd(z) to a/Ixx and a/If.
+"""Recursive least squares (Kim and Tilbury, 1997), and a/Ixx and a/If from Hd(z).
 
-RLS, eqs 25-33, has Potter's square-root form: P = S S^T is kept as its factor S, so that it stays
-symmetric and positive whatever the rounding; the covariance form drifts away within thousands of
-samples when old data are forgotten. Functions follow the shape init, step -> (state, info).
+RLS, eqs 25-33, is in Potter's square-root form: P = S S^T is kept as its factor S, so that it stays
+symmetric and positive definite. With forgetting, the covariance form loses this within thousands of
+samples.
 """
 
 import math
@@ -27,19 +27,19 @@ from heli_jax.numbers import terse
 from heli_jax.vehicle import of_helicopter
 
 _P0 = 1e12
-"""initial variance of every coefficient, of signals scaled to unit rms: nothing is known of it"""
+"""initial variance of every coefficient, for signals of unit rms"""
 _PER_ORDER = 10
-"""samples in a row for each order that a record needs at least"""
+"""fewest samples in a row, for each order"""
 _MEANT = 0.05
-"""part by which the coefficient of s^2 may miss what the structure of eq. 23 asks for"""
+"""largest relative error of the coefficient of s^2 under the structure of eq. 23"""
 _STARTING = 100
-"""first samples, at most, whose errors are those of a P that has not yet fallen"""
+"""first samples that are left out of the one-step errors, at most"""
 _WORSE = 1.5
-"""times the error of one step ahead from which on a simulation's error shows a bias"""
+"""rms error of the simulation over that one step ahead from which on noise biases the estimate"""
 
 
 class RLSState(NamedTuple):
-    """State between samples."""
+    """Estimate after a sample."""
 
     theta: Float[Array, " q"]
     S: Float[Array, "q q"]
@@ -56,7 +56,7 @@ class RLSInfo(NamedTuple):
 
 
 class RLSResult(NamedTuple):
-    """A whole run."""
+    """RLS over a record."""
 
     theta: Float[Array, " q"]
     """final estimate"""
@@ -91,8 +91,7 @@ def rls_step(
     S = (S - shrink * gain[:, None] * f[None, :]) / jnp.sqrt(forgetting)
     variances = jnp.sum(S * S, axis=1)
     largest = jnp.max(variances)
-    # Wind-up: directions that the regressor does not excite are forgotten without being learnt
-    # again, so that P would grow there without end.
+    # Wind-up: with forgetting, P grows without limit in directions that are not excited.
     S = jax.lax.cond(largest > bound, _bounded, lambda S, *_: S, S, variances, bound)
     return RLSState(theta, S), RLSInfo(error, largest)
 
@@ -100,12 +99,12 @@ def rls_step(
 def _bounded(
     S: Float[Array, "q q"], variances: Float[Array, " q"], bound: Float[Array, ""]
 ) -> Float[Array, "q q"]:
-    """Bring the largest variance down to the bound, as a measurement of that parameter without news
-    does: Theta and the excited directions stay."""
+    """Reduce the largest variance to the bound by a pseudo-measurement of that parameter, which
+    leaves Theta and the excited directions."""
     i = jnp.argmax(variances)
     f, p = S[i], variances[i]
-    # A measurement of variance r leaves p r / (p + r), which is the bound for this r. Both branches
-    # of a batched cond are computed: below the bound the divisor must not vanish.
+    # A measurement of variance r leaves p r / (p + r). A batched cond computes both branches: the
+    # divisor must not vanish below the bound.
     r = p * bound / jnp.maximum(p - bound, jnp.finfo(S.dtype).tiny)
     alpha = p + r
     gain = jnp.sum(S * f[None, :], axis=1) / alpha
@@ -170,9 +169,8 @@ def rls_regression(
         forgetting: in (0, 1].
         bound: largest variance that P may reach, against wind-up; 100 p0 unless given.
     """
-    # A scan keeps the types of what it carries: float32 records stay so beside a float64 p0.
+    # A scan carries one dtype: that of the records.
     p0, factor = jnp.asarray(p0, phi.dtype), jnp.asarray(forgetting, phi.dtype)
-    # Far enough above p0 to leave estimates alone; without a bound P would overflow.
     limit = jnp.asarray(100.0 * p0 if bound is None else bound, phi.dtype)
 
     def step(state: RLSState, sample: tuple[Array, Array]) -> tuple[RLSState, tuple[Array, ...]]:
@@ -188,13 +186,13 @@ def transfer_function(theta: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     26."""
     theta = np.asarray(theta)
     n = theta.size // 2
-    # Theta holds -a: eq. 25 has the past outputs on the side of the inputs.
+    # Theta holds -a (eq. 25).
     return theta[n:], np.r_[1.0, -theta[:n]]
 
 
 @dataclass(frozen=True, eq=False)
 class Baseline:
-    """RLS on one input and one output of one flight, and what can be read from it."""
+    """RLS on one input and one output of one flight, and its physical parameters."""
 
     flight: str
     output: str
@@ -207,15 +205,14 @@ class Baseline:
     continuous_num: np.ndarray | None
     continuous_den: np.ndarray | None
     note: str
-    """why the continuous form is another system than Hd, or there is none; empty where Hd is what a
-    zero-order hold makes of it"""
+    """why the continuous form is not the inverse of the hold; empty if it is"""
     combinations: dict[str, float]
     simulated: np.ndarray
     """Hd over the whole record, from its first measured outputs"""
     metrics: Metrics
     """of that simulation"""
     findings: tuple[Finding, ...]
-    """what speaks against it"""
+    """doubts about the estimates"""
 
     @property
     def theta(self) -> np.ndarray:
@@ -239,12 +236,12 @@ class Baseline:
 
     @property
     def exact(self) -> bool:
-        """True if the continuous form gives Hd back when it is sampled."""
+        """True if the continuous form is the inverse of the zero-order hold."""
         return not self.note
 
     @property
     def trusted(self) -> bool:
-        """True if nothing speaks against it."""
+        """True if there is no doubt."""
         return not self.findings
 
     @property
@@ -274,7 +271,7 @@ def baseline(
         )
     input_ = next(n for n in naming.names(model.Inputs) if n in flight.inputs)
     u, y = flight.inputs[input_][part], flight.outputs[output][part]
-    # To unit rms, so that P(0) means the same whatever the units; a silent signal is left as it is.
+    # Scaled to unit rms, which P(0) is for.
     u_scale, y_scale = (float(np.sqrt(np.mean(v**2))) or 1.0 for v in (u, y))
     run = rls(
         jnp.asarray(u / u_scale),
@@ -288,8 +285,7 @@ def baseline(
     num, den = transfer_function(history[-1])
     from scipy.signal import lfilter, lfiltic
 
-    # Started from the first measured outputs, over the whole record: one step ahead any model
-    # predicts well where sampling is fast.
+    # Simulated from the first measured outputs: one step ahead any model predicts well.
     begun = lfiltic(num, den, y[order - 1 :: -1], u[order - 1 :: -1])
     simulated = np.r_[y[:order], lfilter(num, den, u[order:], zi=begun)[0]]
     diverges = not np.abs(simulated).max() <= 1e6 * np.abs(y).max()
@@ -320,7 +316,7 @@ def baseline(
 def _samples(model: Model, flight: Flight, least: int) -> tuple[str, slice, list[Finding]]:
     """Return the first output with `least` samples in a row (else the first), and its longest part
     without a missing sample."""
-    # An angle before its rate: eq. 23, which physical parameters are read from, is of an angle.
+    # An angle before its rate: eq. 23 is of an angle.
     names = [n for n in naming.names(model.Outputs) if n in flight.outputs]
     names = sorted(names, key=lambda n: naming.unit(model.Outputs, n) != "rad")
     parts = {}
@@ -345,11 +341,11 @@ type _Polynomials = tuple[np.ndarray | None, np.ndarray | None]
 
 
 def _continuous(num: np.ndarray, den: np.ndarray, dt: float) -> tuple[_Polynomials, list[Finding]]:
-    """Return H(s), and why it is not the inverse of the zero-order hold."""
+    """Return H(s), and the reason if it is not the inverse of the zero-order hold."""
     try:
         return d2c(num, den, dt, "zoh"), []
     except ValueError as e:
-        # Only what is wrong: the remedy behind the semicolon is what follows here.
+        # Without its remedy.
         refused = str(e).split(";")[0]
     try:
         return d2c(num, den, dt, "real-log"), [found("rls.real-logarithm", reason=refused)]
@@ -360,23 +356,22 @@ def _continuous(num: np.ndarray, den: np.ndarray, dt: float) -> tuple[_Polynomia
 def _combinations(
     model: Model, params: Any, flight: Flight, output: str, den: np.ndarray | None, order: int
 ) -> tuple[dict[str, float], list[Finding]]:
-    """Return a/Ixx and a/If where eq. 23 has the model's structure, and doubts."""
+    """Return a/Ixx and a/If if the model has the structure of eq. 23, and doubts."""
     fourth_order = len(naming.names(model.State)) == 4
-    if not (output in ("roll", "pitch") and of_helicopter(model.Params) and fourth_order):
-        return {}, [found("rls.no-parameters", "doubt", output)]
-    if order != 4:
-        return {}, [found("rls.other-order", value=float(order))]
+    known = output in ("roll", "pitch") and of_helicopter(model.Params) and fourth_order
+    if not known or order != 4:
+        return {}, [found("rls.no-parameters", "doubt", output, value=float(order))]
     if den is None:
         return {}, []
     p = naming.replace(params, **{n: jnp.asarray(v) for n, v in flight.known.items()})
-    # The vehicle may state a stand that this model does not stand on.
+    # A model without the stand.
     p = p if reads(model, p, "zeta") else naming.replace(p, zeta=0.0 * p.zeta)
     ratios = ratios_from_denominator(p, den, output)
     values, doubts = {n: float(v) for n, v in ratios.values.items()}, []
     if wrong := [n for n, v in values.items() if not (math.isfinite(v) and v > 0)]:
         shown = [f"{n} = {terse(values[n])}" for n in wrong]
         doubts.append(found("rls.impossible", "doubt", *wrong, values=shown))
-    # The ratios do not use p2, so that it can contradict them.
+    # The ratios do not use p2.
     p2, expected = float(ratios.p2), float(ratios.p2_expected)
     if abs(p2 / expected - 1.0) > _MEANT:
         doubts.append(found("rls.other-structure", value=p2, expected=expected))
@@ -387,17 +382,14 @@ def _bias(
     errors: Float[np.ndarray, " k"], y: Float[np.ndarray, " N"], agreement: Metrics
 ) -> list[Finding]:
     """Return findings on a bias of least squares by noise on past measured outputs."""
-    # While P falls from its start the errors are those of no model.
+    # While P falls from its initial value the errors are those of no model.
     errors = errors[min(_STARTING, errors.size // 4) :]
     one_step = float(np.sqrt(np.mean(errors**2)))
     if one_step < 1e-8 * float(np.sqrt(np.mean(y**2))):
         return []  # no noise: the rest is rounding
     findings = []
-    if math.isnan(agreement.rmse):
-        findings.append(found("rls.diverges"))
-    # Without a bias both errors are the same noise; past outputs in the regressor hide it from the
-    # error of one step, not from the simulation.
-    elif agreement.rmse > _WORSE * one_step:
+    # A bias shows in simulation, where no past measured output hides it.
+    if agreement.rmse > _WORSE * one_step:
         ratio, simulated = agreement.rmse / one_step, agreement.rmse
         findings.append(
             found("rls.biased", value=ratio, limit=_WORSE, ahead=one_step, simulated=simulated)

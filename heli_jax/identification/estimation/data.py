@@ -1,6 +1,5 @@
-"""The numbers of a problem over its flights as arrays, and the unknowns at the start values."""
+"""The numbers of a problem as arrays, and the unknowns at the start values."""
 
-from dataclasses import replace
 from typing import Any
 
 import jax
@@ -33,7 +32,7 @@ from heli_jax.identification.unknowns.layout import (
 
 
 def data_of(problem: Problem, flights: tuple[Flight, ...], layout: Layout | None = None) -> Data:
-    """The numbers of a problem over the given flights, whose layout may be at hand already."""
+    """Return the numbers of a problem over the given flights; `layout` where it is at hand."""
     dtype = np.dtype(jnp.result_type(float))
     nuisance, frees = problem.nuisance, list(problem.free.values())
     bounds = [transforms.limits(f) for f in frees]
@@ -49,8 +48,7 @@ def data_of(problem: Problem, flights: tuple[Flight, ...], layout: Layout | None
         low=column([b[0] for b in bounds]),
         high=column([b[1] for b in bounds]),
         prior_mean=column([f.prior.mean if f.prior else 0.0 for f in frees]),
-        # An infinite sd in place of a missing prior: its row is zero, and problems that differ in
-        # their priors share one compiled program.
+        # Without a prior the sd is infinite: problems share programs whatever their priors are.
         prior_sd=column([f.prior.sd if f.prior else np.inf for f in frees]),
         flights=tuple(
             _flight_data(problem, f, dtype, u) for f, u in zip(flights, follows, strict=True)
@@ -63,8 +61,7 @@ def data_of(problem: Problem, flights: tuple[Flight, ...], layout: Layout | None
 
 
 def _placed(numbers: Data) -> Data:
-    """Signals on the device, once instead of with every call of a compiled program; numbers that
-    stand alone, of which there are many more, take longer to put there than to hand over."""
+    """Put signals on the device, once instead of with every call; scalars are faster by call."""
     leaves, structure = jax.tree.flatten(numbers)
     signals = iter(jax.device_put([v for v in leaves if v.ndim]))
     return jax.tree.unflatten(structure, [next(signals) if v.ndim else v for v in leaves])
@@ -73,28 +70,27 @@ def _placed(numbers: Data) -> Data:
 def _flight_data(
     problem: Problem, flight: Flight, dtype: np.dtype, follows: dict[str, np.ndarray] | None
 ) -> FlightData:
-    """`follows`: by input what of it follows the instruments."""
+    """Return the numbers of a flight; `follows`: by input the part that follows the instruments."""
     model = problem.model
 
     def arrays(by_name: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         return {n: np.asarray(by_name[n], dtype) for n in naming.names(model.Inputs)}
 
     inputs = arrays(flight.inputs)
-    # By name, as JAX orders them in everything that is compiled.
+    # By name, as JAX orders them.
     outputs = {n: np.asarray(y, dtype) for n, y in sorted(flight.outputs.items())}
     return FlightData(
         dt=np.asarray(flight.dt, dtype),
         inputs=model.Inputs(**inputs),
         outputs=outputs,
         known={n: np.asarray(v, dtype) for n, v in flight.known.items()},
-        # Ones until a run from the start values has shown what the states do: see below.
+        # Ones until `_with_state_scales`.
         state_scale={n: np.ones((), dtype) for n in naming.names(model.State)},
-        # Ten times the signal: so weak a prior says no more than the order of magnitude, but keeps
-        # an unknown that has no effect from drifting off.
+        # Ten times the signal: so weak a prior only keeps an unknown without effect from drifting.
         bias_scale={
             n: np.asarray(10.0 * _size(y[np.isfinite(y)]), dtype) for n, y in outputs.items()
         },
-        # How far an input moves, or its size where it never does.
+        # By the motion of an input, or its size if it is constant.
         offset_scale={
             n: np.asarray(10.0 * _size(u - np.mean(u) if np.ptp(u) > 0 else u), dtype)
             for n, u in inputs.items()
@@ -109,34 +105,37 @@ def _rms(values: jax.Array | np.ndarray) -> float:
 
 
 def _size(values: jax.Array | np.ndarray) -> float:
-    """rms of a signal, 1 where that says nothing."""
+    """Return the rms of a signal; 1 if that is zero or not finite."""
     rms = _rms(values)
     return rms if np.isfinite(rms) and rms > 0 else 1.0
 
 
 def _with_state_scales(problem: Problem, layout: Layout, data: Data) -> Data:
-    """Ten times what each state does in a run from the start values: a weak prior's sd.
+    """Return the data with the sds of the initial states' weak priors: ten times what each state
+    does in a run from the start values.
 
     The run is brought to the size of the measured outputs first, since a gain may be unknown.
     """
-    # Initial states are zero in it whatever their scales are, which may be the ones still.
-    z = start_vector(layout, data, problem)
-    at_start, simulated = _before_it_grows(layout, data, z)
+    # Initial states are zero in it, so the scales that are there do not matter.
+    runs = jax.device_get(_simulated(layout, data, start_vector(layout, data, problem)))
     scaled, names = [], naming.names(layout.model.State)
-    for flight, runs, rms in zip(data.flights, simulated, at_start.state_rms, strict=True):
+    for i, (flight, outputs) in enumerate(zip(data.flights, by_output(layout, runs), strict=True)):
         y = {n: np.asarray(v) for n, v in flight.outputs.items()}
-        y = {n: v[np.isfinite(v)] for n, v in y.items()}
+        # Windows are too short to grow.
+        near = _samples_near(outputs, y) if layout.windows[i][0] == 1 else None
         # On average over the outputs: one gain that is off scales them all.
-        ratio = 10.0 * float(np.mean([_size(v) / _size(runs[n]) for n, v in y.items()]))
-        scale = {n: np.asarray(ratio * _size(v), z.dtype) for n, v in zip(names, rms, strict=True)}
+        sizes = [_size(v[np.isfinite(v)]) / _size(outputs[n][:near]) for n, v in y.items()]
+        ratio, dtype = 10.0 * float(np.mean(sizes)), flight.dt.dtype
+        states = zip(names, runs.states[i], strict=True)
+        scale = {n: np.asarray(ratio * _size(x[:near]), dtype) for n, x in states}
         scaled.append(flight._replace(state_scale=scale))
     return data._replace(flights=tuple(scaled))
 
 
 def _simulated(layout: Layout, data: Data, z: jax.Array) -> SimulatedOutputs:
     """Simulate at z."""
-    # By the program that is to be compiled anyway, where that simulates on its way: one more for
-    # the simulation alone would take longer than the derivatives that nobody asks for here.
+    # By the program of the residuals, where that simulates: it has to be compiled anyway, and a
+    # program for the simulation alone would take longer than the derivatives.
     if layout.noise_model == "white":
         ones = tuple({n: np.ones((), z.dtype) for n in names} for names in layout.outputs)
         at = residual_and_jacobian(layout, data, Noise(ones, np.zeros((), z.dtype)), z)
@@ -146,42 +145,22 @@ def _simulated(layout: Layout, data: Data, z: jax.Array) -> SimulatedOutputs:
 
 
 _GROWN = 100.0
-"""times all that was measured of a flight, from which on a run that grows says nothing of sizes:
-its unstable mode drowns all other states"""
-_HALVINGS = 8
+"""times all that was measured of a flight, from which on a run that grows shows no sizes: its
+unstable mode drowns all other states"""
 
 
-def _before_it_grows(
-    layout: Layout, data: Data, z: Array
-) -> tuple[SimulatedOutputs, tuple[dict[str, np.ndarray], ...]]:
-    """Simulate at z, an unstable model over as much of the records as it stays near
-    them; as NumPy arrays, and by flight and output."""
-    simulate = _simulated
-    for _ in range(_HALVINGS):
-        runs = jax.device_get(simulate(layout, data, z))
-        simulated = by_output(layout, runs)
-        windows = [count for count, _ in layout.windows]
-        far = any(
-            runs_away(v, np.asarray(f.outputs[n]))
-            for f, by_name in zip(data.flights, simulated, strict=True)
-            for n, v in by_name.items()
-        )
-        # Windows are short already.
-        if not far or max(windows) > 1 or min(m for _, m in layout.windows) < 4:
-            break
-        cut = tuple((1, m // 2) for _, m in layout.windows)
-        flights = tuple(
-            f._replace(inputs=jax.tree.map(lambda v, m=m: v[:m], f.inputs))
-            for f, (_, m) in zip(data.flights, cut, strict=True)
-        )
-        layout, data = replace(layout, windows=cut), data._replace(flights=flights)
-        # Of the cut records the simulation alone: their outputs are no longer of their length.
-        simulate = simulated_at
-    return runs, simulated
+def _samples_near(simulated: dict[str, np.ndarray], measured: dict[str, np.ndarray]) -> int:
+    """Return how many samples of outputs (N,) an unstable model stays near the record."""
+    near = [len(next(iter(simulated.values())))]
+    for n, y in measured.items():
+        if runs_away(simulated[n], y):
+            far = ~(np.abs(simulated[n]) < _GROWN * _size(y[np.isfinite(y)]))
+            near.append(int(np.argmax(far)))
+    return max(min(near), 2)
 
 
 def runs_away(simulated: np.ndarray, measured: np.ndarray) -> bool:
-    """True if a simulation grows, and far beyond what was measured, which no wrong gain makes it.
+    """Return True if a simulation grows far beyond the measurement, as no wrong gain makes it.
 
     Args:
         simulated: an output (N,).
@@ -198,7 +177,7 @@ def runs_away(simulated: np.ndarray, measured: np.ndarray) -> bool:
 def start_vector(layout: Layout, data: Data, problem: Problem) -> Float[Array, " q"]:
     """Return z at the start values: gains 1, no shift, the model's own initial state, no bias."""
     dtype = data.low.dtype
-    # Fetched once: an entry by itself would be a program of its own, for each of the unknowns.
+    # Fetched at once: each entry by itself would be a program of its own.
     limits = zip(*jax.device_get((data.sign, data.low, data.high)), strict=True)
     z = [
         transforms.to_coordinate(kind, np.asarray(f.start, dtype), *of_one)
@@ -208,7 +187,7 @@ def start_vector(layout: Layout, data: Data, problem: Problem) -> Float[Array, "
     z += [one] * len(layout.gains) + [zero] * layout.shift
     z += [np.asarray(np.log(problem.noise[n].start), dtype) for n in layout.disturbance]
     z += [np.asarray(np.log(problem.filtered_noise[n].start), dtype) for n in layout.filtered]
-    # Zero is the mean of the weak priors, and for the noise's factors the guess as it is.
+    # Zero is the mean of the weak priors, and a factor of one of the noise's guess.
     whole = np.zeros(layout.size, dtype)
     whole[: len(z)] = jax.device_get(z)
     # A linear model without a start of its own begins at zero, as z does.
@@ -218,12 +197,12 @@ def start_vector(layout: Layout, data: Data, problem: Problem) -> Float[Array, "
 
 
 def _initial_states(layout: Layout, data: Data, problem: Problem, z: np.ndarray) -> None:
-    """Enter the model's own initial state (of a whole helicopter its hover), or for one that is not
-    linear the nearest that shows the measured outputs at the first sample of the window."""
+    """Enter the model's own initial state (of a whole helicopter its hover); of a nonlinear model
+    the nearest one with the measured outputs at the first sample of the window."""
     names, places = naming.names(layout.model.State), flight_places(layout)
     values = {n: np.asarray(f.start, z.dtype) for n, f in problem.free.items()}
     for flight, own, (_, m) in zip(data.flights, places, layout.windows, strict=True):
-        # What is known of this flight alone stands over what is free in all of them.
+        # Values that are known of this flight count.
         params = layout.model.Params(**{**data.base, **values, **flight.known})
         by_model = own_start(layout.model, params)
         first = np.array([by_model[n] for n in names])
@@ -231,8 +210,8 @@ def _initial_states(layout: Layout, data: Data, problem: Problem, z: np.ndarray)
         scales = np.array([float(flight.state_scale[n]) for n in layout.states])
         for k, at in enumerate(own.states):
             x0 = first
-            # The residual of a linear model is linear in its initial states: one step finds them
-            # from anywhere. Of others a far start can lie in the valley of another solution.
+            # One step finds the initial states of a linear model from anywhere. Of others a far
+            # start may be in the valley of another solution.
             if not layout.model.linear:
                 x0 = _state_that_shows(layout, params, flight, k * m, first)
             z[at] = x0[[names.index(n) for n in layout.states]] / scales
@@ -244,8 +223,8 @@ def own_start(model: Model, params: Any) -> dict[str, float]:
     start = {n: float(v) for n, v in naming.asdict(model.initial_state(params)).items()}
     if not is_full_nonlinear(model):
         return start
-    # With its tail's side force a helicopter hovers on a bank, with its rotor tilted. From level it
-    # would slide away, and what no output shows would have to be searched for from there.
+    # With the side force of its tail a helicopter hovers at a bank, with its rotor tilted. From
+    # level it would slide away.
     try:
         hover = trim(model, params).state
     except ValueError:  # the start values cannot fly; the optimum may
@@ -254,13 +233,13 @@ def own_start(model: Model, params: Any) -> dict[str, float]:
 
 
 _LINE = 5
-"""samples to which a straight line is fitted for the value at the first"""
+"""samples of the straight line whose value at the first one is taken"""
 
 
 def _state_that_shows(
     layout: Layout, params: Any, flight: FlightData, k: int, first: np.ndarray
 ) -> np.ndarray:
-    """The state (n,) nearest to `first` whose outputs are the measured ones at sample k.
+    """Return the state (n,) nearest to `first` with the measured outputs at sample k.
 
     Three Gauss-Newton steps: outputs are mostly states themselves, or angles of them.
     """
@@ -274,18 +253,16 @@ def _state_that_shows(
         _, _, C, _ = jacobians(layout.model, params, state, inputs)
         outputs = naming.asdict(layout.model.output(params, state, inputs))
         error = np.array([v - float(outputs[n]) for n, v in measured.items()])
-        # The least step: states that no output shows stay where the model puts them.
+        # The shortest step: states without effect on the outputs stay.
         x = x + np.linalg.pinv(np.asarray(C)[rows], rcond=1e-8) @ error
     return x
 
 
 def _at_start(y: np.ndarray) -> float:
-    """The value at the first of the samples, from a few with less noise than one has; NaN where
-    nothing is measured."""
+    """Return the value at the first sample, averaged over a few; NaN where nothing is measured."""
     seen = np.flatnonzero(np.isfinite(y[:_LINE]))
     if seen.size < 3:
-        # Too few for a line that averages anything. A slow sensor's first sample comes later: the
-        # vehicle was near that, rather than at zero.
+        # Too few for a line. The first sample of a slow sensor is later, and nearer than zero.
         seen = seen if seen.size else np.flatnonzero(np.isfinite(y))
         return float(y[seen[0]]) if seen.size else float("nan")
     return float(np.polyval(np.polyfit(seen, y[seen], 1), 0.0))

@@ -7,32 +7,30 @@ from jaxtyping import Array, Float
 from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.dynamics.model import Disturbance
 from heli_jax.identification.estimation.evaluation import Evaluation, deviations, evaluate
+from heli_jax.identification.estimation.levenberg_marquardt import fit_nuisances
 from heli_jax.identification.estimation.multistart import Search
 from heli_jax.identification.estimation.noise_covariance import (
     RelaxedOptimum,
     log_likelihood_of,
     relaxed_from,
 )
-from heli_jax.identification.estimation.starts import finer_noise_guess, noise_guess_at
+from heli_jax.identification.estimation.starts import noise_guess_at
 from heli_jax.identification.unknowns.layout import Noise, Solution, disturbance_limits
 
-# How large gusts are at the start values: what expected standard deviations go with.
 
+def likely_gusts(at: Solution) -> tuple[Float[Array, " q"], Evaluation]:
+    """Return z with the disturbances of the greatest likelihood, all else as it is, and its
+    evaluation.
 
-def likely_gusts(at: Solution, e: Evaluation) -> tuple[Float[Array, " q"], Evaluation]:
-    """z with the disturbances of the greatest likelihood, all else as it is, and what that tells.
-
-    A search may begin a decade off; what a fit may be expected to determine goes with the size.
+    The accuracy to expect of a fit depends on the size, and a search may begin a decade off.
     """
     layout, data, noise, z = at
-    k, places = layout.first_nuisance, [layout.disturbance_at(n) for n in layout.disturbance]
+    places = np.array([layout.disturbance_at(n) for n in layout.disturbance])
     # Without the initial states and biases of the flights, which nobody states: one that begins in
     # a bank is no gust, and weighed as one it made gusts a tenth of what they were.
-    step = np.linalg.lstsq(e.J[:, k:], -e.r)[0] if np.isfinite(e.J).all() else np.zeros(z.size - k)
-    settled = jnp.asarray(z).at[k:].add(jnp.asarray(step, z.dtype))
-    likely = noise_guess_at(layout, data, noise, settled)
-    likely = finer_noise_guess(layout, data, noise, likely)
-    z = jnp.asarray(z).at[jnp.asarray(places)].set(likely[jnp.asarray(places)])
+    settled = fit_nuisances(layout, data, noise, z)
+    likely = noise_guess_at(layout, data, noise, settled, finer=True)
+    z = jnp.asarray(z).at[places].set(likely[places])
     return z, evaluate(layout, data, noise, z)
 
 
@@ -40,16 +38,16 @@ NO_DISTURBANCE = 2.71
 """twice a log-likelihood ratio below which a disturbance is not significant at 5 %: sigma_w = 0 is
 a boundary, where half of the chi-squared with one degree of freedom holds (Self and Liang, 1987)"""
 _SURE = 0.4
-"""sd of log sigma_w below which nobody need ask whether there is a disturbance"""
+"""sd of log sigma_w below which a disturbance is significant without a search without it"""
 _NONE = 30.0
-"""so far below the log of the smallest noise there is no disturbance"""
+"""logarithm by which sigma_w lies below the smallest noise where there is no disturbance"""
 
 
 def significant_disturbances(search: Search, optimum: RelaxedOptimum) -> RelaxedOptimum:
     """Return the optimum with the disturbances that are significant, the others all but zero.
 
-    Where sigma_w goes to zero, tau_w means nothing and the optimiser has no end to come to; the
-    same residuals with sigma_w all but zero are those of output error.
+    Where sigma_w goes to zero tau_w has no effect, and the optimiser does not converge. With
+    sigma_w all but zero the residuals are those of output error.
 
     Args:
         optimum: with all disturbances; the search for it may have been cut short.
@@ -66,7 +64,7 @@ def significant_disturbances(search: Search, optimum: RelaxedOptimum) -> Relaxed
         without, ratio = _without(search, optimum, d)
         if len(candidates) == 1:
             optimum = optimum._replace(ratio=ratio)
-        # Negated: a ratio that is NaN is none that speaks for a disturbance.
+        # Negated: a ratio that is NaN is no evidence of a disturbance.
         if bool(without.best.converged) and not ratio > NO_DISTURBANCE:
             optimum = without.after(optimum)
             absent.append(d)
@@ -81,7 +79,7 @@ def significant_disturbances(search: Search, optimum: RelaxedOptimum) -> Relaxed
 
 
 def with_noise_guess(search: Search, noise: Noise, z: Float[Array, " q"]) -> Float[Array, " q"]:
-    """z with the disturbances from a coarse search about their start values."""
+    """Return z with the disturbances from a coarse search about their start values."""
     layout = search.layout
     for name in layout.disturbance:
         start = np.log(search.problem.noise[name].start)
@@ -90,7 +88,8 @@ def with_noise_guess(search: Search, noise: Noise, z: Float[Array, " q"]) -> Flo
 
 
 def _is_known(search: Search, optimum: RelaxedOptimum, d: Disturbance) -> bool:
-    """True if all parameters of a disturbance are determined, within what a record can show."""
+    """Return True if all parameters of a disturbance are determined, within what a record can
+    show."""
     layout, z = search.layout, optimum.best.z
     e = evaluate(layout, search.data, optimum.noise, z)
     if not (bool(optimum.best.converged) and np.all(np.isfinite(e.J))):
@@ -111,7 +110,7 @@ def _is_known(search: Search, optimum: RelaxedOptimum, d: Disturbance) -> bool:
 def _without(
     search: Search, optimum: RelaxedOptimum, d: Disturbance
 ) -> tuple[RelaxedOptimum, float]:
-    """The optimum without one disturbance, and twice the log-likelihood that it loses."""
+    """Return the optimum without one disturbance, and twice the log-likelihood that it loses."""
     layout, data = search.layout, search.data
     # Far below the smallest noise rather than zero, whose logarithm no z holds.
     smallest = min(float(s) for by_name in optimum.noise.sd for s in by_name.values())

@@ -1,4 +1,4 @@
-"""Everything that one point tells, for what is not compiled."""
+"""Residuals, Jacobian and simulation at one point as NumPy arrays, and linear algebra on them."""
 
 from typing import NamedTuple
 
@@ -17,18 +17,16 @@ NULL = 1e-8
 """part of the largest singular value, of columns of one size, below which the data do not determine
 a direction: the square of that is rounding in float64"""
 _TAKES_PART = 1e-3
-"""part of a unit direction without effect from which on a coordinate is lost with it"""
+"""part of a unit direction without effect from which on a coordinate is not determined either"""
 
 
 class Evaluation(NamedTuple):
-    """Everything that one point tells, as NumPy arrays."""
+    """Residuals, Jacobian and simulation at one point."""
 
     simulated: tuple[dict[str, np.ndarray], ...]
     """with the bias, SI, by flight and output (N,)"""
     raw: tuple[dict[str, np.ndarray], ...]
     """measured - simulated, SI, by flight and output (N,); NaN where nothing is measured"""
-    state_rms: np.ndarray
-    """(flights, states) root mean square of each simulated state"""
     innovations: tuple[Innovations, ...]
     r: np.ndarray
     """(n,) whitened residuals with the rows of the priors"""
@@ -39,15 +37,15 @@ class Evaluation(NamedTuple):
     slopes: np.ndarray
     """their derivatives by their own coordinates"""
     z: np.ndarray
-    """(q,) where it is"""
+    """(q,)"""
 
 
 def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Evaluation:
-    """Residuals and their Jacobian, the simulation, and the named unknowns."""
+    """Evaluate residuals, Jacobian, simulation and named unknowns at a point."""
     at = residual_and_jacobian(layout, data, noise, z)
-    # Output error has simulated on its way; a filter predicts one step ahead, which is no run.
+    # The residuals of output error hold a simulation; those of a filter are one-step predictions.
     outputs = simulated_at(layout, data, z) if at.simulated is None else at.simulated
-    # Fetched all at once: every fetch by itself would wait for the device.
+    # Fetched at once, with one wait for the device.
     outputs, innovations, r, J, values, slopes = jax.device_get(
         (outputs, at.innovations, at.r, at.J, *named(layout, data, z))
     )
@@ -56,20 +54,19 @@ def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) ->
         {n: np.asarray(flight.outputs[n]) - v for n, v in run.items()}
         for flight, run in zip(data.flights, simulated, strict=True)
     )
-    rms = outputs.state_rms
-    return Evaluation(simulated, raw, rms, innovations, r, J, values, slopes, np.asarray(z))
+    return Evaluation(simulated, raw, innovations, r, J, values, slopes, np.asarray(z))
 
 
 def simulated_outputs(
     layout: Layout, data: Data, z: Float[Array, " q"]
 ) -> tuple[dict[str, np.ndarray], ...]:
-    """By flight and output the simulation (N,) with the bias, SI."""
+    """Return by flight and output the simulation (N,) with the bias, SI."""
     return by_output(layout, jax.device_get(simulated_at(layout, data, z)))
 
 
 @jitted
 def named(layout: Layout, data: Data, z: Float[Array, " q"]) -> tuple[Array, Array]:
-    """Values of parameters, gains and time shift [SI], and their slopes by the coordinates."""
+    """Return parameters, gains and time shift [SI], and their derivatives by the coordinates."""
 
     def values(z: Array) -> Array:
         u = unpack(layout, data, z)
@@ -81,10 +78,9 @@ def named(layout: Layout, data: Data, z: Float[Array, " q"]) -> tuple[Array, Arr
 
 
 def deviations(J: np.ndarray) -> np.ndarray:
-    """Standard deviations (q,) of all coordinates from whitened rows (n, q).
+    """Return the standard deviations (q,) of all coordinates from whitened rows (n, q).
 
-    Infinite for a coordinate without effect, and for those that take part in a direction without:
-    what leaves no trace in the rows is not known, rather than known exactly.
+    Infinite for a coordinate without effect, and for those in a direction without effect.
     """
     return combined_deviations(J, np.eye(J.shape[1]), NULL, _TAKES_PART)
 
@@ -92,26 +88,18 @@ def deviations(J: np.ndarray) -> np.ndarray:
 def combined_deviations(
     J: np.ndarray, combinations: np.ndarray, no_effect: float, takes_part: float
 ) -> np.ndarray:
-    """Standard deviations (k,) of combinations of coordinates from whitened rows.
+    """Return the standard deviations (k,) of combinations of coordinates from whitened rows.
 
     Args:
         J: the rows (n, q).
         combinations: (k, q).
         no_effect: part of the largest singular value below which a direction has no effect.
-        takes_part: part of such a direction from which on a combination is lost with it.
+        takes_part: part of such a direction from which on a combination is not determined either.
     """
-    J = np.asarray(J, dtype=np.float64)
-    # A simulation that diverged tells nothing.
+    # A simulation that diverged determines nothing.
     if not np.isfinite(J).all():
         return np.full(len(combinations), np.inf)
-    # Columns of one size, so that what counts as no effect does not hang on units.
-    norms = np.linalg.norm(J, axis=0)
-    norms = np.where(norms > 0, norms, 1.0)
-    # Singular values of J itself and not of J'J, whose small ones, their squares, are rounding.
-    # Those of its triangle are the same, and it has q rows instead of n.
-    _, sizes, right = np.linalg.svd(np.linalg.qr(J / norms, mode="r"))
-    # Fewer rows than unknowns: what is missing are directions without effect.
-    sizes = np.concatenate([sizes, np.zeros(J.shape[1] - sizes.size)])
+    norms, sizes, right = _svd(J)
     kept = sizes > no_effect * sizes[0]
     along = (combinations / norms) @ right.T
     lengths = np.linalg.norm(combinations / norms, axis=1)
@@ -121,25 +109,33 @@ def combined_deviations(
 
 
 def directions(J: np.ndarray, least: float = NULL) -> np.ndarray:
-    """Orthonormal directions (n, k) in which the unknowns move finite rows (n, q).
+    """Return orthonormal directions (n, k) in which the unknowns move finite rows (n, q).
 
     Args:
         least: part of the largest singular value of columns of one size, below which a direction is
-            rounding, or says nothing that the others do not.
+            rounding, or dependent on the others.
     """
-    norms = np.linalg.norm(J, axis=0)
-    J = np.asarray(J, np.float64) / np.where(norms > 0, norms, 1.0)
-    # Singular values of J's triangle are those of J, and it has q rows instead of n.
-    _, sizes, right = np.linalg.svd(np.linalg.qr(J, mode="r"), full_matrices=False)
+    norms, sizes, right = _svd(J)
     seen = sizes > least * max(sizes[0], 1e-300)
-    return J @ (right[seen].T / sizes[seen])
+    return J / norms @ (right[seen].T / sizes[seen])
 
 
 def pseudoinverse(J: np.ndarray) -> np.ndarray:
     """Return the pseudoinverse (q, n) of rows (n, q), with columns brought to one size first."""
-    # The cut is on singular values, and units of the unknowns must not decide what it takes.
+    norms, sizes, right = _svd(J)
+    kept = sizes > NULL * sizes[0]
+    V = right[kept].T / sizes[kept]
+    return V @ (J / norms @ V).T / norms[:, None]
+
+
+def _svd(J: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the norms of the columns of J (n, q), and singular values (q,) and right singular
+    vectors (q, q) of J with columns of size 1, so that units do not matter."""
+    J = np.asarray(J, np.float64)
     norms = np.linalg.norm(J, axis=0)
     norms = np.where(norms > 0, norms, 1.0)
-    # The triangle has the same singular values, and q rows instead of n.
-    Q, R = np.linalg.qr(np.asarray(J, np.float64) / norms)
-    return np.linalg.pinv(R, rcond=NULL) @ Q.T / norms[:, None]
+    # Of J and not of J'J, whose small singular values, the squares, are rounding. The triangle has
+    # the same singular values, and q rows instead of n.
+    _, sizes, right = np.linalg.svd(np.linalg.qr(J / norms, mode="r"))
+    # With fewer rows than unknowns there are directions without effect.
+    return norms, np.concatenate([sizes, np.zeros(J.shape[1] - sizes.size)]), right

@@ -30,14 +30,10 @@ from heli_jax.identification.estimation.kalman import (
     innovations,
 )
 from heli_jax.identification.estimation.noise_scales import (
-    free_scales,
-    not_attenuating,
-    own_at,
-    own_changed,
-    slopes_at,
-    slopes_changed,
-    taken_up,
-    with_own_noise,
+    correction,
+    corrections_at,
+    corrections_changed,
+    first_corrections,
 )
 from heli_jax.identification.estimation.objective import Objective, RowTags
 from heli_jax.identification.estimation.residual import Residuals
@@ -64,15 +60,10 @@ from heli_jax.numerics.white_noise import without_noise
 from heli_jax.simulation.options import SimulationOptions
 from heli_jax.simulation.simulate import simulate
 
-# Outputs that have no noise of a sensor: they were low-passed before they were logged.
-
 
 def noiseless(outputs: Mapping[str, np.ndarray]) -> list[str]:
     """Return the outputs (N,) without sensor noise; NaN is missing."""
     return [n for n, y in outputs.items() if without_noise(y)]
-
-
-# Records of a fitted model with the disturbance drawn anew.
 
 
 _BATCH = 8
@@ -80,7 +71,7 @@ _BATCH = 8
 
 
 def disturbed_records(reached: Solution, u: Unknowns, i: int, keys: Array) -> dict[str, Array]:
-    """By name the outputs (runs, N) with a disturbance drawn for each key."""
+    """Return by name the outputs (runs, N) with a disturbance drawn for each key."""
     layout, drive = reached.layout, driven(reached.layout, reached.data, u, i)
     model, params, dtype = layout.model, drive.params, reached.z.dtype
     first = drive.state if drive.state is not None else model.initial_state(params)
@@ -109,17 +100,17 @@ def disturbed_records(reached: Solution, u: Unknowns, i: int, keys: Array) -> di
 
 
 _FLOOR = 1e-3
-"""The likelihood's row stays real however far the noise falls; the next round has another level."""
+"""least square of the likelihood's row over the count: it stays real however far the noise falls"""
 _BLIND = 1e4
-"""so many times the signal is a noise from which a filter learns nothing"""
+"""times the signal: a noise that makes a filter ignore the measurement"""
 _DIGITS = 1e13
-"""Variance of an innovation over that of the measurement beyond which float64 has no digits left
-for what the measurement says of the state."""
+"""variance of an innovation over that of the measurement beyond which float64 has no digits left"""
 _TOLERANCE = 1e-6
 _FELL = 0.9
-"""fall of the noise (in the log of the variance) past which the likelihood's row shows no more"""
-_ATTENUATES = 0.02
-"""part by which the derivatives by scale errors change, from which on these move with them"""
+"""fall of the noise (in the log of the variance) beyond which the likelihood's row is at its
+floor"""
+_CORRECTED = 0.02
+"""part by which the slope of a correction changes, from which on the parameters move with it"""
 
 
 class FilterError(Objective):
@@ -128,7 +119,7 @@ class FilterError(Objective):
     noise_model = "disturbance"
 
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
-        """The innovations over their sd, and what makes their Jacobian Fisher's information."""
+        """Return the innovations over their sd, and the rows that make J'J Fisher's information."""
         by_flight = filtered_flights(layout, data, noise, u)
         return Residuals(_likelihood_rows(layout, data, noise, u, by_flight), None, by_flight)
 
@@ -156,40 +147,33 @@ class FilterError(Objective):
         return outputs[concentrated:], concentrated
 
     def first_noise(self, problem: Problem, noise: Noise, flights: Sequence[Flight]) -> Noise:
-        """Add the derivatives by free scale errors and by the noise of integrated signals, zero
-        before the first relaxation."""
-        noise = with_own_noise(problem, noise)
-        scales = free_scales(problem.model.input_scales, problem.free)
-        if not scales:
-            return noise
-        return noise._replace(scale_slopes=np.zeros(len(scales), noise.log_variance_ratio.dtype))
+        """Add the corrections, zero before the first relaxation."""
+        return noise._replace(corrections=first_corrections(problem))
 
     def noise_at_start(self, layout: Layout, data: Data, e: Evaluation, noise: Noise) -> Noise:
-        """The noise with the level that the innovations show."""
+        """Return the noise with the level of the innovations."""
         level = innovation_sums(e, noise)[1] / measured_count(data)
-        # An unstable start: the optimiser has to find out of it by the rows themselves.
+        # The start may be unstable.
         level = level if np.isfinite(level) else 0.0
         return noise._replace(log_variance_ratio=np.asarray(level, noise.log_variance_ratio.dtype))
 
     def relax(
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
     ) -> tuple[Float[Array, " q"], Noise]:
-        """All noise changes by one factor, that of the disturbance in z included, so that the
-        optimum stays where it is."""
+        """Scale all noise by one factor, with the disturbance in z, which leaves the optimum where
+        it is."""
         n, e = measured_count(data), evaluate(layout, data, noise, z)
         freedom = n / max(n - layout.determined, 1)
         squares, logs = innovation_sums(e, noise)
         level = np.asarray(logs / n, noise.log_variance_ratio.dtype)
         if not layout.concentrated:
             measured = signal_numbers(layout, data).size
-            slopes = slopes_at(layout, noise, e, measured)
-            own = own_at(layout, data, noise, e, z, measured)
-            return z, noise._replace(log_variance_ratio=level, scale_slopes=slopes, own=own)
-        # The scale of the greatest likelihood, and what the unknowns took from the squares.
+            corrections = corrections_at(layout, data, noise, e, z, measured)
+            return z, noise._replace(log_variance_ratio=level, corrections=corrections)
+        # The most likely scale, with the degrees of freedom of the unknowns.
         factor = np.sqrt(squares / n * freedom)
         for name in layout.sizes:
-            # The filter knows only ratios of noises: with all of them times one factor its gains,
-            # and with them the optimum, stay.
+            # The gains depend on ratios of noises alone, and so does the optimum.
             at = layout.disturbance_at(name)
             z = z.at[at].add(jnp.asarray(np.log(factor), z.dtype))
         sd = tuple(
@@ -199,21 +183,20 @@ class FilterError(Objective):
         return z, Noise(sd, level)
 
     def noise_matters(self, problem: Problem, layout: Layout, before: Noise, after: Noise) -> bool:
-        """Only where priors are weighed against a scale that is concentrated out, where that is far
-        from what it was or the noise fell past what the likelihood's row can show, or where it
-        attenuates scale errors or is itself too small by what the parameters take up."""
+        """Return True where priors are weighed against a scale that is concentrated out, where that
+        is far from what it was or the noise fell past what the likelihood's row can show, or where
+        a correction changed."""
         if layout.concentrated:
             return any(f.prior for f in problem.free.values()) or _is_far(before, after)
         fell = before.log_variance_ratio - after.log_variance_ratio
-        attenuates = slopes_changed(before, after) > _ATTENUATES
-        return bool(fell > _FELL) or attenuates or own_changed(before, after)
+        return bool(fell > _FELL) or corrections_changed(before, after) > _CORRECTED
 
     def log_likelihood(self, layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
         """Return the log-likelihood of the innovations (Schweppe, 1965), at the scale that
         maximises it if that is concentrated out."""
         n = measured_count(data)
         squares, logs = innovation_sums(e, noise)
-        # The sums hold log(s / sd^2): the sd bring the units of the outputs back.
+        # The sums are of log(s / sd^2): the sd restore the units of the outputs.
         for flight, sd in zip(data.flights, noise.sd, strict=True):
             for k, y in flight.outputs.items():
                 logs += 2.0 * float(np.log(sd[k])) * int(np.isfinite(np.asarray(y)).sum())
@@ -222,7 +205,7 @@ class FilterError(Objective):
         return float(-0.5 * (squares + n * np.log(2.0 * np.pi) + logs))
 
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
-        """Each run with a disturbance drawn anew."""
+        """Return the records; each run has a disturbance of its own."""
         return [
             disturbed_records(
                 reached, u, i, jax.random.split(jax.random.fold_in(jax.random.key(seed), i), runs)
@@ -233,18 +216,18 @@ class FilterError(Objective):
     def expected_error(
         self, layout: Layout, data: Data, noise: Noise, e: Evaluation, z: Array
     ) -> dict[str, float]:
-        """By output, the power of the simulation's error over that which disturbance and noise
-        make.
+        """Return by output the power of the simulation's error over that which disturbance and
+        noise explain.
 
-        A filter whose measurements are all but noise never corrects its state: the variance of its
-        innovations is then that of a simulation's error. The program is the one that is compiled.
+        A filter with very noisy measurements never corrects its state: the variance of its
+        innovations is then that of a simulation's error.
         """
         largest: dict[str, float] = {}
         for f in data.flights:
             for n, y in f.outputs.items():
                 size = float(np.sqrt(np.nanmean(np.square(np.asarray(y)))))
                 largest[n] = max(largest.get(n, _BLIND * 1e-300), _BLIND * size)
-        # The same in all flights, as the noise is, so that they share their covariances here too.
+        # The same in all flights, which share their covariances here too.
         blinding = tuple(
             {n: np.asarray(largest[n], np.asarray(s).dtype) for n, s in sd.items()}
             for sd in noise.sd
@@ -257,7 +240,7 @@ class FilterError(Objective):
         for error, innovation, blind_sd, sd in each:
             for n, s in innovation.variance.items():
                 factor = float(scales.get(n, 1.0)) ** 2
-                # Less the noise that was put in; what rounding leaves below zero is none.
+                # Less the noise that was put in, and no less than zero.
                 of_state = np.maximum(np.asarray(s) - float(blind_sd[n]) ** 2 * factor, 0.0)
                 seen = np.isfinite(error[n])
                 with np.errstate(all="ignore"):
@@ -271,7 +254,7 @@ class FilterError(Objective):
         }
 
     def ill_conditioned(self, problem: Problem, e: Evaluation, sd: dict[str, float]) -> bool:
-        """True if the filter has lost its digits: variances below zero, or too large for
+        """Return True if the filter has lost its digits: variances below zero, or too large for
         float64."""
         ratios = np.concatenate(
             [
@@ -285,8 +268,7 @@ class FilterError(Objective):
         return bool(
             not ratios.size
             or not np.isfinite(ratios).all()
-            # An innovation's variance holds that of its measurement: with less the covariance of
-            # the state is none.
+            # The variance of an innovation is at least that of its measurement.
             or ratios.min() < 1.0 - _TOLERANCE
             or ratios.max() > _DIGITS
         )
@@ -307,8 +289,8 @@ class FilterError(Objective):
 
 
 def _is_far(before: Noise, after: Noise) -> bool:
-    """True if the rows' variance was far from 1, so that a search weighed them wrongly against the
-    rows of variances and may have ended early."""
+    """Return True if the rows' variance was far from 1, so that a search weighed them wrongly
+    against the rows of variances and may have ended early."""
     ratios = [
         float(sd[n] / old[n]) for sd, old in zip(after.sd, before.sd, strict=True) for n in sd
     ]
@@ -319,7 +301,7 @@ def _is_far(before: Noise, after: Noise) -> bool:
 def filtered_flights(
     layout: Layout, data: Data, noise: Noise, u: Unknowns
 ) -> tuple[Innovations, ...]:
-    """The innovations of every flight."""
+    """Return the innovations of every flight."""
     together: dict[int, Innovations] = {}
     for group in layout.one_covariance:
         theirs = innovations_together(layout, data, noise, u, group)
@@ -350,19 +332,18 @@ def _filter_arguments(
 def _likelihood_rows(
     layout: Layout, data: Data, noise: Noise, u: Unknowns, by_flight: tuple[Innovations, ...]
 ) -> Array:
-    r"""Rows whose sum of squares is minus twice the log-likelihood but for a constant; zero where
-    nothing is measured.
+    r"""Return rows whose sum of squares is minus twice the log-likelihood but for a constant; zero
+    where nothing is measured.
 
     $e_k/\sqrt{s_k}$, and with the common scale of all noise concentrated out each times
     $\exp(\tfrac12(\overline{\log s} - level))$; else one row more, whose square is
     $N(1 + \overline{\log s} - level)$.
 
-    These alone would hold half of what the variances tell ($\tfrac14 s'^2/s^2$ of $\tfrac12$),
-    and the optimiser would go twice as far as it should along the noise. As many rows again, zero
-    themselves, have the derivative $\tfrac12 (s'_k/s_k - \overline{s'/s})$: with them J'J is
-    Fisher's information (Mehra, 1970; Maine and Iliff, 1985, leave that part out). The mean is
-    taken off since it is known from elsewhere: with the scale concentrated out it tells nothing,
-    else the one row more tells the same of it.
+    These rows have half of the variances' information ($\tfrac14 s'^2/s^2$ of $\tfrac12$), and
+    the optimiser would take twice the step along the noise. As many rows again, zero themselves,
+    have the derivative $\tfrac12 (s'_k/s_k - \overline{s'/s})$: with them J'J is Fisher's
+    information (Mehra, 1970; Maine and Iliff, 1985, leave that part out). The mean is taken off:
+    with the scale concentrated out it has no information, else the additional row has it.
     """
     y, sd = measured_signals(layout, data, noise)
     at = signals(layout)
@@ -380,7 +361,7 @@ def _likelihood_rows(
         rows, last = rows * jnp.exp(0.5 * above), []
     else:
         # N mean(log s) as a square: the 1 keeps it above zero, where the root has a derivative.
-        above += (taken_up(noise, u) - not_attenuating(layout, noise, u)) / count
+        above += correction(layout, noise, u) / count
         last = [jnp.sqrt(count * jnp.maximum(1.0 + above, _FLOOR))[None]]
     log_s = jnp.where(seen, log_s - mean, 0.0)
     # The last rows are zero themselves, with the derivative of what is subtracted left out.
@@ -388,9 +369,9 @@ def _likelihood_rows(
 
 
 def innovation_sums(e: Evaluation, noise: Noise) -> tuple[float, float]:
-    """Sums over all measurements of e^2/s and of log(s/sd^2)."""
+    """Return the sums over all measurements of e^2/s and of log(s/sd^2)."""
     squares, logs = 0.0, 0.0
-    with np.errstate(all="ignore"):  # an unstable start gives what it gives, and is judged later
+    with np.errstate(all="ignore"):  # of an unstable start
         for flight, sd in zip(e.innovations, noise.sd, strict=True):
             for n, s in flight.variance.items():
                 squares += float(np.nansum(flight.error[n] ** 2 / s))
@@ -401,14 +382,12 @@ def innovation_sums(e: Evaluation, noise: Noise) -> tuple[float, float]:
 OBJECTIVE = FilterError()
 
 
-# Predictions some seconds ahead, from the state that a filter has estimated by then.
-#
-# A simulation of an unstable vehicle leaves any record, and one step ahead everything is predicted
-# well. In between stands what such a model can be judged by.
+# Predictions some seconds ahead, from the state that a filter has estimated: the simulation of an
+# unstable vehicle leaves any record, and one step ahead any model predicts well.
 
 
 SECONDS = 2.0
-"""ahead of the filter at most; each window of so long begins with the filter's prediction"""
+"""length of a window, which begins with the filter's prediction"""
 
 
 class Ahead(NamedTuple):
@@ -417,12 +396,12 @@ class Ahead(NamedTuple):
     predicted: dict[str, Float[np.ndarray, " N"]]
     """SI"""
     variance: dict[str, Float[np.ndarray, " N"]]
-    """of the error, as disturbance and noise make it"""
+    """of the error, by disturbance and noise"""
 
 
 def predictions_ahead(at: Solution) -> tuple[Ahead, ...]:
-    """By flight what is predicted in windows from the filter's state at the begin of each, where a
-    fit by filter error ended."""
+    """Return by flight the predictions in windows from the filter's state at the begin of each, at
+    the end of a fit by filter error."""
     # Outside of what is compiled: how many samples that are decides where windows begin.
     samples = tuple(max(1, round(SECONDS / float(flight.dt))) for flight in at.data.flights)
     return tuple(
@@ -452,7 +431,7 @@ def errors_ahead(
     options: SimulationOptions,
     every: int,
 ) -> Innovations:
-    """Measured less predicted in windows of so many samples, and the variance of that.
+    """Return measured less predicted in windows of `every` samples, and its variance.
 
     Args:
         positional: model, params, inputs, measured and sd, as of `kalman.innovations`.

@@ -1,11 +1,11 @@
-"""Kalman filters: what each measurement says beyond the ones before it.
+"""Kalman filters: one-step predictions of the measurements, and their errors.
 
 Linear models get the exact discrete filter. Others get the extended one: the model is linearised
 anew in every step and the linearised one is followed exactly (Ozaki's local linearisation), so
 that on a linear model both are the same; models without fast modes go by explicit steps
 (`_moments_after`). The process noise is the exact discrete one, the measurement noise white and
-independent between outputs; outputs of one sample are taken one after another, so nothing is
-inverted. A measurement that is NaN is skipped.
+independent between outputs; outputs of one sample are taken one after another, so no matrix
+is inverted. A measurement that is NaN is skipped.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -34,7 +34,7 @@ type Estimate = tuple[Float[Array, " n"], Float[Array, "n n"]]
 
 
 class Drive(NamedTuple):
-    """A model, what drives it along one record, and what is measured of it."""
+    """A model, its inputs along one record, and the outputs that are measured."""
 
     model: Model
     params: Any
@@ -42,9 +42,9 @@ class Drive(NamedTuple):
     """the model's Inputs, arrays (N,)"""
     options: SimulationOptions
     linear: tuple[bool, ...]
-    """of each input whether it moves between samples; () where none does"""
+    """by input True if it moves between samples; () if none does"""
     rows: Array
-    """where the measured outputs stand among the model's (p,)"""
+    """(p,) numbers of the measured outputs among the model's"""
 
 
 class Filter(NamedTuple):
@@ -52,17 +52,17 @@ class Filter(NamedTuple):
 
     samples: Any
     measure: Callable[[Array, Any], tuple[Array, Array]]
-    """(state, sample) -> C (p, n) and what C x leaves of the predicted outputs (p,)"""
+    """(state, sample) -> C (p, n), and the predicted outputs less C x (p,)"""
     move: Callable[[Array, Array, Any], Estimate]
     """(state, its covariance, sample) -> both at the next sample"""
 
 
 # Mean and covariance of a state between samples by explicit steps, for models without fast modes.
 #
-# A local linearisation takes an exponential of a matrix in every step, which holds whatever the
-# modes are, and its equations stay as they are at the step's begin: an error of the second order
-# where inputs move. Runge and Kutta's classical method follows the same moments to the fourth order
-# for a twentieth of the arithmetic; a mode that is fast against the step would make it diverge.
+# A local linearisation takes a matrix exponential in every step and is stable for any mode, but
+# keeps the equations of the step's begin: an error of second order where inputs move. The classical
+# Runge-Kutta method integrates the same moments to fourth order at a twentieth of the cost; with a
+# mode that is fast against the step it diverges.
 
 
 def _moments_after(
@@ -71,7 +71,7 @@ def _moments_after(
     moments: Estimate,
     part: Segment,
 ) -> Estimate:
-    """The moments after one step: x' = f(x, u), P' = A P + P A' + diag(g^2), A = df/dx at x.
+    """Return the moments after one step: x' = f(x, u), P' = A P + P A' + diag(g^2), A = df/dx at x.
 
     Args:
         rates: f, of a state (n,) and Inputs, per second.
@@ -88,8 +88,7 @@ def _moments_after(
         if part.slope is not None:
             u = jax.tree.map(lambda v, slope: v + slope * (share * h), u, part.slope)
         f, along = jax.linearize(lambda x: rates(x, u), x)
-        # A P column by column: a column of P is a direction, and A itself, mostly zeros, is not
-        # needed.
+        # A P column by column: A itself, mostly zeros, is not needed.
         AP = jax.vmap(along, in_axes=1, out_axes=1)(P)
         return f, AP + AP.T + spread
 
@@ -109,28 +108,17 @@ def _moments_after(
 # The extended filter: a model linearised anew at every estimate (Ozaki's local linearisation).
 
 
-class _Equations(NamedTuple):
-    """A model's equations over vectors, to be linearised anew at every estimate."""
-
-    rates: Callable[[Array, Any], Array]
-    """(state (n,), Inputs) -> (n,), per second"""
-    intensity: Float[Array, " n"]
-    """of the process noise, see `Model.noise_intensity`"""
-    explicit: bool
-    """see `Model.explicit`"""
-
-
 def _local(drive: Drive) -> Filter:
-    """The extended filter: the model linearised at every estimate (Ozaki, 1985)."""
+    """Return the extended filter: the model linearised at every estimate (Ozaki, 1985)."""
     model, params, inputs, options, linear, measured = drive
     k = jnp.arange(jax.tree.leaves(inputs)[0].shape[0])
     dtype = jax.tree.leaves(inputs)[0].dtype
     dt = jnp.asarray(options.dt, dtype)
     delays = delays_of(model, params, options.delay, dt)
-    # What is measured is measured with the inputs that act at the samples themselves.
+    # Outputs are measured with the inputs that act at the samples themselves.
     acting = inputs if delays is None else delayed(inputs, delays, k, linear)
-    # A late sample arrives within an interval: before it the one before it still acts. The lengths
-    # of the parts are the same in all intervals, so they are no part of a sample.
+    # A delayed sample takes effect within an interval, before which the previous one acts. The
+    # lengths of the parts are the same in all intervals, so they are no part of a sample.
     lengths, held, slopes = zip(*segments(inputs, dt, delays, k, linear), strict=True)
 
     def rates(x: Array, u: Any) -> Array:
@@ -143,7 +131,19 @@ def _local(drive: Drive) -> Filter:
     noise = model.noise_intensity
     none = jnp.zeros(len(naming.names(model.State)), dtype)
     intensity = none if noise is None else naming.ravel(noise(params), dtype)
-    equations = _Equations(rates, intensity, model.explicit)
+
+    def along(estimate: Estimate, part: Segment) -> Estimate:
+        """Return the estimate after a part of an interval, linearised in each of its substeps."""
+        h = part.length / options.substeps
+
+        def step(estimate: Estimate, j: Array) -> tuple[Estimate, None]:
+            now = part.inputs
+            if part.slope is not None:
+                now = jax.tree.map(lambda u, slope: u + slope * (j * h), now, part.slope)
+            after = _moments_after if model.explicit else _linearised_after
+            return after(rates, intensity, estimate, Segment(h, now, part.slope)), None
+
+        return jax.lax.scan(step, estimate, jnp.arange(options.substeps, dtype=dtype))[0]
 
     def measure(x: Array, sample: Any) -> tuple[Array, Array]:
         u = sample[1]
@@ -154,35 +154,25 @@ def _local(drive: Drive) -> Filter:
         held, _, slopes = sample
         estimate = (x, P)
         for part in zip(lengths, held, slopes, strict=True):
-            estimate = _along(equations, estimate, Segment(*part), options.substeps)
+            estimate = along(estimate, Segment(*part))
         return estimate
 
     return Filter((held, acting, slopes if linear else (None,) * len(held)), measure, move)
 
 
-def _along(equations: _Equations, estimate: Estimate, part: Segment, substeps: int) -> Estimate:
-    """The estimate after a part of an interval, linearised anew in each of its substeps."""
-    h = part.length / substeps
-
-    def step(estimate: Estimate, j: Array) -> tuple[Estimate, None]:
-        now = part.inputs
-        if part.slope is not None:
-            now = jax.tree.map(lambda u, slope: u + slope * (j * h), now, part.slope)
-        return _step(equations, estimate, Segment(h, now, part.slope)), None
-
-    return jax.lax.scan(step, estimate, jnp.arange(substeps, dtype=estimate[0].dtype))[0]
-
-
-def _step(equations: _Equations, estimate: Estimate, part: Segment) -> Estimate:
-    """The estimate one step on, along the model linearised at its begin."""
-    (x, P), (rates, intensity, explicit) = estimate, equations
-    if explicit:
-        return _moments_after(rates, intensity, estimate, part)
+def _linearised_after(
+    rates: Callable[[Array, Any], Array],
+    intensity: Float[Array, " n"],
+    moments: Estimate,
+    part: Segment,
+) -> Estimate:
+    """Return the moments after one step of the model linearised at its begin; arguments as of
+    `_moments_after`."""
+    x, P = moments
     n, A, f = x.shape[0], jax.jacfwd(rates)(x, part.inputs), rates(x, part.inputs)
     if part.slope is not None:
-        # Time is a state more, whose rate is 1 and which is certain: the column of derivatives by
-        # time then makes the step of a linear model exact (local linearisation of an equation that
-        # depends on time).
+        # Time is one more state, of rate 1 and without variance: its column of derivatives makes
+        # the step of a linear model exact.
         _, by_time = jax.jvp(lambda u: rates(x, u), (part.inputs,), (part.slope,))
         A = jnp.pad(A, (0, 1)).at[:n, n].set(by_time)
         f, intensity = jnp.pad(f, (0, 1), constant_values=1.0), jnp.pad(intensity, (0, 1))
@@ -195,7 +185,7 @@ def _step(equations: _Equations, estimate: Estimate, part: Segment) -> Estimate:
 _ONLY_SIMULATE = (
     "solver", "controller", "adjoint", "max_steps", "key", "block", "feedback", "events",
 )  # fmt: skip
-"""options of a simulation that mean nothing to a filter"""
+"""options of a simulation that a filter does not have"""
 
 
 class Innovations(NamedTuple):
@@ -204,7 +194,7 @@ class Innovations(NamedTuple):
     error: dict[str, Float[Array, " N"] | np.ndarray]
     """measured - predicted from all samples before, SI"""
     variance: dict[str, Float[Array, " N"] | np.ndarray]
-    """of that error, as the filter has it"""
+    """of that error, by the filter"""
 
 
 def innovations(
@@ -242,8 +232,7 @@ def innovations(
         y, now = sample
         estimate, innovation = corrected(filter_, carry, R, y, now)
         x, P = filter_.move(*estimate, now)
-        # Phi P Phi' is symmetric but for rounding; the corrections, symmetric themselves, would
-        # never take the difference away again.
+        # Phi P Phi' is symmetric but for rounding, which the corrections would keep.
         return (x, 0.5 * (P + P.T)), innovation
 
     return by_name(measured, *jax.lax.scan(step, (x, P), (y, filter_.samples))[1])
@@ -269,7 +258,7 @@ def begun(
     x0 = model.initial_state(params) if begin is None else begin
     dtype = jax.tree.leaves(inputs)[0].dtype
     estimate = naming.ravel(x0, dtype), first_covariance(model, params, dtype)
-    # Only what is measured: an output more would cost a correction a sample.
+    # Only measured outputs: each costs a correction a sample.
     rows = jnp.asarray([naming.names(model.Outputs).index(n) for n in measured])
     y = jnp.stack(list(measured.values()), axis=1)
     R = jnp.stack([jnp.asarray(sd[n], dtype) ** 2 for n in measured])
@@ -285,13 +274,13 @@ def by_name(names: Iterable[str], errors: Array, variances: Array) -> Innovation
 
 
 def first_covariance(model: Model, params: Any, dtype: DTypeLike) -> Float[Array, "n n"]:
-    """Covariance of the state at the first sample (P0)."""
+    """Return the covariance of the state at the first sample (P0)."""
     sds = initial_sd_of(model, params, dtype)
     return correlation_of(model, params, dtype) * sds[:, None] * sds[None, :]
 
 
 def filter_of(drive: Drive) -> Filter:
-    """The exact filter of a linear model, else the extended one."""
+    """Return the exact filter of a linear model, else the extended one."""
     model, params, options = drive.model, drive.params, drive.options
     if not model.linear:
         return _local(drive)
@@ -307,8 +296,7 @@ def filter_of(drive: Drive) -> Filter:
         x = jnp.sum(Ad * x[None, :], axis=1) + now[0]
         return x, product(product(Ad, P), Ad.T) + Q
 
-    # The inputs' part of all samples at once: one matrix product. C stays, so that no step
-    # differentiates the outputs.
+    # The inputs' part of all samples is one matrix product. C is constant.
     return Filter((U @ B.T, acting @ D.T), lambda x, now: (C, now[1]), move)
 
 

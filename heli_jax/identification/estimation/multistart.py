@@ -1,10 +1,8 @@
-"""Runs of the optimiser from one or several starts, within bounds."""
+"""Runs of the optimiser from one or several starts."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -15,8 +13,8 @@ from heli_jax.identification.estimation.levenberg_marquardt import (
     optimise,
 )
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns import transforms as coordinates
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, within_bounds
+from heli_jax.identification.unknowns import transforms
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise
 
 Progress = Callable[[str], None]
 
@@ -51,16 +49,11 @@ _GOOD = 10.0
 
 
 class Search:
-    """The optimiser over a problem: log coordinates first, bounded ones where that leaves them.
-
-    An optimum inside the bounds is the same in any coordinates; the bounded ones are needed, and
-    compiled, only where the free optimum lies outside.
-    """
+    """The optimiser over a problem."""
 
     def __init__(self, problem: Problem, layout: Layout, data: Data, max_steps: int) -> None:
         self.problem, self.layout, self.data = problem, layout, data
         self.max_steps = max_steps
-        self.bounded = within_bounds(layout, problem)
 
     def run(
         self,
@@ -68,9 +61,9 @@ class Search:
         points: Float[Array | np.ndarray, "s q"],
         progress: Progress | None = None,
         *,
-        known: tuple[Array, Array] | None = None,
+        known: tuple[Array | np.ndarray, Array | np.ndarray] | None = None,
     ) -> list[Optimum]:
-        """An optimum for each start, all in the coordinates of `layout`.
+        """Return an optimum for each start.
 
         Args:
             progress: called with a sentence after each of several starts.
@@ -80,46 +73,31 @@ class Search:
         # has converged, took four times as long as this, and had to be compiled besides.
         runs = []
         for i, z in enumerate(np.asarray(points)):
-            runs.append(self._run(noise, z, known if i == 0 else None))
+            run = optimise(
+                self.layout,
+                self.data,
+                noise,
+                z,
+                self.max_steps,
+                held=self._held,
+                known=known if i == 0 else None,
+            )
+            # An optimiser can converge where the model explains nothing: its gradient is zero
+            # there. The cost is a mean over the measured numbers, as that of no model is.
+            if not run.cost <= _GOOD:
+                nothing = self.misfit_of_nothing(noise) / measured_count(self.data)
+                run = run._replace(converged=run.converged and run.cost <= 1.5 * nothing + _GOOD)
+            runs.append(run)
             if progress is not None and len(points) > 1:
                 progress(f"{i + 1} of {len(points)} starts done")
         return runs
 
-    def _run(self, noise: Noise, start: np.ndarray, known: tuple[Array, Array] | None) -> Optimum:
-        def optimum(layout: Layout, z: Array | np.ndarray) -> Optimum:
-            first = known if layout is self.layout else None
-            end = optimise(
-                layout, self.data, noise, z, self.max_steps, held=self._held, known=first
-            )
-            # z stays on the device, from where the next program takes it.
-            return jax.device_get(end)._replace(z=jnp.asarray(end.z))
-
-        run = optimum(self.layout, start)
-        # An optimiser can converge where the model explains nothing: its gradient is zero there.
-        # The cost is a mean over the measured numbers, as that of no model is.
-        if not run.cost <= _GOOD:
-            nothing = self.misfit_of_nothing(noise) / measured_count(self.data)
-            run = run._replace(converged=run.converged & (run.cost <= 1.5 * nothing + _GOOD))
-        if self.bounded.kinds == self.layout.kinds:
-            return run
-        values = named_values(self.layout, self.data, run.z)
-        left = [
-            n
-            for n, f in self.problem.free.items()
-            if np.isfinite(values[n]) and not coordinates.inside(f, values[n])
-        ]
-        if not left:
-            return run
-        # A run that left its bounds starts again in coordinates that cannot leave them.
-        run = optimum(self.bounded, self._convert(start, self.layout, self.bounded))
-        return run._replace(z=self._convert(run.z, self.bounded, self.layout))
-
     @property
     def _held(self) -> np.ndarray | None:
-        """Mask of the unknowns that the optimiser keeps; None if it moves all."""
+        """Return (q,) True for the unknowns that stay at their start; None if all move."""
         layout = self.layout
-        # Rows without initial states would leave these to their weak priors, which lead to zero:
-        # a rotor that stands still, from where no search in time comes back.
+        # No row of a spectrum has initial states: their weak priors would lead them to zero, a
+        # rotor that stands still, from where no search in time comes back.
         if layout.model.linear or layout.noise_model != "spectrum":
             return None
         return np.arange(layout.size) >= layout.first_nuisance
@@ -127,22 +105,6 @@ class Search:
     def misfit_of_nothing(self, noise: Noise) -> float:
         """Return the sum of squares of a model without any response."""
         return sum_of_squares([f.outputs for f in self.data.flights], noise)
-
-    def _convert(self, z: Array | np.ndarray, old: Layout, new: Layout) -> Array:
-        """The same point in another layout's coordinates; a value at a bound is moved inside."""
-        z = jnp.asarray(z)
-        values = named_values(old, self.data, z)
-        for i, (name, free) in enumerate(self.problem.free.items()):
-            value = values[name]
-            low, high = (float(b) for b in coordinates.limits(free))
-            if np.isfinite(low) and np.isfinite(high):
-                # At a bound itself the bounded coordinate is infinite.
-                edge = 1e-9 * (high - low)
-                value = min(max(value, low + edge), high - edge)
-            limits = (self.data.sign[i], self.data.low[i], self.data.high[i])
-            x = jnp.asarray(value, z.dtype)
-            z = z.at[i].set(coordinates.to_coordinate(new.kinds[i], x, *limits))
-        return z
 
 
 def sum_of_squares(signals: Sequence[Mapping[str, Array | np.ndarray]], noise: Noise) -> float:
@@ -158,17 +120,17 @@ def sum_of_squares(signals: Sequence[Mapping[str, Array | np.ndarray]], noise: N
 def named_values(
     layout: Layout, data: Data, z: Float[Array | np.ndarray, " q"]
 ) -> dict[str, float]:
-    """The free parameters' values at z, by name, SI."""
+    """Return the values of the free parameters at z, by name, SI."""
     at, sign, low, high = (np.asarray(v) for v in (z, data.sign, data.low, data.high))
     return {
-        n: float(coordinates.to_value(kind, at[i], sign[i], low[i], high[i]))
+        n: float(transforms.to_value(kind, at[i], sign[i], low[i], high[i]))
         for i, (n, kind) in enumerate(zip(layout.free, layout.kinds, strict=True))
     }
 
 
 def table(layout: Layout, data: Data, runs: list[Run], chosen: Run) -> tuple[StartRow, ...]:
-    """Start, end and cost of every run: the chosen one first, then by reason, best first; equal
-    optima of one reason share a number."""
+    """Return a row for each run: the chosen one first, then by reason, best first; equal optima of
+    one reason share a number."""
     reasons = list(dict.fromkeys(run.reason for run in runs))
     rows, optimum, last = [], 0, None
     for run in sorted(runs, key=lambda run: (reasons.index(run.reason), rank(run.optimum))):
@@ -194,7 +156,7 @@ def table(layout: Layout, data: Data, runs: list[Run], chosen: Run) -> tuple[Sta
 
 
 def rank(run: Optimum) -> tuple[bool, float]:
-    """Sort key of runs: those that converged first, then by cost."""
+    """Return the sort key of a run: those that converged first, then the lowest cost."""
     # False sorts before True.
     return not bool(run.converged), _cost(run)
 

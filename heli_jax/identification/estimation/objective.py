@@ -1,10 +1,9 @@
 """The objective that a method of estimation minimises, and what follows from it.
 
-A method is one class: its rows and what they are (tags), the noise and how it is relaxed, the
-likelihood, and the records that a bootstrap draws. The rest of the package asks only this: the
-optimiser squares and sums the rows, identifiability and intervals come from their Jacobian. The
-defaults are those of a simulation against samples with white noise. Methods are entered in
-`heli_jax.identification.methods`.
+A method is one class: its rows and their tags, the noise and its relaxation, the likelihood, and
+the records of a bootstrap. The optimiser sums the squares of the rows; identifiability and
+intervals come from their Jacobian. The defaults are those of a simulation against samples with
+white noise. Methods are entered in `heli_jax.identification.methods`.
 """
 
 import abc
@@ -54,21 +53,19 @@ class Objective(abc.ABC):
     """A method of estimation. It has no state: there is one object of each."""
 
     noise_model: ClassVar[NoiseModel] = "white"
-    """what the likelihood takes the noise for. 'white': a simulation against samples, white noise
-    of each signal. 'disturbance': one-step predictions, with a disturbance that is estimated and
-    one white noise of each output. 'spectrum': numbers at frequencies, weighed by a spectrum that
-    is estimated; initial states and biases have no part in the rows"""
+    """the noise of the likelihood. 'white': a simulation against samples, white noise of each
+    signal. 'disturbance': one-step predictions, with a disturbance that is estimated and one white
+    noise of each output. 'spectrum': numbers at frequencies over a spectrum that is estimated,
+    without initial states and biases"""
     fits_responses: ClassVar[bool] = False
     """True if frequency responses are fitted, as `Problem.frequency` states them"""
-
-    # What the method takes.
 
     def refusal(self, problem: Problem) -> str | None:
         """Return why the method cannot solve a problem and what can; None where it can."""
         return None
 
     def flight_facts(self, problem: Problem, flights: Sequence[Flight]) -> tuple[Any, ...]:
-        """Return what has to be known of each flight before anything is traced; hashable."""
+        """Return by flight, hashable, what the method needs before a trace."""
         return ()
 
     def instrumented(
@@ -83,15 +80,13 @@ class Objective(abc.ABC):
         all noise is concentrated out of the likelihood instead."""
         return (), False
 
-    # Its rows.
-
     @abc.abstractmethod
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
         """Return the rows of the measurements, divided by the noise; traced, and differentiated
         forwards."""
 
     def tags(self, layout: Layout, data: Data, count: int) -> RowTags:
-        """Return what the first `count` rows are: all that `residuals` returns."""
+        """Return the tags of the `count` rows that `residuals` returns."""
         numbers = signal_numbers(layout, data)
         flights = np.array([i for i, _ in signals(layout)])
         begins = np.searchsorted(numbers, np.arange(flights.size))
@@ -103,33 +98,30 @@ class Objective(abc.ABC):
             tags[0, numbers.size :] = np.repeat(np.arange(len(defects)), defects)
         return RowTags(tags[0], tags[1], tags[2], np.arange(count) < numbers.size)
 
-    # Its noise.
-
     def first_noise(self, problem: Problem, noise: Noise, flights: Sequence[Flight]) -> Noise:
-        """Return the first guess of the noise as the method needs it, from standard deviations by
-        flight and output; of flights that are fitted or held out."""
+        """Return the first guess of the noise as the method needs it, from sds by flight and
+        output."""
         return noise
 
     def noise_at_start(self, layout: Layout, data: Data, e: Evaluation, noise: Noise) -> Noise:
-        """Return the noise with what an evaluation at a start shows of it; the same object where
-        it shows nothing."""
+        """Return the noise after an evaluation at a start; the same object if it is unchanged."""
         return noise
 
     def data_at_start(self, data: Data) -> Data:
-        """Return the data of the first search, where those measured would mislead it."""
+        """Return the data of the first search, if others than those measured."""
         return data
 
     def noise_of_check(self, layout: Layout, data: Data, noise: Noise) -> Noise:
-        """Return the noise by which start values are judged before a fit; the same object unless
-        the fit ends with another."""
+        """Return the noise of a check at the start values; the same object unless the fit ends with
+        another."""
         return noise
 
     def relax(
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
     ) -> tuple[Float[Array, " q"], Noise]:
-        """Return z, and the noise that the residuals show there."""
+        """Return z, and the noise of the residuals there."""
         n = measured_count(data)
-        # The unknowns fit part of the noise, which is missing in the residuals of every signal.
+        # The unknowns fit part of the noise of every signal.
         freedom = n / max(n - layout.determined, 1)
         e = evaluate(layout, data, noise, z)
         sd = [dict(by_output) for by_output in noise.sd]
@@ -150,10 +142,8 @@ class Objective(abc.ABC):
     def finish(
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
     ) -> Float[Array, " q"]:
-        """Return z at the end of a search, with the unknowns that have no part in the rows."""
+        """Return z at the end of a search, with the unknowns that are in no row."""
         return z
-
-    # Its likelihood.
 
     def log_likelihood(self, layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
         """Return the log-likelihood in SI units of the outputs, at the most likely noise where
@@ -168,7 +158,7 @@ class Objective(abc.ABC):
         """Return the log density of the rows but for a constant; traced. Scales that are estimated
         are integrated out under Jeffreys' prior."""
         # The integral over sd of sd^-(n+1) exp(-S / (2 sd^2)) is proportional to S^(-n/2). Rows
-        # of missing samples are zero: they add nothing to S, and n leaves them out.
+        # of missing samples are zero, and n does not count them.
         counts = [jnp.sum(jnp.isfinite(y)) for f in data.flights for y in f.outputs.values()]
         n = jnp.stack(counts).astype(rows.dtype)
         if self.noise_model == "white":
@@ -182,8 +172,6 @@ class Objective(abc.ABC):
         """Return how many independent numbers the noise is estimated from."""
         return measured_count(data)
 
-    # Records of its model, and how it is judged.
-
     @abc.abstractmethod
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
         """Return by flight and output the signals without bias and noise at `reached`, where the
@@ -192,26 +180,26 @@ class Objective(abc.ABC):
     def expected_error(
         self, layout: Layout, data: Data, noise: Noise, e: Evaluation, z: Array
     ) -> dict[str, float] | None:
-        """Return by output the power of the simulation's error over the power that disturbance and
-        noise explain; None where the simulation has to explain the record by itself."""
+        """Return by output the power of the simulation's error over that which disturbance and
+        noise explain; None without a disturbance."""
         return None
 
     def ill_conditioned(self, problem: Problem, e: Evaluation, sd: dict[str, float]) -> bool:
-        """Return True if the numbers at the optimum are rounding; sd of the measurement noise, SI,
-        by 'flight/output'."""
+        """Return True if the evaluation is rounding; sd: of the measurement noise, SI, by
+        'flight/output'."""
         return False
 
     def response_agreement(
         self, layout: Layout, data: Data, noise: Noise, z: Array
     ) -> ResponseAgreement | None:
-        """Return how modelled and measured frequency responses agree, where these are fitted."""
+        """Return the agreement of modelled and measured frequency responses, if these are
+        fitted."""
         return None
 
     def findings(
         self, at: Solution, e: Evaluation, names: Sequence[str], ill: bool
     ) -> list[Finding]:
-        """Return what a reader should know of the method's own assumptions; `ill` if the numbers
-        are rounding."""
+        """Return findings on the assumptions of the method; `ill` if the evaluation is rounding."""
         return []
 
 
@@ -221,7 +209,6 @@ def errors_of(layout: Layout, e: Evaluation) -> list[Float[np.ndarray, " n"]]:
 
 
 def noise_unknowns(layout: Layout) -> int:
-    """Return how many standard deviations of measurement noise are estimated beside z."""
-    # They count in AIC and BIC: models that need different noises differ in unknowns. A smooth
-    # spectrum is not counted, and each candidate model has its own.
+    """Return the number of sds of measurement noise that are estimated beside z."""
+    # They count in AIC and BIC. A smooth spectrum does not, and each candidate model has its own.
     return len(signals(layout)) if layout.noise_model == "white" else int(layout.concentrated)

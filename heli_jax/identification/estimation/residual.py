@@ -1,4 +1,4 @@
-"""The residual vector that fit, identifiability and uncertainty differentiate.
+"""The residual vector, and its Jacobian.
 
 The rows of the measurements are the method's (`Objective.residuals`); those of the priors,
 (value - mean) / sd, follow, then those of the weak priors.
@@ -18,7 +18,7 @@ from heli_jax.numerics.jitted import jitted
 
 
 class Residuals(NamedTuple):
-    """Rows of the measurements, and what was simulated or predicted for them."""
+    """Rows of the measurements, and the simulation or prediction behind them."""
 
     rows: Float[Array, " n"]
     """whitened; zero where nothing is measured"""
@@ -29,9 +29,8 @@ class Residuals(NamedTuple):
 
 
 # Derivatives of many windows at once. An initial state has an effect in its own window alone, an
-# input's offset in its own flight. Unknowns that share no row are differentiated along one common
-# direction ("colouring": Curtis, Powell and Reid, 1974), and their columns separated afterwards by
-# the rows that each can reach.
+# input's offset in its own flight. Unknowns without a common row are differentiated along one
+# direction (colouring: Curtis, Powell and Reid, 1974), and their columns separated by their rows.
 
 
 _NONE = -2
@@ -44,24 +43,23 @@ def _colours(layout: Layout) -> tuple[Int[np.ndarray, " q"], Int[np.ndarray, " q
 
     Groups are the windows, then the signals, then the flights.
     """
-    # One window has no neighbour to share directions with. All rows of a filter hang on every
-    # unknown, through the scale that is concentrated out.
+    # All rows of a filter depend on every unknown, through the scale that is concentrated out.
     windows = sum(count for count, _ in layout.windows)
     if layout.noise_model != "white" or windows < 2:
         return None
     states, shared = len(layout.states), layout.first_nuisance
     outputs = sorted({n for names in layout.outputs for n in names})
-    # Parameters have an effect in every row: each has its own direction.
+    # Parameters have an effect in every row.
     colour, group = np.arange(layout.size), np.full(layout.size, -1)
     window, signal = 0, windows
     each = zip(flight_places(layout), layout.outputs, strict=True)
     for f, (places, names) in enumerate(each, windows + sum(map(len, layout.outputs))):
         k = np.arange(len(places.states))[:, None]
-        # A defect hangs on the window before it and the one after: two sets of directions.
+        # A defect depends on the windows before and after it: two sets of directions.
         side = k % 2 if layout.continuity is not None else 0
         colour[places.states] = shared + side * states + np.arange(states)
         group[places.states] = window + k
-        # Windows and outputs of other flights share these directions: no row hangs on both.
+        # Windows and outputs of other flights share these directions: no row depends on both.
         if layout.bias:
             at = np.array([outputs.index(n) for n in names])
             colour[places.biases] = shared + 2 * states + at
@@ -95,7 +93,7 @@ def _spread_out(
     layout: Layout, data: Data, along: Float[Array, "n c"], colour: np.ndarray, group: np.ndarray
 ) -> Float[Array, "n q"]:
     """Return the whole Jacobian from the derivatives along the colours."""
-    # A derivative along a direction is the sum over its unknowns, of which each row hangs on one.
+    # A derivative along a direction is the sum over its unknowns, and each row depends on one.
     shared = jnp.asarray(group < 0)
     felt = shared[None, :]
     for own in _groups_of_rows(layout, data):
@@ -111,7 +109,7 @@ def prior_rows(layout: Layout, data: Data, z: Float[Array, " q"]) -> Float[Array
     """Return (value - mean) / sd of the parameters' priors; zero where there is none."""
     u = unpack(layout, data, z)
     values = jnp.stack(list(u.params.values()))
-    # Without a prior the sd is infinite: a row for every parameter keeps the shapes the same.
+    # Without a prior the sd is infinite: the shapes do not depend on priors.
     return (values - data.prior_mean) / data.prior_sd
 
 
@@ -142,18 +140,18 @@ class ResidualAndJacobian(NamedTuple):
     innovations: tuple[Innovations, ...]
     """by flight; none with output error"""
     simulated: SimulatedOutputs | None
-    """what output error simulates on its way; None where nothing is simulated"""
+    """None where nothing is simulated"""
 
 
 @jitted
 def residual_and_jacobian(
     layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
 ) -> ResidualAndJacobian:
-    """Residuals and their Jacobian in forward mode, in one pass."""
-    # Forwards: there are far more rows than unknowns, and nothing of the simulation is stored.
+    """Return residuals and their Jacobian in forward mode, in one pass."""
+    # Forwards: there are far more rows than unknowns.
 
     def rows(z: Array) -> tuple[Array, Any]:
-        # The residuals come along as auxiliary values: a pass of their own would simulate again.
+        # The residuals are auxiliary values, without a second simulation.
         r, residuals = _all_rows(layout, data, noise, z)
         return r, (r, residuals.runs, residuals.innovations)
 
@@ -162,10 +160,9 @@ def residual_and_jacobian(
 
     directions, colours = jnp.eye(layout.size, dtype=z.dtype), _colours(layout)
     if colours is not None:
-        # Several unknowns a direction, each felt by rows of its own.
         directions = jnp.zeros_like(directions).at[colours[0], np.arange(layout.size)].set(1.0)
         directions = directions[: colours[0].max() + 1]
-    # The residuals are the same for all directions: with None vmap computes them once.
+    # With None vmap computes once what is the same for all directions.
     r, J, (_, runs, innovations) = jax.vmap(along, out_axes=(None, -1, None))(directions)
     if colours is not None:
         J = _spread_out(layout, data, J, *colours)

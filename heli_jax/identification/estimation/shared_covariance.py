@@ -1,4 +1,4 @@
-"""Flights of one linear model side by side: their Kalman filters differ in the states alone."""
+"""Kalman filters of several flights of one linear model, which share their covariances."""
 
 from typing import Any, NamedTuple
 
@@ -16,31 +16,28 @@ from heli_jax.simulation.discretize import process_noise
 from heli_jax.simulation.hold import between_samples
 from heli_jax.simulation.stepping import held_columns
 
-# The Kalman filter of a linear model over whole records: one covariance, and a gain that settles.
+# Without missing samples the covariances depend on the model alone and not on the measurements:
+# records of one model share them. They converge (Kalman, 1960); then the gain is constant, and the
+# filter is a linear recurrence. Both have derivatives of their own: those of the Riccati equation
+# are a Lyapunov recursion with the closed-loop matrix, which all unknowns share; those of the state
+# are the same recurrence with another forcing.
 #
-# With no sample missing the covariances depend on the model alone, not on what is measured: records
-# of one model share them, as columns. They converge (Kalman, 1960); from there on the gain stays,
-# and what is left of the filter is a linear recurrence. Both are followed with derivatives of their
-# own: those of the Riccati equation are a Lyapunov recursion in the closed-loop matrix, which all
-# unknowns have in common, and those of the state the same recurrence driven otherwise.
-#
-# Nothing is approximated: where the covariance does not converge (an unstable mode that no output
-# shows, a record that is too short) the gain never freezes, and this is the exact filter to the
-# end.
+# If the covariance does not converge (an unstable mode that no output shows, a short record) the
+# gain never freezes: the filter is exact in any case.
 
 
 _CHUNK = 64
 """samples after which the covariance is compared with what it was"""
 _CONVERGED = 1e-10
 """change of a covariance within a chunk, in units of the two standard deviations, below which it
-stays: derivatives converge later than values, by a factor of about the samples that it took"""
+has converged: derivatives converge later than values, by a factor of about the samples it took"""
 
 
 class Records(NamedTuple):
     """m records of N samples, side by side."""
 
     U: Float[Array, "N m r"]
-    """what `Gaussian.B` multiplies"""
+    """inputs of `Gaussian.B`"""
     acting: Float[Array, "N m i"]
     """the inputs that act at the samples themselves"""
     y: Float[Array, "N m p"]
@@ -57,7 +54,7 @@ class Gaussian(NamedTuple):
     C: Float[Array, "p n"]
     D: Float[Array, "p i"]
     Q: Float[Array, "n n"]
-    """covariance that a step adds"""
+    """covariance of the process noise of a step"""
     R: Float[Array, " p"]
     """variances of the measurement noise"""
     P0: Float[Array, "n n"]
@@ -65,10 +62,10 @@ class Gaussian(NamedTuple):
 
 
 class _Gain(NamedTuple):
-    """Use of a sample."""
+    """Gains of a sample."""
 
     G: Float[Array, "n p"]
-    """what an innovation adds to the next predicted state: Ad times the Kalman gain"""
+    """Ad times the Kalman gain"""
     white: Float[Array, "p p"]
     """inverse of the Cholesky factor of the innovations' covariance"""
 
@@ -83,20 +80,18 @@ class _State(NamedTuple):
 
 
 def filtered_records(system: Gaussian, records: Records) -> tuple[Array, Array]:
-    """Errors (N, m, p) and variances (N, p) of the innovations.
+    """Return errors (N, m, p) and variances (N, p) of the innovations.
 
-    Outputs of one sample are taken one after another, as in `kalman.innovations`: the error of each
-    is what the samples before and the outputs before it leave.
+    Outputs of one sample are taken one after another, as in `kalman.innovations`.
     """
     N, m, p = records.y.shape
     n, count = records.x0.shape[1], -(-N // _CHUNK)
 
     def chunk(state: _State, part: Any) -> tuple[_State, Any]:
-        # By chunks: within one the loop has no branch, and a gain that has settled is noticed one
-        # chunk late at most.
+        # By chunks, since the loop within one has no branch.
         return jax.lax.cond(state.steady, _frozen, _transient, system, state, *part)
 
-    # What the last chunk is filled up with comes behind the record and is cut off again.
+    # The last chunk is padded behind the record, and cut off again.
     samples = (records.U, records.acting, records.y)
     parts = jax.tree.map(
         lambda v: jnp.pad(v, ((0, count * _CHUNK - N), (0, 0), (0, 0))).reshape(
@@ -115,14 +110,13 @@ def filtered_records(system: Gaussian, records: Records) -> tuple[Array, Array]:
 def _transient(
     system: Gaussian, state: _State, U: Array, acting: Array, y: Array
 ) -> tuple[_State, tuple[Array, Array]]:
-    """A chunk with a gain anew at each sample."""
+    """Filter a chunk with a gain for each sample."""
     Ad, B, C, D, Q, R, _ = system
 
     def step(carry: tuple[Array, Array, _Gain], now: Any) -> tuple[Any, Any]:
         x, P, _ = carry
         U, acting, y = now
-        # The covariance does not see the measurements, so one recursion serves all records; only
-        # the states beside it are many.
+        # One covariance for all records, and a state for each.
         P, gain = riccati(Ad, C, Q, R, P)
         nu = y - acting @ D.T - x @ C.T
         x = x @ Ad.T + nu @ gain.G.T + U @ B.T
@@ -137,10 +131,10 @@ def _transient(
 def _frozen(
     system: Gaussian, state: _State, U: Array, acting: Array, y: Array
 ) -> tuple[_State, tuple[Array, Array]]:
-    """A chunk with the gain that there is."""
+    """Filter a chunk with a constant gain."""
     G, white = state.gain
     v = y - acting @ system.D.T
-    # With a gain that stays, prediction and correction are one matrix, the filter's closed loop.
+    # Prediction and correction are one matrix, the closed loop of the filter.
     x, X = recurrence(system.Ad - G @ system.C, v @ G.T + U @ system.B.T, state.x)
     sd = 1.0 / jnp.diagonal(white)
     error = (v - X @ system.C.T) @ (white * sd[:, None]).T
@@ -150,12 +144,12 @@ def _frozen(
 def _converged(before: Array, after: Array) -> Array:
     before, after = jax.lax.stop_gradient((before, after))
     sd = jnp.sqrt(jnp.maximum(jnp.diagonal(after), 0.0))
-    # By the two standard deviations: whatever the units, and for what is known all but exactly too.
+    # Over the two standard deviations: in any units, and for states that are known almost exactly.
     return _in_all(jnp.all(jnp.abs(after - before) <= _CONVERGED * sd[:, None] * sd[None, :]))
 
 
-# Side by side the gain freezes where it may in all: a condition of each its own would be computed
-# both ways in all of them.
+# In a batch the gain freezes once it may in all: with a condition for each both branches would be
+# computed in all.
 @jax.custom_batching.custom_vmap
 def _in_all(flag: Array) -> Array:
     return flag
@@ -168,10 +162,10 @@ def _(size: int, batched: list[bool], flag: Array) -> tuple[Array, bool]:
 
 @jax.custom_jvp
 def riccati(Ad: Array, C: Array, Q: Array, R: Array, P: Array) -> tuple[Array, _Gain]:
-    """The covariance of the state one sample on, and how the sample between is used.
+    """Return the covariance of the state one sample on, and the gains of the sample.
 
     Args:
-        Q: (n, n), covariance that the step adds.
+        Q: (n, n), covariance of the process noise of the step.
         R: (p,), variances of the measurement noise.
         P: (n, n), covariance of the state predicted for the sample.
     """
@@ -182,17 +176,17 @@ def riccati(Ad: Array, C: Array, Q: Array, R: Array, P: Array) -> tuple[Array, _
 def _riccati(
     Ad: Array, C: Array, Q: Array, R: Array, P: Array
 ) -> tuple[Array, _Gain, tuple[Array, Array]]:
-    """`riccati`, the Kalman gain, and Ad times the covariance of the corrected state."""
+    """Return `riccati`, the Kalman gain, and Ad times the covariance of the corrected state."""
     H = P @ C.T
-    # By its Cholesky factor the innovation of each output is freed of what the outputs before it
-    # tell: the same numbers as when they are taken one after another.
+    # The Cholesky factor takes off each innovation what the outputs before it predict: the same
+    # numbers as with outputs one after another.
     L = jnp.linalg.cholesky(C @ H + jnp.diag(R))
     white = jax.scipy.linalg.solve_triangular(L, jnp.eye(R.shape[0], dtype=R.dtype), lower=True)
     whitened = H @ white.T
     K = whitened @ white
     corrected = Ad @ (P - whitened @ whitened.T)
     following = corrected @ Ad.T + Q
-    # Symmetric by force: rounding would grow with each step.
+    # Made symmetric: rounding would grow with each step.
     return 0.5 * (following + following.T), _Gain(Ad @ K, white), (K, corrected)
 
 
@@ -212,14 +206,14 @@ def _riccati_jvp(primals: Any, tangents: Any) -> Any:
     whitened = gain.white @ dS @ gain.white.T
     half = jnp.tril(whitened) - 0.5 * jnp.diag(jnp.diagonal(whitened))
     d_white = -half @ gain.white
-    # The gain's own derivative enters the states, although it drops out of the covariance.
+    # The derivative of the gain is in the states, although not in the covariance.
     dK = (dP @ C.T + P @ dC.T - K @ dS) @ (gain.white.T @ gain.white)
     return (following, gain), (d_following, _Gain(dAd @ K + Ad @ dK, d_white))
 
 
 @jax.custom_jvp
 def recurrence(F: Array, forcing: Array, x0: Array) -> tuple[Array, Array]:
-    """x[k+1] = F x[k] + forcing[k]: x after the last of K samples, and x (K, m, n) at all."""
+    """Return x after the last of K samples and x (K, m, n) at all: x[k+1] = F x[k] + forcing[k]."""
     return jax.lax.scan(lambda x, f: (x @ F.T + f, x), x0, forcing)
 
 
@@ -227,7 +221,7 @@ def recurrence(F: Array, forcing: Array, x0: Array) -> tuple[Array, Array]:
 def _recurrence_jvp(primals: Any, tangents: Any) -> Any:
     (F, _, _), (dF, d_forcing, dx0) = primals, tangents
     x, X = recurrence(*primals)
-    # All samples' dF x at once, in place of a product more in every step.
+    # dF x of all samples at once, in place of one more product in every step.
     driven = X @ dF.T + d_forcing
     return (x, X), recurrence(F, driven, dx0)
 
@@ -235,7 +229,7 @@ def _recurrence_jvp(primals: Any, tangents: Any) -> Any:
 def innovations_together(
     layout: Layout, data: Data, noise: Noise, u: Unknowns, group: tuple[int, ...]
 ) -> list[Innovations]:
-    """The innovations of flights that share their covariances, flight after flight."""
+    """Return the innovations of flights that share their covariances."""
     names = layout.outputs[group[0]]
     measured = [{n: data.flights[i].outputs[n] - u.biases[i][n] for n in names} for i in group]
     drives = [driven(layout, data, u, i) for i in group]
@@ -245,8 +239,7 @@ def innovations_together(
     starts = [layout.model.initial_state(d.params) if d.state is None else d.state for d in drives]
     x0 = jnp.stack([naming.ravel(start, dtype) for start in starts])
     error, variance = filtered_records(system, Records(U, acting, y, x0))
-    # Shorter records were filled up behind their end. A filter only looks back, so nothing of that
-    # reaches the samples before it.
+    # Shorter records were padded behind their end, which no sample before it depends on.
     lengths = [by_name[names[0]].shape[0] for by_name in measured]
     return [
         Innovations(
@@ -260,8 +253,8 @@ def innovations_together(
 def _system(
     layout: Layout, drives: list[Drive], noise: Noise, u: Unknowns, group: tuple[int, ...]
 ) -> tuple[Gaussian, Array, Array]:
-    """The model as the filter takes it, what B multiplies and the inputs that act, (N, m, .)."""
-    # Parameters, sample time and holds are the same in all, or they were no group.
+    """Return the model, the inputs of its B, and the inputs that act at the samples, (N, m, .)."""
+    # Parameters, sample time and holds are the same in the whole group.
     model, params, dt = layout.model, drives[0].params, drives[0].dt
     names = layout.outputs[group[0]]
     inputs = jax.tree.map(lambda *v: _columns(v), *(drive.inputs for drive in drives))
@@ -272,22 +265,21 @@ def _system(
         _, inputs, linear = between_samples(layout.model, inputs, inputs, hold)
         return held_columns(model, params, inputs, dt, u.shift, linear)
 
-    # The matrices come out once and not by record: they do not depend on the inputs, and that they
-    # are the same in all flights is what makes these a group.
+    # The matrices do not depend on the inputs, and come out once.
     Ad, B, U, acting = jax.vmap(held, -1, (None, None, 1, 1))(inputs)
     _, _, C, D = jacobians(model, params)
     rows = np.asarray([naming.names(model.Outputs).index(n) for n in names])
     Q = process_noise(model, params, dt)
     by_flight = jnp.stack([jnp.stack([noise.sd[i][n] for n in names]) for i in group])
-    # No number at all is better than one of another flight's noise.
+    # NaN is better than the noise of another flight.
     sd = jnp.where(jnp.all(by_flight == by_flight[:1]), by_flight[0], jnp.nan)
-    # The scales are unknowns of the fit and common to all flights, so they may stand in R.
+    # The scales are unknowns that all flights share.
     R = jnp.square(jnp.stack([measurement_sd(u, n, s) for n, s in zip(names, sd, strict=True)]))
     P0 = first_covariance(model, params, Ad.dtype)
     return Gaussian(Ad, B, C[rows], D[rows], Q, R, P0), U, acting
 
 
 def _columns(records: Any) -> Float[Array, "N m"]:
-    """Signals (N,) side by side, shorter ones filled up behind their end."""
+    """Return signals (N,) as columns, shorter ones padded behind their end."""
     N = max(v.shape[0] for v in records)
     return jnp.stack([jnp.pad(v, (0, N - v.shape[0])) for v in records], axis=1)

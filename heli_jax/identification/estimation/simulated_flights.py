@@ -1,4 +1,4 @@
-"""The flights as the model with given unknowns flies them, with windows side by side."""
+"""Simulation of the flights with given unknowns; windows of one length run together."""
 
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ from heli_jax.simulation.simulate import Trajectory, simulate
 
 
 class Drive(NamedTuple):
-    """Drive of the model through one flight."""
+    """Parameters, inputs and initial state of the model in one flight."""
 
     params: Any
     """the model's Params, SI"""
@@ -34,10 +34,10 @@ class Drive(NamedTuple):
 def driven(layout: Layout, data: Data, u: Unknowns, i: int) -> Drive:
     """Return the drive of the i-th flight: inputs are (logged + offset) * gain."""
     flight, offsets = data.flights[i], u.offsets[i]
-    # The later wins: what was known of this flight alone stands above what is estimated of all.
+    # The last value counts: one that is known of this flight alone.
     params = layout.model.Params(**{**data.base, **u.params, **u.noise, **flight.known})
     inputs = naming.asdict(flight.inputs)
-    # The offset in the log's own numbers, so that it does not change with the gain.
+    # In units of the log, so that the offset does not change with the gain.
     inputs = {n: v + offsets[n] if n in offsets else v for n, v in inputs.items()}
     inputs = {n: v * u.gains[n] if n in u.gains else v for n, v in inputs.items()}
     return Drive(params, layout.model.Inputs(**inputs), flight.dt, u.states[i])
@@ -48,8 +48,8 @@ class SimulatedOutputs(NamedTuple):
 
     outputs: tuple[Float[Array, "p N"], ...]
     """by flight, SI, as `Layout.outputs` orders them, with the bias"""
-    state_rms: Float[Array, "f n"]
-    """root mean square of each simulated state, by flight"""
+    states: tuple[Float[Array, "s N"], ...]
+    """by flight, as the model's State orders them"""
 
 
 class Run(NamedTuple):
@@ -58,19 +58,19 @@ class Run(NamedTuple):
     states: Float[Array, "s N"]
     """as the model's State orders them"""
     outputs: Float[Array, "p N"]
-    """what the flight measures, as `Layout.outputs` orders it, without bias"""
+    """the measured outputs, as `Layout.outputs` orders them, without bias"""
     ends: Any
-    """with windows the State that each leads to at the next one's first sample, (windows,)"""
+    """with windows the State at the end of each, at the first sample of the next, (windows,)"""
 
 
 def predict(layout: Layout, data: Data, u: Unknowns) -> tuple[Run, ...]:
-    """The simulated flights (without bias).
+    """Return the simulated flights (without bias).
 
-    Windows of one length are simulated together, whichever flight they belong to.
+    Windows of one length are simulated together, of all flights.
     """
     by_flight, groups = {}, {}
     for i, flight in enumerate(data.flights):
-        # What is compiled differs with each of these: only equal ones run side by side.
+        # Only flights that are equal in each of these share a program.
         key = (layout.windows[i][1], tuple(flight.known), layout.holds[i])
         groups.setdefault(key, []).append(i)
     for (m, *_), members in groups.items():
@@ -85,7 +85,7 @@ def predict(layout: Layout, data: Data, u: Unknowns) -> tuple[Run, ...]:
 
 
 def _simulated(layout: Layout, i: int, drive: Drive, shift: Any) -> Trajectory:
-    """A run with inputs that move between samples as those of the i-th flight."""
+    """Simulate with the holds of the i-th flight."""
     return simulate(
         layout.model,
         drive.params,
@@ -96,7 +96,7 @@ def _simulated(layout: Layout, i: int, drive: Drive, shift: Any) -> Trajectory:
         substeps=layout.substeps,
         delay=shift,
         block=layout.block,
-        # Least squares differentiates forwards alone, and this compiles faster than both modes.
+        # Compiles faster than an adjoint for both modes; least squares differentiates forwards.
         adjoint=dfx.ForwardMode(),
         hold=layout.hold(i),
     )
@@ -105,37 +105,37 @@ def _simulated(layout: Layout, i: int, drive: Drive, shift: Any) -> Trajectory:
 def _side_by_side(
     layout: Layout, data: Data, u: Unknowns, members: list[int], m: int
 ) -> dict[int, Run]:
-    """The runs of several windows of m samples, by vmap."""
+    """Return the runs of several windows of m samples, by vmap."""
     chained = any(layout.windows[i][0] > 1 for i in members)
-    # With several windows one sample more, at which the next begins.
+    # With several windows one more sample, the first of the next.
     each = [_cut(layout, data, u, i, m + chained) for i in members]
     stacked = jax.tree.map(lambda *v: jnp.concatenate(v), *each)
 
     def window(inputs: Any, known: dict[str, Any], dt: Any, state: Any) -> tuple[Any, Any]:
-        """States and outputs of one window; vmap makes them of all."""
+        """Return states and outputs of one window."""
         params = layout.model.Params(**{**data.base, **u.params, **u.noise, **known})
-        # Any member's number will do: the inputs of all of them move alike between samples.
+        # All members have the same holds.
         late = delays_of(layout.model, params, u.shift, dt)
         if late is not None:
-            # The whole samples were taken off when the windows were cut, but for the one before.
+            # `_with_lead` has shifted by whole samples, but for the one in front.
             late = Delays(late.groups, tuple(-1 for _ in late.whole), late.rest)
         run = _simulated(layout, members[0], Drive(params, inputs, dt, state), late)
         return jax.tree.map(lambda v: v[: m + chained], (run.states, run.outputs))
 
     states, outputs = jax.vmap(window)(*stacked)
     names = naming.names(layout.model.Outputs)
-    # All of them in one array, since XLA makes a kernel of every part that is cut out of another.
+    # In one array, since XLA makes a kernel of every slice.
     x, y = (jnp.stack(jax.tree.leaves(v)) for v in (states, outputs))
     runs, first = {}, 0
     for i in members:
-        # The windows lie flight after flight along the batch.
+        # The batch has the windows flight after flight.
         count = layout.windows[i][0]
         n = jax.tree.leaves(data.flights[i].inputs)[0].shape[0]
         windows = slice(first, first + count)
 
         def joined(v: Array, windows: slice = windows, n: int = n) -> Array:
-            """One flight's windows end to end, of signals (signals, windows, samples)."""
-            # The sample after these m is the next window's first; past n stand repetitions.
+            """Join the windows of one flight, of signals (signals, windows, samples)."""
+            # Sample m is the first of the next window; those past n are repetitions.
             return v[:, windows, :m].reshape(v.shape[0], -1)[:, :n]
 
         ends = None
@@ -150,11 +150,12 @@ def _side_by_side(
 def _cut(
     layout: Layout, data: Data, u: Unknowns, i: int, samples: int
 ) -> tuple[Any, dict[str, Array], Array, Any]:
-    """Inputs (windows, samples), known parameters, sample time and initial states (windows,)."""
+    """Return inputs (windows, samples), known parameters, sample time and initial states of the
+    windows of the i-th flight, (windows,)."""
     flight, (count, m) = data.flights[i], layout.windows[i]
     drive = driven(layout, data, u, i)
     late = delays_of(layout.model, drive.params, u.shift, flight.dt)
-    # The last window may reach past the record: it is filled up with the last sample.
+    # The last window may reach past the record: it is padded with the last sample.
     of_window = m * np.arange(count)[:, None] + np.arange(samples)[None, :]
     state = u.states[i]
     if state is not None:
@@ -165,17 +166,17 @@ def _cut(
 
 
 def _with_lead(inputs: Any, samples: np.ndarray, late: Delays | None) -> Any:
-    """The inputs (windows, m) of windows, read as late as they act.
+    """Return the inputs (windows, m) as they act, delayed.
 
-    Where inputs are late each window has the sample before its first in front, which acts there
-    until the first one does: (windows, m + 1).
+    With a delay each window has the sample before its first in front, which acts until the first
+    does: (windows, m + 1).
     """
     if late is None:
         return at(inputs, samples)
     lead = np.concatenate([samples[:, :1] - 1, samples], axis=1)
     leaves, structure = jax.tree.flatten(at(inputs, lead, late))
     for i, v in enumerate(jax.tree.leaves(inputs)):
-        # One that acts at once is read without a shift, and needs nothing in front.
+        # An input without a delay needs no sample in front.
         if late.group(i) is None:
             leaves[i] = at(v, np.concatenate([samples, samples[:, -1:] + 1], axis=1))
     return jax.tree.unflatten(structure, leaves)
@@ -183,12 +184,11 @@ def _with_lead(inputs: Any, samples: np.ndarray, late: Delays | None) -> Any:
 
 def outputs_of(u: Unknowns, runs: tuple[Run, ...]) -> SimulatedOutputs:
     """Return the simulated outputs with their biases, as reports show them."""
-    rms = [jnp.sqrt(jnp.mean(jnp.square(run.states), axis=1)) for run in runs]
     with_bias = [
         run.outputs + jnp.stack(list(bias.values()))[:, None]
         for run, bias in zip(runs, u.biases, strict=True)
     ]
-    return SimulatedOutputs(tuple(with_bias), jnp.stack(rms))
+    return SimulatedOutputs(tuple(with_bias), tuple(run.states for run in runs))
 
 
 @jitted
@@ -206,12 +206,12 @@ def by_output(layout: Layout, simulated: SimulatedOutputs) -> tuple[dict[str, np
     )
 
 
-# What is measured: the signals of all flights one after another, and how many numbers they are.
+# The measured signals of all flights, one after another.
 
 
 _BEHIND = 0.02
-"""of the noise that came through filters, which is behind them at least: without any the first
-innovation, which an initial state makes zero, would have no variance, and the likelihood no end"""
+"""of the noise before filters, the least that is behind them: without it the first innovation,
+which an initial state makes zero, has no variance, and the likelihood no maximum"""
 
 
 def signals(layout: Layout) -> list[tuple[int, str]]:
@@ -221,14 +221,14 @@ def signals(layout: Layout) -> list[tuple[int, str]]:
 
 def signal_numbers(layout: Layout, data: Data) -> np.ndarray:
     """Return the signal of every measured number."""
-    # From shapes alone: a constant to whatever is traced.
+    # From shapes alone: a constant in a trace.
     sizes = [data.flights[i].outputs[n].shape[0] for i, n in signals(layout)]
     return np.repeat(np.arange(len(sizes)), sizes)
 
 
 def measured_signals(layout: Layout, data: Data, noise: Noise) -> tuple[Array, Array]:
-    """All that is measured, and its sd, each (n,)."""
-    # Joined, since XLA makes a kernel of every signal that is treated by itself.
+    """Return all measurements and their sd, each (n,)."""
+    # Joined, since XLA makes a kernel of every single signal.
     at = signals(layout)
     sd = jnp.stack([noise.sd[i][n] for i, n in at])
     y = jnp.concatenate([data.flights[i].outputs[n] for i, n in at])
@@ -236,7 +236,7 @@ def measured_signals(layout: Layout, data: Data, noise: Noise) -> tuple[Array, A
 
 
 def measurement_sd(u: Unknowns, output: str, sd: Array) -> Array:
-    """The sd of an output's white measurement noise, from what is guessed or stated."""
+    """Return the sd of the white noise of an output, from its guessed or stated sd."""
     sd = sd * u.scales[output] if output in u.scales else sd
     through = u.noise.get(sensor_noise(output))
     return sd if through is None else jnp.hypot(sd, _BEHIND * through)
@@ -244,23 +244,13 @@ def measurement_sd(u: Unknowns, output: str, sd: Array) -> Array:
 
 def measured_count(data: Data) -> int:
     """Return the count of measured numbers."""
-    return int(measured_counts(data))
-
-
-def measured_counts(data: Data) -> np.ndarray:
-    """Return the same of each record, where all of `data` has leading axes of records."""
-    # In NumPy, outside of what is compiled: the optimiser's program does not depend on it.
-    each = [
-        np.isfinite(np.asarray(y)).sum(axis=-1)
-        for flight in data.flights
-        for y in flight.outputs.values()
-    ]
-    return np.asarray(np.sum(each, axis=0))
+    outputs = [y for flight in data.flights for y in flight.outputs.values()]
+    return int(sum(np.isfinite(np.asarray(y)).sum() for y in outputs))
 
 
 def least_noise(y: np.ndarray) -> float:
-    """The sd, SI, below which what is left of an output (N,) is rounding; NaN is missing."""
-    # A residual that is all rounding would make the next rows infinite; of an output that is
-    # nothing at all even 1e-12 of its unit is plenty.
+    """Return the sd [SI] below which the residual of an output (N,) is rounding; NaN is missing."""
+    # A noise of zero would make the next rows infinite; of an output that is zero 1e-12 of its
+    # unit will do.
     rms = float(np.sqrt(np.mean(np.square(y[np.isfinite(y)]))))
     return 1e-12 * (rms if rms > 1e-100 else 1.0)

@@ -1,12 +1,11 @@
-"""The identifiability analysis: what the data determine of the free parameters, and what not.
+"""Identifiability analysis: rank, covariance and null directions of the free parameters.
 
-Everything is done in relative coordinates: log |value| for parameters of one sign, value over a
-scale for those that may be zero. Initial states and biases are projected out first.
+It works in relative coordinates: log |value| for parameters of one sign, value over a scale for
+those that may be zero. Initial states and biases are projected out first.
 """
 
 import math
-from collections.abc import Collection, Mapping
-from types import MappingProxyType
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +14,6 @@ from scipy.sparse.csgraph import connected_components
 from heli_jax.flights.flight import labels
 from heli_jax.identification.estimation.evaluation import NULL, Evaluation
 from heli_jax.identification.identifiability.directions import (
-    TAKES_NO_PART,
     TAKES_PART,
     Spread,
     WithoutWeakPriors,
@@ -23,8 +21,8 @@ from heli_jax.identification.identifiability.directions import (
     projected,
     row_reduced,
     unit_vector,
-    with_further,
-    with_too_wide,
+    with_new_directions,
+    with_wide_intervals,
     without_effect,
 )
 from heli_jax.identification.identifiability.equivalents import Valley
@@ -41,32 +39,27 @@ from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Layout, flight_unknowns
 
-# From the residual's Jacobian to relative coordinates.
-
 _NEAR_ZERO = 1e-2
-"""part of a parameter's size below which it takes no part in products of powers"""
+"""value over its reference below which a parameter is in no product of powers"""
 _AT_END = 1e-3
-"""part of the largest time shift within which one is at the end of its search"""
+"""distance to the largest time shift, over that, of a shift at its end"""
 _NO_EFFECT = 1e-6
-"""A nuisance whose whole effect is below this part of the noise, such as the memory of a
-disturbance that is not there, has no direction to be projected out."""
+"""norm of a nuisance's column [sds of the noise] below which it is left out"""
 
 
 def unknowns_of(problem: Problem, layout: Layout, e: Evaluation) -> tuple[Unknown, ...]:
     """Return the parameters of interest with their size and prior in relative coordinates."""
-    dt = problem.training[0].dt
     unknowns = []
     for name, value in zip(layout.of_interest, map(float, e.named), strict=True):
-        if name == "time_shift":
-            # A shift is known well where it is known to a sample, whatever its value. The search is
-            # through a tanh, which comes near to its end and never to it.
-            room = MAX_TIME_SHIFT - abs(value)
-            u = Unknown(name, value, False, 1.0, 0.0, is_parameter=False, reference=dt)
-            u = u._replace(at_bound=room < _AT_END * MAX_TIME_SHIFT)
-        elif name in problem.free:
+        if name in problem.free:
             u = _parameter(problem, name, value)
+        elif name == "time_shift":
+            # Its unit is a sample. The search is through a tanh, which approaches its end.
+            at_bound = MAX_TIME_SHIFT - abs(value) < _AT_END * MAX_TIME_SHIFT
+            dt = problem.training[0].dt
+            u = Unknown(name, value, False, 1.0, 0.0, False, dt, at_bound=at_bound)
         else:
-            u = Unknown(name, value, True, 1.0, 0.0, is_parameter=False, reference=abs(value))
+            u = Unknown(name, value, True, 1.0, 0.0, False, abs(value))
         unknowns.append(u)
     return tuple(unknowns)
 
@@ -75,39 +68,35 @@ def _parameter(problem: Problem, name: str, value: float) -> Unknown:
     """Return a free parameter of the model as an unknown."""
     free, late = problem.free[name], name in problem.model.delay_parameters
     low, high = free.lower, free.upper
-    # Zero is as good a value as any where the sign may change, and of every delay: one that is
-    # searched as a positive number may still be none at all, of which its logarithm says nothing.
+    # A delay may be zero too.
     symmetric = late or transforms.changes_sign(free)
     reference, log = abs(value), True
-    # Between bounds of both signs neither a logarithm nor the start's size means anything.
     if low is not None and high is not None and low < 0 < high:
         reference, log = 0.5 * (high - low), False
     elif symmetric:
-        # A value near zero is known as soon as it is known to be small beside the start; or beside
-        # a sample, however small a delay the search began with.
+        # The unit of a value near zero is the size of the start; of a delay a sample at least.
         reference = max(abs(value), transforms.scale(free))
         reference = max(reference, problem.training[0].dt) if late else reference
         log = abs(value) > _NEAR_ZERO * reference
-    # What a parameter may plausibly do: by its prior, or half its interval.
+    # The scale is the prior's sd, or half the interval.
     prior, scale = reference / free.prior.sd if free.prior else 0.0, 1.0
     if prior:
         scale = 1.0 / prior
     elif log and low and high:
-        # Bounds that nearly meet would make a scale of zero, and a null direction of it.
         scale = max(0.5 * float(np.log(high / low)), 1e-3)
     at_bound = transforms.at_bound(free, value)
     return Unknown(name, value, log, scale, prior, True, reference, symmetric, at_bound=at_bound)
 
 
 class RelativeRows(NamedTuple):
-    """The Jacobian without the priors of the parameters, taken apart."""
+    """The Jacobian without the rows of the parameters' priors."""
 
     sensitivity: np.ndarray
-    """(n, q) of the rows of data, parameters of interest in relative coordinates"""
+    """(n, q) rows of the data by the parameters of interest, in relative coordinates"""
     nuisances: np.ndarray
-    """(n, k) of the same rows, all other unknowns"""
+    """(n, k) rows of the data by all other unknowns"""
     weak: np.ndarray
-    """(w, k) the weak priors' rows, which only nuisances have"""
+    """(w, k) rows of the nuisances' weak priors"""
 
 
 def relative_rows(
@@ -115,59 +104,47 @@ def relative_rows(
 ) -> tuple[tuple[Unknown, ...], RelativeRows]:
     """Return the parameters of interest, and the Jacobian's rows in relative coordinates."""
     unknowns = unknowns_of(problem, layout, e)
-    # In double precision from here on, whatever the fit ran in: null directions are told by 1e-8.
     J = np.asarray(e.J, dtype=np.float64)
     q, p = len(layout.of_interest), len(layout.free)
     count = layout.size - layout.first_nuisance
-    # Last come the weak priors (all that stands in z from `layout.first_nuisance` on), before them
-    # the parameters' own; the defects between windows count as data.
+    # The last rows are the weak priors, before them the parameters' priors; defects between windows
+    # count as data.
     data = J[: J.shape[0] - count - p]
     slopes = np.asarray(e.slopes, dtype=np.float64)
     factor = np.divide(
         [u.reference for u in unknowns], slopes, out=np.zeros_like(slopes), where=slopes != 0
     )
-    # A parameter of negative sign falls as its logarithm rises; the size is what counts.
     sensitivity = data[:, :q] * np.abs(factor) * np.sign(slopes) * [u.sign for u in unknowns]
     return unknowns, RelativeRows(sensitivity, data[:, q:], J[J.shape[0] - count :, q:])
 
 
-# The verdict.
-
 _ROUGHLY = 0.5
-"""sd in relative coordinates, as intervals are reported, above which a parameter is determined only
-roughly: its 95 % interval reaches further than a factor of 2.7 to either side"""
+"""relative sd above which a parameter is determined only roughly: its 95 % interval reaches further
+than a factor of 2.7 to either side"""
 _STRONG = 0.99
-"""correlation beyond which the verdict names a pair; rank alone does not show it (a stand's damping
-and the flybar's have correlation 1.00000 and full rank)"""
+"""correlation of a pair that is named"""
 
 
 class Around(NamedTuple):
-    """Knowledge of a point beside its slopes."""
+    """Facts on a point that its Jacobian does not have."""
 
     aliased: Collection[str] = ()
-    """the parameters that move a mode which the samples do not tell from its aliases"""
+    """the parameters that move a mode whose aliases fit as well"""
     second: tuple[SecondSolution, ...] = ()
     """other values that fit as well"""
     valley: Valley | None = None
-    """tells which combinations are the same far from the point; without it there are none"""
-    null: tuple[np.ndarray, ...] = ()
-    """directions (q,) in relative coordinates that are open at another point as likely"""
+    """tests combinations far from the point; without it there are none"""
     one_sided: tuple[str, ...] = ()
     """the parameters that the likelihood does not bound within the factor of ten"""
-    limits: Mapping[str, tuple[float, float]] = MappingProxyType({})
-    """by parameter the ends of its 95 % interval by the likelihood, where the slopes have others"""
     reported: np.ndarray | None = None
-    """covariance (q, q) of the parameters of interest that the reported intervals have, where it is
-    not that of white residuals; in the optimiser's coordinates, for `analyse` in relative ones"""
-    widening: Spread = lambda along: (1.0, Z95)
-    """by a weighted sum (q,) in the same coordinates the factor on its sd by white residuals, and
-    how many sds its 95 % interval reaches"""
+    """covariance (q, q) of the reported intervals if residuals are not white, in the optimiser's
+    coordinates; for `analyse` in relative ones"""
 
 
 def verdict_of(
     problem: Problem, layout: Layout, e: Evaluation, around: Around = Around()
 ) -> Verdict:
-    """Return what the data determine at one point.
+    """Return the identifiability analysis at one point.
 
     Raises:
         ValueError: the simulation is not finite there.
@@ -180,30 +157,23 @@ def verdict_of(
     unknowns, rows = relative_rows(problem, layout, e)
     unknowns = tuple(u._replace(aliased=u.name in around.aliased) for u in unknowns)
     q = len(unknowns)
-    # All further work is on the triangle, which holds what the data say in as many rows as columns.
     R = np.linalg.qr(np.hstack([rows.sensitivity, rows.nuisances]), mode="r")
     S, N = R[:, :q], R[:, q:]
-    # With weak priors: what neither the data nor a prior of its own sees is no unknown, and none of
-    # the others depends on another.
     held = np.vstack([N, rows.weak])
     shown = np.linalg.norm(held, axis=0) > _NO_EFFECT
     sensitivity = projected(np.vstack([S, np.zeros((len(rows.weak), q))]), held[:, shown])
-    # Without them. Their sds are the units of these columns, so the solution is in sds.
+    # Without the weak priors. Their sds are the units of these columns.
     seen = np.linalg.norm(N, axis=0) > _NO_EFFECT
     compensation = np.zeros((N.shape[1], q))
     compensation[seen] = -np.linalg.lstsq(N[:, seen], S, rcond=NULL)[0]
     named = flight_unknowns(layout, labels(problem.training))
-    # Before those named stand the parameters of the disturbance and the noise's factors.
+    # The parameters of the disturbance and the noise's factors stand before the named nuisances.
     without_weak = WithoutWeakPriors(
-        projected(S, N[:, seen], NULL), compensation[N.shape[1] - len(named) :], named
+        projected(S, N[:, seen]), compensation[N.shape[1] - len(named) :], named
     )
     to_relative = np.asarray(e.slopes, np.float64) * [u.sign / u.reference for u in unknowns]
     if around.reported is not None:
-        reported = around.reported * np.outer(to_relative, to_relative)
-        widening = around.widening
-        around = around._replace(
-            reported=reported, widening=lambda along: widening(along * to_relative)
-        )
+        around = around._replace(reported=around.reported * np.outer(to_relative, to_relative))
     return analyse(sensitivity, unknowns, without_weak=without_weak, around=around)
 
 
@@ -214,53 +184,60 @@ def analyse(
     without_weak: WithoutWeakPriors | None = None,
     around: Around = Around(),
 ) -> Verdict:
-    """Return the verdict from a whitened sensitivity in relative coordinates.
+    """Return the analysis of a whitened sensitivity in relative coordinates.
 
     Args:
-        sensitivity: (any, q) with the nuisances free but for their weak priors. Priors of the
-            unknowns are no rows of it; they come with the unknowns.
-        without_weak: the same without the weak priors, which count as data where it is not given.
+        sensitivity: (any, q) with the nuisances free but for their weak priors, and without rows of
+            the unknowns' priors.
+        without_weak: the same without the weak priors; if not given, these count as data.
     """
     bare = sensitivity if without_weak is None else without_weak.sensitivity
     scale, own = np.array([u.scale for u in unknowns]), np.array([u.prior for u in unknowns])
     names = [u.name for u in unknowns]
-    # The rank is that without the weak priors: they give every nuisance a finite interval, and so
-    # would lend one to each parameter that a bias or an initial state can take the place of.
-    # A prior is a measurement of the parameter itself: a row with one over its sd.
+    # The rank is that without the weak priors, which would bound a parameter that is exchangeable
+    # with a bias. A prior is a row with one over its sd.
     total, data = directions(np.vstack([bare, np.diag(own)]), scale), directions(bare, scale)
     covariance = total.covariance
     if not total.null:
-        # All is determined: the intervals are those of the fit, which has the weak priors.
+        # The intervals are those of the fit, with the weak priors.
         covariance = directions(np.vstack([sensitivity, np.diag(own)]), scale, 0.0).covariance
-    null = with_too_wide(total.null, total.covariance, unknowns)
-    null = with_further(null, _further(total.covariance, covariance, unknowns, around))
+    null = with_wide_intervals(total.null, total.covariance, unknowns)
+    null = with_new_directions(
+        null, _additional_null_directions(total.covariance, covariance, unknowns, around)
+    )
     reported = covariance
     if around.reported is not None:
         reported = around.reported
-        null = with_too_wide(null, reported, unknowns)
-    # Two lists: what nothing determines is an error of the experiment, what rests on a prior is a
-    # number that the prior has put there, and its combinations have no prior in them.
+        null = with_wide_intervals(null, reported, unknowns)
+    # Without a null direction: those that the data alone leave.
     resting = []
     if not null and own.any():
-        resting = with_too_wide(data.null, data.covariance, unknowns)
+        resting = with_wide_intervals(data.null, data.covariance, unknowns)
     dead = without_effect(sensitivity, unknowns)
     of_rows = (sensitivity, without_weak)
-    groups = _groups(null, covariance, unknowns, of_rows, around, dead)
-    resting_groups = _groups(resting, data.covariance, unknowns, of_rows, around)
+
+    def spread(C: np.ndarray) -> Spread:
+        """Return the sd of a sum, as much wider as the reported one is."""
+
+        def sd(along: np.ndarray) -> float:
+            wider = (along @ reported @ along) / max(along @ covariance @ along, 1e-300)
+            return math.sqrt(max(0.0, float(wider * (along @ C @ along))))
+
+        return sd
+
+    groups = _groups(null, spread(covariance), unknowns, of_rows, around, dead)
+    resting_groups = _groups(resting, spread(data.covariance), unknowns, of_rows, around)
     moved = np.abs(null).max(axis=0) if null else np.zeros(len(unknowns))
     changed = {n for other in around.second for n in other.changed}
     undetermined = [
-        n for n, part in zip(names, moved, strict=True) if part > TAKES_NO_PART or n in changed
+        n for n, part in zip(names, moved, strict=True) if part > TAKES_PART or n in changed
     ]
-    # A variance of nothing may be rounding of either sign.
     sds = np.sqrt(np.maximum(np.diag(reported), 0.0)).tolist()
-    # One that takes part in no determined direction has no correlation.
     sizes = np.sqrt(np.diag(covariance))
     sizes = np.where(sizes > 0, sizes, 1.0)
     correlation = np.clip(covariance / np.outer(sizes, sizes), -1.0, 1.0)
     np.fill_diagonal(correlation, 1.0)
-    # Where a nuisance is exchangeable with a parameter the data say nothing of it, whatever
-    # interval the weak priors make.
+    # The data have no information on a parameter that is exchangeable with a nuisance.
     share = dict(zip(names, _prior_share(covariance, bare).tolist(), strict=True))
     share |= dict.fromkeys((n for g in groups if g.exchanged for n in g.names), 1.0)
     return Verdict(
@@ -281,54 +258,48 @@ def analyse(
         roughly=tuple(
             u.name
             for u, sd in zip(unknowns, sds, strict=True)
-            if u.name not in (*undetermined, *dead) and _is_rough(u, sd, around.limits)
+            if u.name not in (*undetermined, *dead)
+            and ((u.logarithmic and sd > _ROUGHLY) or (u.symmetric and Z95 * sd >= u.distance))
         ),
         second=around.second,
     )
 
 
-def _further(
+def _additional_null_directions(
     bare: np.ndarray, covariance: np.ndarray, unknowns: tuple[Unknown, ...], around: Around
 ) -> list[np.ndarray]:
-    """Return directions that are not determined although their intervals are short, by covariances
-    (q, q) without the weak priors (`bare`) and with them."""
-    # Those of one sign have the factor of ten. Of what may be zero weak priors alone hold one whose
-    # sd without them is beyond its scale and ten times the one with them.
+    """Return null directions whose intervals are short, by covariances (q, q) without the weak
+    priors (`bare`) and with them."""
+    # Weak priors alone bound a parameter that may be zero if its sd without them is beyond its
+    # scale and ten times that with them.
     weakly = [
         bare[:, i]
         for i, u in enumerate(unknowns)
         if not u.logarithmic and bare[i, i] > max(1.0, FACTOR**2 * covariance[i, i])
     ]
-    # An alias is another optimum, of which no slope at this one tells.
     aliased = [v for v, u in zip(np.eye(len(unknowns)), unknowns, strict=True) if u.aliased]
-    # What goes with one that the likelihood does not bound, without those that it does.
+    # The regression on a one-sided parameter, of those that are one-sided too.
     open_ = np.array([u.name in around.one_sided for u in unknowns])
-    sds = np.sqrt(np.where(open_, np.diag(covariance), 1.0))
-    one_sided = [np.where(open_, covariance[:, i] / sds, 0.0) for i in np.flatnonzero(open_)]
-    return [*weakly, *aliased, *around.null, *one_sided]
+    one_sided = [np.where(open_, covariance[:, i], 0.0) for i in np.flatnonzero(open_)]
+    return [*weakly, *aliased, *one_sided]
 
 
 def _groups(
     null: list[np.ndarray],
-    covariance: np.ndarray,
+    spread: Spread,
     unknowns: tuple[Unknown, ...],
     of_rows: tuple[np.ndarray, WithoutWeakPriors | None],
     around: Around,
     dead: tuple[str, ...] = (),
 ) -> tuple[Group, ...]:
-    """Return the parameters in null directions, those apart that no direction ties together.
-    Those without effect (`dead`) have a sentence of their own, and no combination."""
+    """Return the groups of parameters that null directions connect, but for those without effect
+    (`dead`)."""
     alive = np.array([u.name not in dead for u in unknowns])
     null = [v for v in null if np.abs(v[alive]).max(initial=0.0) > TAKES_PART]
     if not null:
         return ()
 
-    def spread(along: np.ndarray) -> tuple[float, float]:
-        wider, reach = around.widening(along)
-        return wider * math.sqrt(max(0.0, float(along @ covariance @ along))), reach
-
-    # Any basis of the null space serves; the reduced one has zeros wherever it can, and so shows
-    # which parameters are not tied together.
+    # The reduced basis of the null space has the most zeros.
     rows = np.array([unit_vector(v) for v in row_reduced(np.array(null), unknowns)[0]])
     parts = (np.abs(rows) > TAKES_PART) & alive
     rows, parts = rows[parts.any(axis=1)], parts[parts.any(axis=1)]
@@ -339,7 +310,7 @@ def _groups(
         mine, members = list(rows[labels == k]), parts[labels == k].any(axis=0)
         tied, exchanged = (), []
         if around.valley is not None:
-            tied = around.valley.tied(mine, spread, unknowns)
+            tied = around.valley.determined_combinations(mine, spread, unknowns)
         if without_weak is not None:
             exchanged = [n for v in mine for n in without_weak.exchanged(v, sensitivity)]
         names = tuple(unknowns[i].name for i in np.flatnonzero(members))
@@ -348,7 +319,7 @@ def _groups(
 
 
 def _pairs(correlation: np.ndarray, names: list[str], undetermined: list[str]) -> tuple[Pair, ...]:
-    """Return the pairs beyond the limit; what is not determined has no correlation."""
+    """Return the strongly correlated pairs of parameters that are determined."""
     strong = np.argwhere(np.tril(np.abs(correlation) > _STRONG, -1)).tolist()
     pairs = [Pair(names[j], names[i], float(correlation[i, j])) for i, j in strong]
     pairs = [p for p in pairs if not {p.first, p.second} & {*undetermined}]
@@ -357,19 +328,8 @@ def _pairs(correlation: np.ndarray, names: list[str], undetermined: list[str]) -
 
 def _prior_share(covariance: np.ndarray, bare: np.ndarray) -> np.ndarray:
     """Return the share (q,) of the variance by all priors."""
-    # The estimates' variance P = P (B'B + R) P is that of the data, whose rows are B, and that of
-    # all priors R. An unknown without a prior rests on another's where only the two together show.
+    # P = P (B'B + R) P is the sum of the parts of the data, with rows B, and of all priors R.
     variance = np.diag(covariance)
     of_data = np.sum((bare @ covariance) ** 2, axis=0)
     share = 1.0 - of_data / np.where(variance > 0, variance, 1.0)
     return np.clip(np.where(variance > 0, share, 0.0), 0.0, 1.0)
-
-
-def _is_rough(u: Unknown, sd: float, limits: Mapping[str, tuple[float, float]]) -> bool:
-    """True if a 95 % interval, by the likelihood where `limits` has it, is wide or holds zero."""
-    low, high = limits.get(u.name, (math.nan, math.nan))
-    if u.symmetric and (low <= 0.0 <= high if u.name in limits else Z95 * sd >= u.distance):
-        return True
-    if u.name in limits and u.logarithmic:
-        sd = max(abs(math.log(end / u.value)) for end in (low, high)) / Z95
-    return u.logarithmic and sd > _ROUGHLY

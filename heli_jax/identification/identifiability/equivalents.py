@@ -1,8 +1,8 @@
-"""Other parameter values that the data do not tell from those of an optimum.
+"""Other parameter values with the same residuals as those of an optimum.
 
-One search: some values are put elsewhere, all other unknowns follow (`Valley.visit`), and the
-residuals tell whether the point is as good. Points to put them at come from the directions that
-slopes leave open (`Valley.tied`), from an exchange of two modes (`second_solutions`), and from the
+One search serves all: some values are set elsewhere, all other unknowns follow (`Valley.visit`),
+and the sum of squares shows whether the point fits as well. The values come from null directions
+(`Valley.determined_combinations`), from an exchange of two modes (`second_solutions`), or from the
 aliases of a fast mode (`validation.logging_rate`).
 """
 
@@ -25,8 +25,6 @@ from heli_jax.identification.identifiability.verdict import Combination, SecondS
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Solution
-
-# The smallest sum of squares with some coordinates held: how all other unknowns follow.
 
 
 class Rows(NamedTuple):
@@ -52,24 +50,27 @@ def squares_of(r: np.ndarray) -> float:
 
 
 _RIDGE = 1.0 / 3.0
-"""one over how far a step may go, in coordinates most of which are logarithms, for nothing"""
+"""one over the largest step in a direction without effect, in coordinates of the search"""
 _ENOUGH = 0.05
-"""squares that a further step may promise where a search stops"""
+"""predicted gain of a further step [squares] at which a search stops"""
 _STEPS = 10
 _HUGE = 1e50
+"""squares and slopes of a simulation that diverges"""
 
 
 def descend(
     rows: Callable[[np.ndarray], Rows], z: np.ndarray, moving: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Return the point (q,) of the least squares near z (q,) by Levenberg and Marquardt, where the
-    coordinates `moving` (q,) may change, and the sum there less what a further step promises,
-    infinite where nothing finite is found."""
+    """Return the least-squares point (q,) near z (q,) by Levenberg-Marquardt, and the sum there
+    less the predicted gain of a further step; infinite if nothing finite is found.
+
+    Args:
+        moving: (q,) True for coordinates that may change.
+    """
     now, ridge, promised = rows(z), _RIDGE, math.inf
     squares = squares_of(now.r)
     for _ in range(_STEPS):
         J = now.J[:, moving]
-        # Past that the squares of a simulation that has diverged are no numbers.
         if not (squares < _HUGE and np.abs(J).max(initial=0.0) < _HUGE):
             return z, math.inf
         Q, R = np.linalg.qr(J)
@@ -83,7 +84,7 @@ def descend(
             break
         then = rows(z + step)
         gained = squares - squares_of(then.r)
-        # Negated: also what is not finite is no step.
+        # False if the sum is not finite.
         if gained > 0:
             z, now, squares = z + step, then, squares - gained
             ridge = max(_RIDGE, ridge / 10.0)
@@ -94,21 +95,18 @@ def descend(
     return z, squares - promised
 
 
-# Points far from an optimum at which the residuals are the same: what is true along all of them.
-#
-# A slope at one point tells a product of powers from a sum by nothing: La + Lb has the slope of
-# La Lb where both are equal. So one unknown after the other is moved by a finite factor, the rest
-# follow by Gauss and Newton, and only what has stayed is determined.
-
+# Slopes at one point do not distinguish a product from a sum: La + Lb has the slope of La Lb if
+# both are equal. So each unknown is moved by a finite factor, all others follow, and a combination
+# that stays constant is determined.
 
 SAME = 3.84
-"""squares by which a point may be worse and still be as good: the 95 % point of chi-squared"""
+"""excess of the squares up to which a point fits as well: 95 % point of chi-squared"""
 _FACTOR = 1.5
-"""by which each unknown is moved, up and down; those tied to it move as far, or change sign"""
+"""by which each unknown is moved"""
 _MOVED = 0.3
-"""logarithm by which a combination's own parameters have to move for its staying to tell"""
+"""least change of the logarithms of a combination's parameters"""
 _STAYS = 0.02
-"""part of that by which it may change: what rounded exponents make"""
+"""part of that by which the combination may change, as exponents are rounded"""
 
 
 class Point(NamedTuple):
@@ -117,18 +115,17 @@ class Point(NamedTuple):
     values: dict[str, float]
     """of the unknowns of interest, SI"""
     excess: float
-    """by how much its sum of squares is above that of the optimum"""
+    """sum of squares above that of the optimum"""
     expected: float
-    """the same as the slopes at the optimum have it"""
+    """the same as predicted by the slopes at the optimum"""
 
 
 class Valley(NamedTuple):
-    """A solution whose surroundings may be visited."""
+    """The surroundings of a solution."""
 
     problem: Problem
     at: Solution
     e: Evaluation
-    """there"""
 
     def visit(
         self,
@@ -138,14 +135,15 @@ class Valley(NamedTuple):
         same: bool = False,
         priors: bool = False,
     ) -> Point | None:
-        """Return the best point with some values held; None where there is none.
+        """Return the best point with some values held; None if no finite one is found.
 
         Args:
-            held: values that stay, SI.
-            guess: of other unknowns of interest, where the search begins; the optimum's unless
-                named.
-            same: whether the residuals themselves have to stay, each of them, and not only the sum
-                of their squares; asked where the valley's own point is no optimum too.
+            held: fixed values, SI.
+            guess: values of other unknowns of interest at which the search begins; the optimum's
+                unless named.
+            same: True to search the same residuals in place of the least squares, as at start
+                values.
+            priors: True to count the parameters' priors.
         """
         layout = self.at.layout
         names, z = layout.of_interest, np.array(self.at.z, np.float64)
@@ -158,7 +156,7 @@ class Valley(NamedTuple):
                 return None
             z[names.index(name)] = at
         moving = np.array([i >= len(names) or names[i] not in held for i in range(layout.size)])
-        # The parameters' priors stand before the nuisances'.
+        # The rows of the parameters' priors stand before those of the nuisances.
         last = self.e.r.size - (layout.size - layout.first_nuisance)
         own = slice(0) if priors else slice(last - len(layout.free), last)
         here = np.delete(np.asarray(self.e.r, np.float64), own)
@@ -176,12 +174,11 @@ class Valley(NamedTuple):
         expected = squares_of(np.asarray(self.e.J, np.float64) @ (z - np.asarray(self.at.z)))
         return Point({n: float(v) for n, v in zip(names, values, strict=True)}, excess, expected)
 
-    def tied(
+    def determined_combinations(
         self, null: Sequence[np.ndarray], spread: Spread, unknowns: tuple[Unknown, ...]
     ) -> tuple[Combination, ...]:
-        """Return the products of powers, else the sums, that change neither along null directions
-        at the optimum nor far from it.
-        """
+        """Return the products of powers, else the sums, that are constant along null directions,
+        at the optimum and far from it."""
         params = self.problem.model.Params
         units = {u.name: naming.unit(params, u.name) for u in unknowns if u.is_parameter}
         found = [
@@ -197,30 +194,27 @@ class Valley(NamedTuple):
     ) -> list[dict[str, float]]:
         """Return the values at points along the valley, to which each unknown is moved in turn."""
         N = np.array(null) * np.array([u.per_log if u.logarithmic else 0.0 for u in unknowns])
-        # Onto the null directions: how the logarithms of all go with that of one.
+        # The projection on the null directions: how all logarithms move with one.
         onto, points = np.linalg.pinv(N) @ N, []
         for i, u in enumerate(unknowns):
             if not onto[i, i] > 1e-2:
                 continue
-            along = onto[i] / onto[i, i]
-            others = [
-                k for k in np.flatnonzero(abs(along) > 1e-6) if k != i and unknowns[k].logarithmic
-            ]
-            for factor in (_FACTOR, 1.0 / _FACTOR):
-                # The others go by the same powers of the factor, or by equal steps.
-                for by in (factor**along, 1.0 + (factor - 1.0) * along):
-                    guess = {unknowns[k].name: unknowns[k].value * float(by[k]) for k in others}
-                    point = self.visit({u.name: u.value * factor}, guess, same=True)
-                    if point is not None and point.excess <= SAME:
-                        points.append(point.values)
-                        break
+            powers = onto[i] / onto[i, i]
+            guess = {
+                other.name: other.value * _FACTOR**power
+                for other, power in zip(unknowns, powers.tolist(), strict=True)
+                if other.name != u.name and abs(power) > 1e-6
+            }
+            point = self.visit({u.name: u.value * _FACTOR}, guess, same=True)
+            if point is not None and point.excess <= SAME:
+                points.append(point.values)
         return points
 
 
 def _stays(
     c: Combination, unknowns: tuple[Unknown, ...], points: Sequence[Mapping[str, float]]
 ) -> bool:
-    """True if a combination is the same at all points, and its parameters are not at one."""
+    """True if a combination is constant at all points, and its parameters change at one."""
     values, has_moved = {u.name: u.value for u in unknowns}, False
     for point in points:
         if c.kind == "sum":
@@ -239,39 +233,37 @@ def _stays(
     return has_moved
 
 
-# Two real modes that other parameters make.
-#
-# A servo's lag before a vehicle's damping answers as a slow servo before a quick vehicle does, with
-# another gain. No slope at one of the two tells of the other, and the start of a search decides
-# which of them it ends at. So for each pair of real modes the parameters that make them are put
-# where the modes are exchanged, and all others follow.
+# A fast servo before a slow vehicle has the same response as a slow servo before a fast vehicle
+# with another gain. So for each pair of real modes the parameters are changed such that the two
+# modes are exchanged, and all others follow.
 
 _APART = 9.0
-"""squares that the slopes let expect of the other values: below, the two are the same"""
+"""squares predicted by the slopes below which two solutions are one"""
 _CHANGED = 0.05
-"""relative change of a parameter's value that is worth naming"""
+"""relative change of a parameter that counts"""
 _RATIO = 1.1
-"""of two modes: nearer ones have nothing to exchange"""
+"""of two modes, below which they are not exchanged"""
 _MAKES = 0.05
-"""of the change of two modes that parameters make, the least beside the largest"""
+"""smallest singular value over the largest, and smallest logarithm, of an exchange"""
 _REACH = math.log(300.0)
-"""how far a parameter may be put"""
+"""largest change of a parameter's logarithm"""
 _VISITS = 3
-"""times that all unknowns follow after an exchange"""
+"""searches of all unknowns after an exchange"""
 _DIFFERENCE = 1e-5
-"""relative, of a parameter"""
+"""relative step of a parameter"""
 
 
 def second_solutions(
     problem: Problem, at: Solution, e: Evaluation, *, optimum: bool = True
 ) -> tuple[SecondSolution, ...]:
-    """Return other admissible values of the free parameters that the data do not tell from those
-    here, or that fit better.
+    """Return other admissible values of the free parameters that fit as well or better.
+
+    Args:
+        optimum: False at start values, where the residuals have to stay the same.
     """
     here = {n: float(v) for n, v in zip(at.layout.of_interest, e.named, strict=True)}
     here = {n: here[n] for n in problem.free if n in here}
-    # At the start values nothing has been fitted: any step would make the other the better one. Of
-    # rows that are sums over frequencies none stays.
+    # At start values any step is an improvement, and rows that are sums over frequencies change.
     if len(here) < 2 or not (optimum or at.layout.noise_model == "white"):
         return ()
     finite = np.isfinite(e.r).all() and np.isfinite(e.J).all()
@@ -279,8 +271,7 @@ def second_solutions(
         return ()
     valley, solutions = Valley(problem, at, e), []
     for held in _exchanged_modes(problem, here):
-        # Held until the others have followed, or the modes would change back; then all of them
-        # follow more than once, until they stay or are back.
+        # First with the exchanged values held, then all together until they settle.
         before, point = here, valley.visit(held, {}, same=not optimum, priors=True)
         for _ in range(_VISITS):
             if point is None:
@@ -289,11 +280,10 @@ def second_solutions(
             point = valley.visit({}, before, same=not optimum, priors=True)
             if point is not None and all(_alike(v, point.values[n]) for n, v in here.items()):
                 break
-        # What the slopes expect to be within the interval is no other solution.
+        # A point within the interval by the slopes is no other solution.
         if point is None or not (point.excess <= SAME and point.expected > _APART):
             continue
         there = {n: point.values[n] for n in here}
-        # A point that still moves is no solution.
         if not all(map(_alike, before.values(), there.values())):
             continue
         changed = tuple(n for n, v in here.items() if not _alike(v, there[n]))
@@ -309,11 +299,9 @@ def _alike(a: float, b: float) -> bool:
 
 @np.errstate(all="ignore")
 def _exchanged_modes(problem: Problem, values: Mapping[str, float]) -> list[dict[str, float]]:
-    """Return by pair of real modes of the linearised model the values of those parameters that
-    exchange the two, but for what is not linear in them.
-    """
+    """Return for each pair of real modes of the linearised model the changed parameters that
+    exchange the two, to first order in logarithms."""
     model, flight = problem.model, problem.training[0]
-    # What is zero has no relative change, and a delay makes no mode.
     names = [n for n, v in values.items() if v and n not in model.delay_parameters]
     params = problem.params_with(flight.known | dict(values))
     about = operating_point(
@@ -331,7 +319,7 @@ def _exchanged_modes(problem: Problem, values: Mapping[str, float]) -> list[dict
     found = []
     if real.size < 2:
         return found
-    # Which pole is which is told by nearness, as the step is small.
+    # Poles after the small step are matched by distance.
     slopes = []
     for n in names:
         there = poles(**{n: values[n] * (1.0 + _DIFFERENCE)})
@@ -339,11 +327,10 @@ def _exchanged_modes(problem: Problem, values: Mapping[str, float]) -> list[dict
         slopes.append(np.nan_to_num(np.real(near / here - 1.0) / _DIFFERENCE))
     for i, j in itertools.combinations(real, 2):
         ratio = float((here[j] / here[i]).real)
-        # The same mode twice has no slope, and nothing to exchange.
         if not (ratio > 0 and abs(math.log(ratio)) > math.log(_RATIO)):
             continue
         target, E = math.log(ratio) * np.array([1.0, -1.0]), np.array(slopes).T[[i, j]]
-        # The smallest change of all parameters that exchanges the two.
+        # The smallest change of the parameters.
         z = np.linalg.pinv(E, rcond=_MAKES) @ target
         z[np.abs(z) < _MAKES] = 0.0
         if np.allclose(E @ z, target, rtol=0.1) and np.max(np.abs(z)) < _REACH:

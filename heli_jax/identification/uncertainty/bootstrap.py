@@ -1,6 +1,6 @@
-"""Bootstrap: records about the estimated vehicle's response are identified again, many times."""
+"""Parametric bootstrap."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -8,119 +8,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from heli_jax import naming, stages
-from heli_jax.flights.flight import Flight
+from heli_jax import stages
 from heli_jax.identification.estimation.frequency_lines import (
     errors_of_lines,
     in_time_of,
     records_of,
 )
-from heli_jax.identification.estimation.levenberg_marquardt import Optimum
-from heli_jax.identification.estimation.many_runs import optimise_many
+from heli_jax.identification.estimation.levenberg_marquardt import Optimum, optimise
 from heli_jax.identification.estimation.multistart import Search
 from heli_jax.identification.estimation.noise_covariance import relax_noise_covariance
-from heli_jax.identification.problem import FEWEST_SEEN
 from heli_jax.identification.result import Fit
 from heli_jax.identification.uncertainty.autocorrelated_residuals import drawn
 from heli_jax.identification.unknowns.layout import Data, Layout, Solution, unpack, value_of
 
 _STEPS = 200
-"""of the optimiser at most, in frequency"""
-
-
-class Refits(NamedTuple):
-    """Estimates of many records."""
-
-    values: dict[str, np.ndarray]
-    """by free parameter, (records,); NaN where a record did not converge"""
-    converged: np.ndarray
-    """(records,); False too where an output has fewer than 8 measured samples"""
-    cost: np.ndarray
-    """(records,) sum of squares over the number of measured samples, by the noise of the fit: 1
-    where a record is as noisy, more where the model explains it less; NaN with too few samples"""
-
-
-def refit(
-    fit: Fit,
-    records: Sequence[Sequence[Flight] | Flight],
-    *,
-    say: Callable[[str], None] = lambda _: None,
-) -> Refits:
-    """Estimate the parameters of a fit anew from other records, side by side.
-
-    Each record has the flights of the fit, of the same length and rate, with inputs and outputs of
-    its own; all else is the fit's, and all searches begin at its optimum. No verdict is made of a
-    record, and no interval.
-
-    Args:
-        fit: with output error or filter error.
-        records: each a Flight, or as many as the fit has.
-        say: called with a sentence where many records are not fitted by programs of machine code.
-
-    Raises:
-        TypeError: a record that is no flights.
-        ValueError: a record is not like that of the fit, with what differs; a method that estimates
-            the noise's spectrum.
-    """
-    at = fit.reached
-    if at.layout.noise_model == "spectrum":
-        raise ValueError(f"refit: not available with method {fit.method}")
-    if not records:
-        raise ValueError("refit: expected one record at least, got none")
-    flights = [_like(at, r, f"refit, record {k}") for k, r in enumerate(records)]
-
-    def stacked(signals: list[np.ndarray]) -> Array:
-        return jnp.asarray(np.stack(signals), at.z.dtype)
-
-    inputs, outputs = [], []
-    for i, own in enumerate(at.data.flights):
-        names = naming.names(at.layout.model.Inputs)
-        driven = {n: stacked([r[i].inputs[n] for r in flights]) for n in names}
-        inputs.append(at.layout.model.Inputs(**driven))
-        outputs.append({n: stacked([r[i].outputs[n] for r in flights]) for n in own.outputs})
-
-    def data(record: Any) -> Data:
-        each = zip(at.data.flights, *record, strict=True)
-        return at.data._replace(flights=tuple(f._replace(outputs=y, inputs=u) for f, y, u in each))
-
-    optima = optimise_many(at, data, len(flights), (tuple(outputs), tuple(inputs)), say)
-    seen = [[np.isfinite(y).sum() for f in r for y in f.outputs.values()] for r in flights]
-    enough = np.array([min(counts) >= FEWEST_SEEN for counts in seen])
-    converged = np.asarray(optima.converged) & enough
-    values = {n: np.where(converged, v, np.nan) for n, v in _values(at, optima.z).items()}
-    return Refits(values, converged, np.where(enough, np.asarray(optima.cost), np.nan))
-
-
-def _values(at: Solution, z: Any) -> dict[str, np.ndarray]:
-    """Return by free parameter (records,) at the unknowns (records, q)."""
-    z = jnp.asarray(z)
-    return {
-        n: np.asarray(value_of(at.layout, at.data, i, z[:, i]))
-        for i, n in enumerate(at.layout.free)
-    }
-
-
-def _like(at: Solution, record: Any, where: str) -> list[Flight]:
-    """Return the flights of a record, which have to be like the fit's."""
-    flights = [record] if isinstance(record, Flight) else record
-    if not isinstance(flights, Sequence) or not all(isinstance(f, Flight) for f in flights):
-        raise TypeError(f"{where}: expected a Flight or a list of them, got {record!r:.80}")
-    if len(flights) != len(at.data.flights):
-        raise ValueError(f"{where}: expected {len(at.data.flights)} flights, got {len(flights)}")
-    names = naming.names(at.layout.model.Inputs)
-    for flight, own, hold in zip(flights, at.data.flights, at.layout.holds, strict=True):
-        expected = {
-            "samples": (next(iter(own.outputs.values())).shape[0], flight.n_samples),
-            "dt": (float(own.dt), float(flight.dt)),
-            "inputs": (list(names), [n for n in names if n in flight.inputs]),
-            "outputs": (sorted(own.outputs), sorted(flight.outputs)),
-            "hold": (list(hold), [flight.hold.get(n) for n in names]),
-            "known": tuple({n: float(v) for n, v in f.known.items()} for f in (own, flight)),
-        }
-        for name, (value, got) in expected.items():
-            if value != got:
-                raise ValueError(f"{where}: expected {name} {value} as the fit has, got {got}")
-    return list(flights)
+"""steps of the optimiser in frequency, at most"""
+_STEPS_IN_TIME = 60
+"""the same in time, from the fit's optimum"""
 
 
 class Bootstrap(NamedTuple):
@@ -131,7 +35,7 @@ class Bootstrap(NamedTuple):
     failures: int
     """runs that did not converge"""
     records: tuple[int, ...] = ()
-    """the numbers of the records that these are of"""
+    """numbers of the records in `values`"""
 
     def interval(self, name: str) -> tuple[float, float]:
         """Return 2.5 and 97.5 % of the values."""
@@ -139,21 +43,16 @@ class Bootstrap(NamedTuple):
         return float(low), float(high)
 
 
-def bootstrap(
-    fit: Fit, runs: int = 200, *, seed: int = 0, say: Callable[[str], None] = lambda _: None
-) -> Bootstrap:
-    """Refit records simulated with the estimates: same inputs, same missing samples, new noise.
+def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
+    """Refit records simulated with the estimates: same inputs and missing samples, new noise.
 
-    Filter error draws the disturbance anew. Output error adds white noise, or where its residuals
-    are autocorrelated, noise with their covariance over time and between outputs. Frequency error
-    draws residuals line by line, and estimates the spectrum anew.
-
-    Args:
-        say: called with a sentence where many records are not fitted by programs of machine code.
+    Filter error draws a new disturbance. Output error adds white noise, or noise with the
+    covariance of autocorrelated residuals over time and between outputs. Frequency error draws
+    residuals line by line, and estimates the spectrum again.
 
     Raises:
-        ValueError: no run; the time shift is free in a fit in time, the data do not determine every
-            parameter, or responses are fitted, which have no residual at lines.
+        ValueError: no run, a free time shift in a fit in time, a parameter that is not
+            identifiable, or a fit of frequency responses.
     """
     if runs < 1:
         raise ValueError(f"bootstrap: expected at least 1 run, got {runs}")
@@ -166,34 +65,44 @@ def bootstrap(
     if fit.not_identifiable:
         raise ValueError(f"bootstrap: the data do not determine {', '.join(fit.not_identifiable)}")
     rng = np.random.default_rng(seed)
-    # Priors are measurements too, of another kind: their means are drawn anew as well.
+    # Priors are measurements: their means are drawn too.
     values = np.array([fit.estimates[n].value for n in at.layout.free])
     prior_sd = np.where(np.isfinite(at.data.prior_sd), at.data.prior_sd, 0.0)
     records = () if in_frequency else _records(fit, at, runs, seed, rng)
     means = values + prior_sd * rng.standard_normal((runs, values.size))
-    means = jnp.asarray(means, at.z.dtype)
+    means = means.astype(at.z.dtype)
 
-    def data(record: Any) -> Data:
-        outputs, mean = record
-        each = zip(at.data.flights, outputs, strict=True)
-        flights = tuple(f._replace(outputs=y) for f, y in each)
-        return at.data._replace(flights=flights, prior_mean=mean)
+    def data(k: int) -> Data:
+        flights = tuple(
+            f._replace(outputs={n: y[k] for n, y in outputs.items()})
+            for f, outputs in zip(at.data.flights, records, strict=True)
+        )
+        return at.data._replace(flights=flights, prior_mean=means[k])
 
     if in_frequency:
         z, converged = _fit_by_lines(at, means, rng)
     else:
-        optima = optimise_many(at, data, runs, (records, means), say)
-        z, converged = optima.z, np.asarray(optima.converged)
-    # No nuisances: weak priors hold them, which are not drawn anew.
+        optima = []
+        for k in range(runs):
+            # The outer stage counts records.
+            with stages.stage("one record", shown=False):
+                optima.append(optimise(at.layout, data(k), at.noise, at.z, _STEPS_IN_TIME))
+            stages.advance()
+        z, converged = np.stack([o.z for o in optima]), np.array([o.converged for o in optima])
+    # Without the nuisances, whose weak priors are not drawn.
     fitted = np.flatnonzero(converged)
-    estimates = _values(at, np.asarray(z)[fitted])
+    z = jnp.asarray(np.asarray(z)[fitted])
+    estimates = {
+        n: np.asarray(value_of(at.layout, at.data, i, z[:, i]))
+        for i, n in enumerate(at.layout.free)
+    }
     return Bootstrap(estimates, runs - fitted.size, tuple(map(int, fitted)))
 
 
 def _records(
     fit: Fit, at: Solution, runs: int, seed: int, rng: np.random.Generator
-) -> tuple[dict[str, Array], ...]:
-    """Draw by flight and output (runs, N); NaN where the record has it."""
+) -> tuple[dict[str, np.ndarray], ...]:
+    """Return simulated outputs by flight, (runs, N); NaN where the record has it."""
     u = unpack(at.layout, at.data, at.z)
     noise_free = at.layout.objective.records(at, u, runs, seed)
     records = []
@@ -210,7 +119,7 @@ def _records(
                 noise = coloured[:, at.layout.outputs[i].index(n)]
             record = np.asarray(outputs[n]) + float(u.biases[i][n]) + noise
             record = np.where(np.isnan(np.asarray(y)), np.nan, record)
-            by_output[n] = jnp.asarray(record, at.z.dtype)
+            by_output[n] = record.astype(at.z.dtype)
         records.append(by_output)
     return tuple(records)
 
@@ -218,15 +127,13 @@ def _records(
 def _fit_by_lines(
     at: Solution, means: Float[Array, "runs p"], rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "runs q"], Bool[np.ndarray, " runs"]]:
-    """Fit drawn records one by one, each with its means of the priors and its own spectrum; return
-    the unknowns, and whether they converged."""
+    """Fit drawn records one by one, each with its own means of priors and spectrum; return the
+    unknowns and convergence."""
     z, converged = [], []
-    begun = Optimum(
-        at.z, jnp.zeros((), at.z.dtype), np.asarray(0), np.asarray(True), np.asarray(np.inf)
-    )
+    begun = Optimum(at.z, 0.0, 0, True)
     for mean, data in zip(means, _spectrum_records(at, rng), strict=False):
         search = _FromOptimum(at.layout, data._replace(prior_mean=mean))
-        # Steps of its search are none of the stage's, which counts records.
+        # The outer stage counts records.
         with stages.stage("one record", shown=False):
             best = relax_noise_covariance(search, at.noise, begun).best
         z.append(np.asarray(best.z))
@@ -236,28 +143,28 @@ def _fit_by_lines(
 
 
 class _FromOptimum(Search):
-    """The optimiser in the coordinates in which a fit ended, over other numbers."""
+    """The search in the final coordinates of a fit, with other data."""
 
     def __init__(self, layout: Layout, data: Data) -> None:
         self.problem: Any = None
-        self.layout = self.bounded = layout
+        self.layout = layout
         self.data, self.max_steps = data, _STEPS
 
 
 def _spectrum_records(at: Solution, rng: np.random.Generator) -> Iterator[Data]:
-    """Yield the numbers of the problem, again and again with other noise.
+    """Yield the data of the problem with other noise, without end.
 
-    The model's response and the ends of each record stay, and every line gets a whitened residual
-    that another one had, with any phase, at the size that the spectrum gives it there (Franke and
-    Härdle, 1992, On bootstrapping kernel spectral estimates). Nothing is simulated in time.
+    The model's response and the ends of each record stay. Every line gets the whitened residual of
+    a random line, with a random phase, scaled by the spectrum (Franke and Härdle, 1992, On
+    bootstrapping kernel spectral estimates). Nothing is simulated in time.
     """
     layout, noise = at.layout, at.noise
     errors = jax.device_get(errors_of_lines(layout, at.data, noise, at.z).errors)
     records = records_of(layout)
-    # What the unknowns fit of the noise is missing in the residual.
+    # The residual lacks what the unknowns fit of the noise.
     rows = sum(2 * e.size for e in errors)
     freedom = (rows / max(rows - len(layout.of_interest), 1)) ** 0.5
-    # Flights of the same outputs share what is drawn from.
+    # Flights with the same outputs share one pool.
     white: dict[tuple[str, ...], list[np.ndarray]] = {}
     for record, e, W in zip(records, errors, noise.whitening, strict=True):
         whitened = (np.asarray(W) @ e[:, :, None])[:, :, 0]

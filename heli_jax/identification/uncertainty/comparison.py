@@ -1,4 +1,4 @@
-"""Four intervals of one parameter side by side, and which to believe where they differ."""
+"""Intervals of a parameter by four methods, and findings on their differences."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,17 +14,17 @@ from heli_jax.identification.uncertainty.nuts import EFFECTIVE, RHAT, Posterior,
 from heli_jax.stages import stage
 
 DIFFERENT = 0.15
-"""intervals whose ends lie further apart than this part of their width differ"""
+"""largest distance between the ends of equal intervals, over their width"""
 _OF_QUANTILES = 2.0
-"""over the root of the number of samples, the same for the ends of a bootstrap: three standard
-deviations of a normal sample's 2.5 % quantile, sqrt(0.025 0.975) / 0.0584 of its own, over 3.92"""
+"""the same for n samples of a bootstrap, times sqrt(n): three sd of a normal sample's 2.5 %
+quantile, sqrt(0.025 0.975) / 0.0584, over 3.92"""
 
 type _Ends = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
-    """95 % intervals by parameter and method, and what they came from."""
+    """95 % intervals by parameter and method, and their sources."""
 
     by_parameter: dict[str, dict[str, tuple[float, float]]]
     """parameter -> method ('gaussian', 'profile', 'bootstrap', 'nuts') -> (lower, upper)"""
@@ -48,12 +48,12 @@ def intervals(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> Intervals:
-    """Profile likelihood, bootstrap and posterior beside the Gaussian intervals of a fit.
+    """Return intervals by profile likelihood, bootstrap and NUTS beside the Gaussian ones of a fit.
 
-    A fit that did not converge, or left a parameter open, has the Gaussian ones alone.
+    A fit that is not converged and identifiable has only Gaussian intervals.
 
     Args:
-        profiles: parameters to profile; none unless given.
+        profiles: parameters to profile.
         runs: records of the bootstrap, 0 for none.
         draws: draws of each of four NUTS chains, 0 for none (needs the extra `bayes`).
         progress: called with a line of text before each longer part of the work.
@@ -71,7 +71,6 @@ def intervals(
     if fit.status != "converged" and (profiles or runs or draws):
         findings.append(found("intervals.none", "doubt", *fit.not_identifiable))
         profiles, runs, draws = None, 0, 0
-    # From the quickest to the slowest, so that a mistake shows early.
     if profiles:
         report(f"profile likelihood of {', '.join(profiles)}")
         with stage(f"profile likelihood of {', '.join(profiles)}", name="profile likelihood"):
@@ -79,7 +78,7 @@ def intervals(
     if runs:
         report(f"bootstrap, {runs} records")
         with stage("bootstrap", total=runs):
-            booted = bootstrap(fit, runs, seed=seed, say=report)
+            booted = bootstrap(fit, runs, seed=seed)
     if draws:
         report(f"NUTS, 4 chains of {draws} draws")
         with stage("NUTS"):
@@ -91,7 +90,6 @@ def intervals(
         by_parameter[name] = {"gaussian": (estimate.lower95, estimate.upper95)}
         if name in profiled:
             by_parameter[name]["profile"] = (profiled[name].lower95, profiled[name].upper95)
-        # Percentiles of a single value would be an interval of no width.
         if booted is not None and booted.values[name].size > 1:
             by_parameter[name]["bootstrap"] = booted.interval(name)
         if posterior is not None:
@@ -113,7 +111,7 @@ def _findings(
     posterior: Posterior | None,
 ) -> list[Finding]:
     findings = []
-    # In frequency all go by the noise's spectrum.
+    # Methods in frequency weigh by the noise's spectrum.
     white = fit.coloured and fit.reached.layout.noise_model != "spectrum"
     if white and any({"profile", "nuts"} & set(by) for by in by_parameter.values()):
         findings.append(found("intervals.residuals-coloured"))
@@ -123,7 +121,7 @@ def _findings(
         numbers = {"rhat": posterior.rhat, "draws": posterior.effective}
         limits = {"most_rhat": RHAT, "least_draws": EFFECTIVE}
         findings.append(found("intervals.chains", value=posterior.divergent, **numbers, **limits))
-    # With coloured residuals they differ for the reason that was given above.
+    # With coloured residuals they differ for that reason.
     for name, by in () if fit.coloured else by_parameter.items():
         sampled = 0 if booted is None else booted.values[name].size
         limits = {"bootstrap": max(DIFFERENT, _OF_QUANTILES / max(sampled, 1) ** 0.5)}

@@ -35,17 +35,17 @@ from heli_jax.identification.unknowns.layout import (
 _STEP = 1e-3
 """of a coordinate, for a difference"""
 _NO_EFFECT = 1e-5
-"""of the largest singular value, below which a direction is that of the common scale"""
+"""singular value over the largest below which a direction is that of the common scale"""
 _TAKES_PART = 0.02
-"""part of a direction without effect from which on a size is lost with it"""
+"""component in that direction from which on a size is not determined"""
 
 
 def size_deviations(at: Solution, e: Evaluation) -> dict[str, float]:
-    """Return by size of a noise the standard deviation of its logarithm, in its own unit; {} where
-    the sizes are not relative to the noise of one output, which may be next to nothing.
+    """Return the sd of the logarithm of each size of a noise [1]; {} unless the sizes are relative
+    to a common scale.
 
-    In its own unit a size is its coordinate plus the logarithm of the common scale, which moves by
-    -1/2 of the mean of log s (the variances of the innovations).
+    The log of a size is its coordinate plus the log of the common scale, which changes by -1/2 of
+    the mean of log s, with s the variances of the innovations.
     """
     layout = at.layout
     if not (layout.filtered and layout.concentrated and np.isfinite(e.J).all()):
@@ -58,28 +58,27 @@ def size_deviations(at: Solution, e: Evaluation) -> dict[str, float]:
         mean[j] = (innovation_sums(moved, at.noise)[1] - here) / (n * _STEP)
     rows = np.tile(-0.5 * mean, (len(layout.sizes), 1))
     rows[range(len(layout.sizes)), [layout.disturbance_at(name) for name in layout.sizes]] += 1.0
-    # The scale itself is known to 1/(2 n) from the innovations' squares.
+    # The squares of the innovations determine the log of the scale with variance 1/(2 n).
     sds = combined_deviations(e.J, rows, _NO_EFFECT, _TAKES_PART)
     sds = np.sqrt(sds**2 + 0.5 / n)
     return dict(zip(layout.sizes, map(float, sds), strict=True))
 
 
-_SAYS_NOTHING = 1e3
-"""A disturbance's standard deviation or correlation time whose interval reaches by this factor to
-either side is not identifiable."""
+_UNBOUNDED = 1e3
+"""factor to either side of an interval from which on a disturbance's parameter is not
+identifiable"""
 _LARGEST = 700.0
-"""log of a factor by which an interval reaches at most: the largest float64 is exp(709)"""
+"""largest log of an interval's factor: exp overflows at 709"""
 
 
 def estimates_of(
     problem: Problem, at: Solution, e: Evaluation, errors: StandardErrors
 ) -> dict[str, Estimate]:
-    """Return the unknowns of interest: free parameters, gains, time shift."""
+    """Return the estimates of the free parameters, gains and time shift."""
     e = errors.by or e
     alone = _insensitivity(e)
     estimates = {}
     for i, u in enumerate(unknowns_of(problem, at.layout, e)):
-        # Relative to its reference: the size of the value, or a sample for the time shift.
         white = float(np.sqrt(errors.verdict.covariance[i, i]))
         relative = white * float(errors.wider[i])
         ends = errors.limits.get(u.name) or _interval95(u, relative, float(errors.quantiles[i]))
@@ -109,8 +108,8 @@ def estimates_of(
 
 
 def _insensitivity(e: Evaluation) -> Float[np.ndarray, " q"]:
-    """Return the standard deviation of each unknown if all others were known, over that which it
-    has; 1 where it is not identifiable."""
+    """Return the sd of each unknown if all others were known, over its sd; 1 where it is not
+    identifiable."""
     norms = np.linalg.norm(np.asarray(e.J, np.float64), axis=0)
     sds = deviations(e.J)
     known = (norms > 0) & np.isfinite(sds)
@@ -119,7 +118,7 @@ def _insensitivity(e: Evaluation) -> Float[np.ndarray, " q"]:
 
 
 def _interval95(u: Unknown, relative: float, quantile: float) -> tuple[float, float]:
-    # Symmetric in the coordinate of the search: in the parameter of one sign, by equal factors.
+    # A parameter of one sign has equal factors to either side.
     if u.symmetric or not u.logarithmic:
         reach = quantile * relative * u.reference
         return u.value - reach, u.value + reach
@@ -139,7 +138,7 @@ def _unit(problem: Problem, name: str) -> str:
 def flight_nuisances(
     problem: Problem, at: Solution, e: Evaluation, errors: StandardErrors
 ) -> dict[str, Estimate]:
-    """Return the disturbance, then initial states, biases and input offsets."""
+    """Return the estimates of the disturbance, initial states, biases and input offsets."""
     layout = at.layout
     if layout.size == len(layout.of_interest):
         return {}
@@ -149,13 +148,13 @@ def flight_nuisances(
         sds[layout.disturbance_at(name)] = relative * wider[layout.disturbance_at(name)]
     reaches = errors.quantiles * sds
     estimates = {}
-    # The parameters of process noise, searched in their logarithms: intervals by factors.
+    # The parameters of process noise are searched in their logarithms.
     starts = problem.noise | {sensor_noise(n): f for n, f in problem.filtered_noise.items()}
     disturbance = unpack(layout, at.data, at.z).noise
     for i, name in enumerate(layout.noises, len(layout.of_interest)):
         value, factor = float(disturbance[name]), float(np.exp(min(reaches[i], _LARGEST)))
         numbers = (value * float(sds[i]), value / factor, value * factor)
-        if factor >= _SAYS_NOTHING:
+        if factor >= _UNBOUNDED:
             numbers = (None, None, None)
         unit = naming.unit(layout.model.Params, name) or ""
         estimates[name] = Estimate(value, *numbers, unit, starts[name].start, 0.0, False)
@@ -163,7 +162,7 @@ def flight_nuisances(
     for i, u in enumerate(unknowns, layout.first_nuisance):
         scale = u.scale(at.data)
         value, sd, reach = (float(v * scale) for v in (at.z[i], sds[i], reaches[i]))
-        # Scaled so that the sd of each weak prior is one: its precision is the prior's share.
+        # In sds of the weak prior the variance is the prior's share.
         share = min(1.0, float(whites[i]) ** 2)
         estimates[u.label] = Estimate(
             value, sd, value - reach, value + reach, _unit_of(problem, u), 0.0, share, False
@@ -176,14 +175,14 @@ def _unit_of(problem: Problem, u: FlightUnknown) -> str:
         return naming.unit(problem.model.State, u.of) or ""
     if u.kind == "bias":
         return naming.unit(problem.model.Outputs, u.of) or ""
-    # An offset is in the log's plain numbers where the estimated gain carries the unit.
+    # With an estimated gain that has a unit, the offset is a plain number.
     plain = problem.gain_units.get(u.of, "1") != "1"
     return "1" if plain else naming.unit(problem.model.Inputs, u.of) or ""
 
 
 def without_disturbance(estimate: Estimate, *, size: bool) -> Estimate:
-    """Return the estimate of a disturbance's parameter where no disturbance shows: a size is zero
-    then, at its bound; a time means nothing."""
+    """Return the estimate of a parameter of an insignificant disturbance: a size is zero, at its
+    bound; a time has no interval."""
     value = 0.0 if size else estimate.value
     return estimate._replace(value=value, sd=None, lower95=None, upper95=None, at_bound=size)
 
@@ -191,8 +190,8 @@ def without_disturbance(estimate: Estimate, *, size: bool) -> Estimate:
 def noise_by_name(
     problem: Problem, noise: Noise, scales: Mapping[str, ArrayLike]
 ) -> dict[str, float]:
-    """Return the sd of the measurement noise as 'flight/output', in the output's SI unit; `scales`
-    are factors by output that are unknowns themselves, 1 unless named."""
+    """Return the sd of the measurement noise by 'flight/output' [SI], with estimated factors
+    `scales` by output."""
     return {
         f"{label}/{n}": float(np.asarray(sd)) * float(np.asarray(scales.get(n, 1.0)))
         for label, by_name in zip(labels(problem.training), noise.sd, strict=True)

@@ -1,4 +1,4 @@
-"""Draws from the posterior by the No-U-Turn sampler, on the residual that the fit minimised."""
+"""Draws from the posterior by the No-U-Turn sampler (NUTS)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -27,12 +27,12 @@ from heli_jax.identification.unknowns.layout import (
 RHAT = 1.01
 """potential scale reduction below which the chains agree (Vehtari et al., 2021)"""
 EFFECTIVE = 400
-"""effective draws above which an interval may be read off: 100 a chain (Vehtari et al., 2021)"""
+"""effective draws above which an interval is reliable: 100 a chain (Vehtari et al., 2021)"""
 _CHAINS = 4
 _BLOCKS = 20
-"""in which the chains go on, one after another"""
+"""parts of a chain, for progress"""
 _TARGET = 0.8
-"""acceptance rate that the step is adapted to (Hoffman and Gelman, 2014)"""
+"""acceptance rate (Hoffman and Gelman, 2014)"""
 
 
 class Convergence(NamedTuple):
@@ -44,7 +44,7 @@ class Convergence(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Draws of the free parameters and whether they may be believed."""
+    """Draws of the free parameters and their convergence."""
 
     draws: dict[str, np.ndarray]
     """by free parameter, (chains, draws)"""
@@ -56,15 +56,15 @@ class Posterior:
     convergence: dict[str, Convergence] = field(default_factory=dict)
     """by free parameter, in the optimiser's coordinates"""
     nuisance: dict[str, np.ndarray] = field(default_factory=dict)
-    """draws of what was sampled beside the free parameters, as `Fit.nuisance` names it, the noise's
-    factors as 'noise factor OUTPUT'; the scale of the noise is integrated out and so has none"""
+    """draws of the other unknowns by the names of `Fit.nuisance`, and of 'noise factor OUTPUT'; the
+    scale of the noise is integrated out"""
     statistics: dict[str, np.ndarray] = field(default_factory=dict)
     """by draw (chains, draws), by arviz' names: `diverging`, `energy`, `acceptance_rate`, `n_steps`
     (of the integrator), `tree_depth`, `lp` (log density but for a constant), `step_size`"""
 
     @property
     def trusted(self) -> bool:
-        """True if the chains agree, and are long enough for an interval."""
+        """True if the chains converged and are long enough for an interval."""
         return self.rhat < RHAT and self.effective > EFFECTIVE and self.divergent == 0
 
     def interval(self, name: str) -> tuple[float, float]:
@@ -72,20 +72,9 @@ class Posterior:
         low, high = np.percentile(self.draws[name], [2.5, 97.5])
         return float(low), float(high)
 
-    def to_arviz(self) -> Any:
-        """Return the draws as arviz' inference data (an xarray DataTree): groups `posterior`, of
-        the free parameters, and `sample_stats`.
-
-        Raises:
-            ValueError: arviz is not installed (extra `bayes`).
-        """
-        from heli_jax.exports import posterior_tree
-
-        return posterior_tree(self.draws, self.statistics)
-
 
 def nuts(fit: Fit, draws: int = 500, *, warmup: int = 200, seed: int = 0) -> Posterior:
-    """Draw four chains of `draws` draws each, begun about the optimum in its own ellipse.
+    """Return four chains of `draws` draws each, from points near the optimum.
 
     The prior is flat in the optimiser's coordinates (log of a parameter of one sign) beside the
     priors of the problem; the scale of the noise is integrated out (Jeffreys).
@@ -106,12 +95,12 @@ def nuts(fit: Fit, draws: int = 500, *, warmup: int = 200, seed: int = 0) -> Pos
     if fit.not_identifiable:
         raise ValueError(f"nuts: the data do not determine {', '.join(fit.not_identifiable)}")
     e = evaluate(at.layout, at.data, at.noise, at.z)
-    # Whitened by the Gaussian approximation, so that all directions have size one: J = QR, and with
-    # z = z0 + R^-1 xi the precision J'J = R'R becomes the unit matrix.
+    # Whitened by the Gaussian approximation: with J = QR and z = z0 + R^-1 xi the precision of xi
+    # is the unit matrix.
     triangle = np.linalg.qr(np.asarray(e.J, np.float64), mode="r")
     root = jnp.asarray(np.linalg.inv(triangle), at.z.dtype)
 
-    # Traced once each, where blackjax traces them anew for each of its ten uses.
+    # Jitted here, as blackjax traces it for each of its ten uses.
     @jax.jit
     def density(xi: Array) -> Array:
         return log_posterior(at.layout, at.data, at.noise, at.z + root @ xi)
@@ -152,7 +141,7 @@ def _sample(
     with stages.stage(f"NUTS, warm-up of {warmup} steps"):
         (state, parameters), _ = jax.block_until_ready(run(keys[1], first, warmup))
     sampler = blackjax.nuts(density, **parameters)
-    # Chains begin apart, so that R-hat can tell whether they meet.
+    # Chains begin apart: R-hat compares them.
     settling = warmup // 2
 
     # The states are blackjax's own records: `Any`.
@@ -208,7 +197,7 @@ def _posterior(
     fitted = [s.flight for s in fit.signals if not s.hold_out]
     for i, one in enumerate(flight_unknowns(layout, fitted), layout.first_nuisance):
         nuisance[one.label] = np.asarray(z[..., i]) * one.scale(data)
-    # In the optimiser's coordinates, in which the posterior is nearest to a normal distribution.
+    # In the optimiser's coordinates the posterior is nearest to a normal distribution.
     named = z[:, :, : len(layout.free)]
     rhat = np.asarray(jax.jit(diagnostics.potential_scale_reduction)(named))
     effective = np.asarray(jax.jit(diagnostics.effective_sample_size)(named))
@@ -227,13 +216,13 @@ def _posterior(
 def log_posterior(
     layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
 ) -> Float[Array, ""]:
-    """Return the log density of z but for a constant, from the fit's own rows.
+    """Return the log density of z but for a constant.
 
-    The scale of the noise is integrated out under Jeffreys' prior: of each flight and output with
-    output error, the common one with filter error, unless it was fixed.
+    The scale of the noise is integrated out under Jeffreys' prior unless it is fixed: that of each
+    flight and output with output error, the common one with filter error.
     """
     rows = rows_of(layout, data, noise._replace(own=()), z)
     rest = jnp.concatenate([prior_rows(layout, data, z), weak_rows(layout, z)])
-    # The rows of the priors come last and have no scale to be integrated out.
+    # The rows of the priors come last; their scale is known.
     measured = layout.objective.log_density(layout, data, rows[: rows.shape[0] - rest.shape[0]])
     return measured - 0.5 * jnp.sum(rest**2)

@@ -1,11 +1,10 @@
-"""The unknowns of a problem: one vector z, what stands where in it, and the numbers beside it.
+"""The unknowns of a problem: their places in one vector z, and the numbers of the problem.
 
 z holds coordinates of the free parameters, then input gains, the time shift, the disturbance, the
 noise of sensors before filters and of outputs, then for each flight the initial state, the biases
 and the offsets of the inputs.
 """
 
-import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -24,21 +23,21 @@ from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.transforms import Real
 
-# Where a type is Any here it is a record class of the model (Params, State, Inputs: a user's own
-# classes), or numbers that are NumPy's before they are put on the device and JAX's after.
+# Any stands for a record class of the model (Params, State, Inputs), and for numbers that are
+# NumPy's before they are on the device and JAX's after.
 
 _BLOCK = 32
 _SCALES = 40.0
 """logarithm by which the noise of one output may differ from its guess"""
 _FAINTEST, _STRONGEST = 60.0, 10.0
-"""logarithms: how far sigma_w may fall below the measured motion, and rise above what would move
-the model as far as it was measured within one sample"""
+"""logarithms by which sigma_w may fall below the measured motion, and rise above the disturbance
+that moves the model so far within one sample"""
 _SHORTEST, _LONGEST = 0.01, 1e3
 """bounds of tau_w, in samples and in lengths of the record"""
 
 
 class FlightData(NamedTuple):
-    """One flight as arrays: what a trace may see of it."""
+    """One flight as arrays."""
 
     dt: Any
     """[s]"""
@@ -55,7 +54,7 @@ class FlightData(NamedTuple):
     offset_scale: dict[str, Any]
     """sd of the weak prior on the offset of each input"""
     by_instrument: Any = None
-    """the model's Inputs, arrays (N,): what of the inputs follows the instruments; None without"""
+    """the model's Inputs, arrays (N,): the part that follows the instruments; None without"""
 
 
 class Data(NamedTuple):
@@ -74,7 +73,7 @@ class Data(NamedTuple):
 
 
 class Layout(eqx.Module):
-    """The static side of a problem: what the unknowns are, in which order."""
+    """The static part of a problem: the unknowns and their order."""
 
     model: Model
     free: tuple[str, ...] = eqx.field(static=True)
@@ -96,21 +95,21 @@ class Layout(eqx.Module):
     objective: Any = eqx.field(static=True)
     """the method's `Objective`, whose class stands above this module"""
     concentrated: bool = eqx.field(static=True)
-    """filter error: whether a common factor of all noise is taken out of the likelihood"""
+    """filter error: True if a common factor of all noise is concentrated out of the likelihood"""
     solver: str | None = eqx.field(static=True)
     substeps: int = eqx.field(static=True)
     block: int = eqx.field(static=True)
     """samples per step of the exact recurrence"""
     windows: tuple[tuple[int, int], ...] = eqx.field(static=True)
-    """by flight: how many windows, and the samples of each"""
+    """by flight the number of windows, and the samples of each"""
     continuity: float | None = eqx.field(static=True)
     """see `Problem.continuity`"""
     holds: tuple[tuple[str, ...], ...] = eqx.field(static=True)
-    """by flight what each of the model's inputs does between samples (`Flight.hold`)"""
+    """by flight the hold of each of the model's inputs (`Flight.hold`)"""
     one_covariance: tuple[tuple[int, ...], ...] = eqx.field(static=True)
-    """filter error: groups of flights that share the covariances of one Kalman filter"""
+    """filter error: groups of flights that share covariances"""
     flight_facts: tuple[Any, ...] = eqx.field(static=True, default=())
-    """by flight what the method takes of it before anything is traced (`Objective.flight_facts`)"""
+    """by flight `Objective.flight_facts`"""
 
     @property
     def noise_model(self) -> str:
@@ -119,31 +118,29 @@ class Layout(eqx.Module):
 
     @property
     def of_interest(self) -> tuple[str, ...]:
-        """The parameters of interest: what the verdict speaks of, first in z. To the free
-        parameters come the gains and the shift, which are shared by all flights."""
+        """The parameters of interest, first in z: the free parameters, the gains and the shift."""
         gains = tuple(f"gain {name}" for name in self.gains)
         return (*self.free, *gains, *(("time_shift",) if self.shift else ()))
 
     @property
     def states(self) -> tuple[str, ...]:
-        """The states whose initial values are unknowns: all that are not random there."""
+        """The states whose initial values are unknowns: all that are not random."""
         if not self.initial_state:
             return ()
-        # A disturbance's state has a distribution at the first sample, with which the filter
-        # begins; an unknown beside that would be a second estimate of the same thing.
+        # The state of a disturbance has a distribution at the first sample.
         random = self.model.random_states
         return tuple(n for n in naming.names(self.model.State) if n not in random)
 
     @property
     def first_nuisance(self) -> int:
         """The place in z of the first nuisance parameter of a flight: initial states, biases and
-        input offsets, which have weak priors and are projected out of the verdict."""
+        input offsets, which have weak priors."""
         return len(self.of_interest) + len(self.noises) + len(self.scaled)
 
     @property
     def noises(self) -> tuple[str, ...]:
-        """The parameters of process noise: those of the disturbance, then the sd of what came
-        through filters."""
+        """The parameters of process noise: those of the disturbance, then the sds of noise before
+        filters."""
         return (*self.disturbance, *map(sensor_noise, self.filtered))
 
     @property
@@ -171,11 +168,10 @@ class Layout(eqx.Module):
 
     @property
     def determined(self) -> int:
-        """Unknowns that the data have to determine: those that windows tie together count once."""
+        """The number of unknowns, where the states that continuity ties together count once."""
         if self.continuity is None:
             return self.size
-        # The states at the start of a window are nearly given by the window before it, so only
-        # those of the first take a degree of freedom.
+        # The states at the start of a window are nearly those at the end of the one before it.
         return self.size - len(self.states) * sum(count - 1 for count, _ in self.windows)
 
 
@@ -249,30 +245,26 @@ def flight_unknowns(layout: Layout, called: Sequence[str]) -> tuple[FlightUnknow
 
 
 class Noise(NamedTuple):
-    """The noise that residuals are divided by."""
+    """The noise by which residuals are divided."""
 
     sd: tuple[dict[str, Any], ...]
     """of the measurement noise, by flight and output; `Layout.scaled` ones times their factors"""
     log_variance_ratio: Any
-    """filter error: the mean over all measurements of log(innovation variance / sd^2) about which
-    the likelihood is laid out in rows, so that they have variance 1; frequency error: likewise the
-    mean over all lines of log det(spectrum)"""
+    """filter error: the mean over all measurements of log(innovation variance / sd^2) at the last
+    relaxation, which gives the rows variance 1; frequency error: the mean over all lines of log
+    det(spectrum)"""
     whitening: Any = ()
-    """frequency error: by record (K, p, p) what makes white noise of that at its lines; () else"""
+    """frequency error: by record (K, p, p) the whitening matrices of its lines; () else"""
     by_instrument: Any = ()
     """frequency error: 1 where instruments weigh the errors, 0 where the model's own response does,
     as it does until the search by instrument has somewhere to begin"""
-    scale_slopes: Any = ()
-    """filter error: derivatives of the sum of log(innovation variance) by the scale errors that are
-    unknown (k,), see `noisy_scales`; () where the model has none"""
-    own: Any = ()
-    """filter error: by parameter of a sensor model's own process noise the derivative of what the
-    parameters of the mean take up by its logarithm, and that logarithm (2,), see
-    `restricted_likelihood`; () where there is none"""
+    corrections: Any = ()
+    """filter error: by parameter the slope of a correction of the likelihood, and where it is zero
+    (2,), see `noise_scales`; () where the model integrates no sensor"""
 
 
 class Solution(NamedTuple):
-    """The end of a fit, for what goes on from there."""
+    """A point, with all that evaluates it: the end of a fit, say."""
 
     layout: Layout
     data: Data
@@ -307,7 +299,7 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...]) -> Layout:
     return Layout(
         model=with_sensor_noise(problem.model, tuple(problem.filtered_noise)),
         free=tuple(problem.free),
-        kinds=tuple(transforms.plain_kind(f) for f in problem.free.values()),
+        kinds=tuple(transforms.kind(f) for f in problem.free.values()),
         gains=naming.names(problem.model.Inputs) if nuisance.input_gain else (),
         shift=nuisance.time_shift,
         initial_state=nuisance.initial_state,
@@ -332,23 +324,17 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...]) -> Layout:
     )
 
 
-def within_bounds(layout: Layout, problem: Problem) -> Layout:
-    """The layout whose free parameters are kept within their bounds by logit coordinates."""
-    kinds = tuple(transforms.kind(f) for f in problem.free.values())
-    return layout if kinds == layout.kinds else dataclasses.replace(layout, kinds=kinds)
-
-
 def _holds(model: Model, flight: Flight) -> tuple[str, ...]:
     return tuple(flight.hold[n] for n in naming.names(model.Inputs))
 
 
 def _one_covariance(problem: Problem, flights: tuple[Flight, ...]) -> tuple[tuple[int, ...], ...]:
-    """The flights of a linear model without missing samples, in groups of one covariance."""
+    """Return the flights of a linear model without missing samples, in groups of one covariance."""
     if not (problem.model.linear and problem.noise_model == "disturbance"):
         return ()
     groups: dict[Any, list[int]] = {}
     for i, flight in enumerate(flights):
-        # A missing sample changes the covariance of its own record.
+        # A missing sample changes the covariance of its record.
         if all(np.isfinite(y).all() for y in flight.outputs.values()):
             numbers = (sorted(flight.sd.items()), sorted(flight.known.items()))
             key = (flight.dt, sorted(flight.outputs), _holds(problem.model, flight), numbers)
@@ -362,31 +348,29 @@ def _windows(problem: Problem, flight: Flight) -> tuple[int, int]:
     if problem.window is None:
         return 1, n
     samples = round(problem.window / flight.dt)
-    # The length asked for is met only about: windows of one length run side by side in one vmap,
-    # where a short one at the end would be simulated by itself.
+    # Only about the length of `Problem.window`: windows of one length share one vmap.
     count = max(1, round(n / samples))
     return count, -(-n // count)
 
 
 def value_of(layout: Layout, data: Data, i: int, z: Real) -> Any:
-    """The value of a free parameter."""
+    """Return the value of a free parameter."""
     return transforms.to_value(layout.kinds[i], z, data.sign[i], data.low[i], data.high[i])
 
 
 def disturbance_limits(layout: Layout, data: Data) -> dict[str, tuple[Any, Any]]:
-    """Lowest and highest logarithm of each parameter of the disturbances, each by itself.
+    """Return the lowest and highest logarithm of each parameter of the disturbances.
 
-    A correlation time below a hundredth of a sample is white noise to any record, one above a
-    thousand records is a random walk; beyond these a likelihood without a maximum would take the
-    numbers as far as the computer has any. sigma_w has the size of the measured motion to go by,
-    with room for a disturbance that is none.
+    A correlation time below a hundredth of a sample is white noise in any record, one above a
+    thousand records a random walk. sigma_w is limited by the size of the measured motion. Without
+    limits a likelihood without a maximum would drive them to overflow.
     """
     dt = functools.reduce(jnp.minimum, [flight.dt for flight in data.flights])
     longest = functools.reduce(
         jnp.maximum,
         [f.dt * next(iter(f.outputs.values())).shape[0] for f in data.flights],
     )
-    # A bias's scale is ten times what the output does.
+    # The scale of a bias is ten times the output.
     motion = functools.reduce(
         jnp.maximum, [0.1 * s for f in data.flights for s in f.bias_scale.values()]
     )
@@ -399,7 +383,7 @@ def disturbance_limits(layout: Layout, data: Data) -> dict[str, tuple[Any, Any]]
         size = jnp.log(motion)
         limits[name] = (size - _FAINTEST, size - 2.0 * jnp.log(dt) + _STRONGEST)
     for output in layout.filtered:
-        # A bias's scale is ten times what the output does, which no noise exceeds by far.
+        # The scale of a bias is ten times the output, which no noise exceeds by far.
         scales = [f.bias_scale[output] for f in data.flights if output in f.bias_scale]
         size = jnp.log(functools.reduce(jnp.maximum, scales))
         limits[sensor_noise(output)] = (size - _FAINTEST, size)
@@ -407,7 +391,7 @@ def disturbance_limits(layout: Layout, data: Data) -> dict[str, tuple[Any, Any]]
 
 
 def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
-    """Names for the entries of z."""
+    """Return the unknowns by name, in the units of the model."""
     q = len(layout.free)
     params = {name: value_of(layout, data, i, z[i]) for i, name in enumerate(layout.free)}
     gains = {name: z[q + i] for i, name in enumerate(layout.gains)}
@@ -419,7 +403,7 @@ def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
         at += 1
     limits = disturbance_limits(layout, data)
     # Clipped, not transformed: inside the limits the likelihood keeps its shape in the logarithm,
-    # and outside its derivative is zero, which tells that the parameter means nothing there.
+    # and outside its derivative is zero, which shows that the parameter has no effect.
     noise = {
         name: jnp.exp(jnp.clip(z[at + i], *limits[name])) for i, name in enumerate(layout.noises)
     }
@@ -430,7 +414,7 @@ def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
 
 
 def scales_of(layout: Layout, z: Float[Array, " q"]) -> dict[str, Any]:
-    """Factors on the guess of the measurement noise, by output that has one of its own."""
+    """Return by output the factor on the guess of its noise, for those that have one."""
     first = layout.first_nuisance - len(layout.scaled)
     return {
         name: jnp.exp(jnp.clip(z[first + i], -_SCALES, _SCALES))
@@ -441,14 +425,14 @@ def scales_of(layout: Layout, z: Float[Array, " q"]) -> dict[str, Any]:
 def _of_flight(
     layout: Layout, i: int, flight: FlightData, z: Array
 ) -> tuple[Any, dict[str, Any], dict[str, Any]]:
-    """The i-th flight's initial state, biases and input offsets."""
+    """Return the i-th flight's initial state, biases and input offsets."""
     places, outputs, state = flight_places(layout)[i], layout.outputs[i], None
     if layout.initial_state:
         every = places.states.ravel().tolist()
         initial = z[every[0] : every[-1] + 1] if every else z[:0]
         initial = initial.reshape(places.states.shape)
         initial = initial[0] if len(initial) == 1 else initial
-        # States that are random at the first sample begin at their mean, zero.
+        # Random states begin at their mean, zero.
         values = dict.fromkeys(
             naming.names(layout.model.State), jnp.zeros(initial.shape[:-1], z.dtype)
         )

@@ -15,7 +15,10 @@ from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate, simulated_outputs
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines, parts_of
-from heli_jax.identification.estimation.levenberg_marquardt import optimise, residual_and_jacobian
+from heli_jax.identification.estimation.levenberg_marquardt import (
+    fit_nuisances,
+    residual_and_jacobian,
+)
 from heli_jax.identification.estimation.noise_covariance import first_noise, first_noise_sizes
 from heli_jax.identification.estimation.output_error import in_time
 from heli_jax.identification.methods import objective_of
@@ -28,9 +31,6 @@ from heli_jax.identification.unknowns.layout import (
     layout_of,
 )
 from heli_jax.identification.validation.excitation import LEVEL, errors_against_excitation
-
-_STEPS = 60
-"""of Levenberg-Marquardt at most, to a filter's initial states and biases"""
 
 
 class Validation(NamedTuple):
@@ -66,9 +66,7 @@ def validate(
     full = jnp.concatenate([z[:first], begin])
     if other.noise_model == "disturbance":
         # Those of a simulation would take gusts for a bias, which the innovations then have.
-        shared = np.arange(other.size) < first
-        end = optimise(other, data, their_noise, full, _STEPS, held=shared)
-        full = end.z if np.isfinite(np.asarray(end.z)).all() else full
+        full = fit_nuisances(other, data, their_noise, full)
     else:
         full = in_time(other, data, their_noise, full)
     e = evaluate(other, data, their_noise, full)

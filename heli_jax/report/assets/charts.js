@@ -84,12 +84,7 @@
   function seriesOf(panel, of, unit) {
     const list = [{}], bands = [], bars = [];
     const span = panel.limits[1] - panel.limits[0];
-    const value = (u, v) => {
-      if (v == null) return "–";
-      const si = text(v, span) + (unit ? ` ${unit}` : "");
-      const l = panel.logged;
-      return l ? `${si} = ${text(v * l[2] + l[3], span * Math.abs(l[2]))} ${l[1]}` : si;
-    };
+    const value = (u, v) => v == null ? "–" : text(v, span) + (unit ? ` ${unit}` : "");
     panel.series.forEach((s, k) => {
       const at = list.length, points = s.kind === "points" || s.kind === "bars";
       list.push({
@@ -291,7 +286,7 @@
       place.className = "panel";
       const label = document.createElement("p");
       label.className = "y";
-      label.textContent = panel.logged ? `${panel.label}; in the log ${panel.logged[1]}` : panel.label;
+      label.textContent = panel.label;
       place.append(label);
       box.append(place);
       if (panel.series.length) groups.get(chart.group).push(plot(chart, panel, place, k === chart.panels.length - 1));

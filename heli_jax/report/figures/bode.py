@@ -24,30 +24,29 @@ _TURN = 2.0 * np.pi
 """rad/s of 1 Hz"""
 _DB = 20.0 / np.log(10.0)
 SEEN, BEYOND_CHANCE = 0.1, 0.3
-"""mean coherence over an octave: below the first it is chance, the second is hardly made by it, of
-three or four averages either, and up to the last such bin frequencies are drawn"""
+"""mean coherence over an octave below which it is chance, and from which on it is not; the axis
+ends at the last bin of the second"""
 _WIDE, _WIDE_DATA = 1.0, 0.5
-"""relative random error of a measured response, and of one beside a model, past which a bin says
-little, and is not drawn"""
+"""relative random error above which a measured response, and one beside a model, is not drawn"""
 _BY_CHANCE = 2.0
-"""Bins neither set the axes nor tell the phase's branch below a mean coherence over an octave of
-SEEN, nor of this times what chance makes of it, one over the number of averages."""
+"""least mean coherence over an octave times the number of averages, of a bin that sets the axes and
+the branch of the phase"""
 _MARGINS = (6.0, 45.0)
-"""dB and deg beyond what sets the axes"""
+"""margins of the axes [dB, deg]"""
 _ERRORS = (12.0, 90.0)
-"""dB and deg that the panels of the error show at most to either side"""
+"""half range of the error panels [dB, deg]"""
 _FEW = 3
-"""bins that set the axes' limits at least"""
+"""fewest bins that set the axes"""
 
 
 def _chart(title: str, note: str, limits: Sequence[float], panels: Sequence[Panel]) -> Chart:
-    """Over frequency; limits in rad/s."""
+    """Return a chart over frequency with limits [rad/s]."""
     hz = float(limits[0]) / _TURN, float(limits[-1]) / _TURN
     return Chart(title, "frequency [Hz]", hz, tuple(panels), note, logarithmic=True)
 
 
 def _nearest(degrees: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Phases on the branch within half a turn of others."""
+    """Return phases [deg] within half a turn of others."""
     return degrees - 360.0 * np.round((degrees - along) / 360.0)
 
 
@@ -55,17 +54,15 @@ def phase(H: np.ndarray) -> np.ndarray:
     """Unwrapped phase (k,) [deg], begun between -270 and 90."""
     unwrapped = np.degrees(np.unwrap(np.angle(H)))
     first = unwrapped[0] if unwrapped.size else 0.0
-    # Less 1e-6, so that rounding does not send a response that begins at +90 down to -270.
+    # 1e-6 against rounding at +90.
     return unwrapped - 360.0 * np.ceil((first - 90.0 - 1e-6) / 360.0)
 
 
 def baseline_response(baseline: Baseline, omega: np.ndarray) -> np.ndarray:
     """Hd(e^{i omega dt}) (k,) of the recursive least squares, without the hold of its input."""
-    # On the unit circle, as it was identified: its continuous form is an approximation where no
-    # inverse of the hold exists.
+    # On the unit circle: the continuous form may be an approximation.
     turns = omega * baseline.dt
     z, hold = np.exp(1j * turns), np.sinc(turns / (2.0 * np.pi)) * np.exp(-0.5j * turns)
-    # A pole on the unit circle gives inf there, which no curve draws.
     with np.errstate(all="ignore"):
         return np.polyval(baseline.num, z) / np.polyval(baseline.den, z) / hold
 
@@ -74,7 +71,7 @@ def _curve(
     label: str, omega: np.ndarray, H: np.ndarray, degrees: np.ndarray, color: str, width: float
 ) -> tuple[Series, Series]:
     """Magnitude [dB] and phase of a response."""
-    # A zero of the response has no decibels and no phase; a NaN breaks the line.
+    # A zero has no phase; NaN breaks the line.
     good = np.isfinite(H) & (np.abs(H) > 0)
     gain = np.where(good, _DB * np.log(np.where(good, np.abs(H), 1.0)), np.nan)
     of_phase = np.where(good, degrees, np.nan)
@@ -95,7 +92,6 @@ def _bars(
 ) -> tuple[Series, Series]:
     """Gain [dB] and phase with error bars, by the relative errors of the two."""
     hz = omega / _TURN
-    # Where the error is large the two ends of the gain are not as far away in decibels.
     down = -_DB * np.log(np.maximum(1.0 - relative[0], 1e-2))
     reach = np.degrees(np.minimum(relative[1], np.pi))
     of_gain = bars(label, hz, gain, [down, _DB * np.log1p(relative[0])], color)
@@ -116,10 +112,7 @@ def bode_unit(model: Model, output: str, input: str) -> str:
 
 
 def _last_of(omega: np.ndarray, coherence: np.ndarray, known: np.ndarray) -> float:
-    """The last frequency that the axes hold [rad/s].
-
-    Single bins are coherent by chance up to the end of the band, far above what was excited.
-    """
+    """Return the last frequency of the axes [rad/s]: that of a coherent bin."""
     mean = octave_mean(omega, coherence)
     for bins in (known & (mean >= BEYOND_CHANCE), known & (mean >= SEEN), known):
         if bins.any():
@@ -128,15 +121,15 @@ def _last_of(omega: np.ndarray, coherence: np.ndarray, known: np.ndarray) -> flo
 
 
 def _room(values: np.ndarray, margin: float, series: Sequence[Series]) -> tuple[float, float]:
-    """Limits by what sets the axes; by all series where nothing does."""
+    """Return limits by given values; by all series if there are none."""
     if not values.size:
         return limits_of(series)
     return float(np.min(values)) - margin, float(np.max(values)) + margin
 
 
 def match(pair: FittedPair, unit: str, note: str, baseline: Baseline | None = None) -> Chart:
-    """Gain, phase and partial coherence of data and model, and their quotient, all with 95 %
-    intervals; the quotient within the envelopes of what pilots do not notice.
+    """Draw gain, phase and partial coherence of data and model, and their ratio, with 95 %
+    intervals and the envelopes of unnoticeable dynamics.
 
     Args:
         baseline: the recursive least squares of this input and output, as a further curve.
@@ -150,7 +143,6 @@ def match(pair: FittedPair, unit: str, note: str, baseline: Baseline | None = No
     own = pair.half95 * pair.sd[known] / np.abs(H)
     gain, angle = _DB * np.log(np.abs(H)), np.degrees(np.angle(H))
     if modelled.all():
-        # Beside the model: point by point, since data may have gaps.
         angle = _nearest(angle, near[known])
     data = _bars(f, gain, angle, (own, own), style.BLACK, "data, 95 % intervals")
     beside = []
@@ -160,9 +152,7 @@ def match(pair: FittedPair, unit: str, note: str, baseline: Baseline | None = No
         beside = [
             c._replace(dashed=True) for c in _curve("RLS", omega, R, turned, style.ORANGE, 1.2)
         ]
-    # What a bin without coherence says is mostly noise over a stick that hardly moved: it is drawn
-    # where there is room, and makes none. In gusts a response has a coherence of 0.3 to 0.6, and
-    # intervals that are read: such bins have to be within the axes.
+    # Incoherent bins do not set the axes.
     mean = octave_mean(omega, pair.coherence)
     rule = (np.minimum(pair.coherence, mean) >= BEYOND_CHANCE)[known]
     rule = rule if np.count_nonzero(rule) >= _FEW else np.ones_like(rule)
@@ -179,7 +169,7 @@ def match(pair: FittedPair, unit: str, note: str, baseline: Baseline | None = No
         limits = _room(ruling, _MARGINS[k], series)
         panels.append(panel(words, series, height, limits=limits))
     panels.append(_coherence(omega, pair.coherence))
-    # Data over model: the data's error is the random one, the model's that of its parameters.
+    # Data over model, with the random error and that of the parameters.
     both = modelled[known]
     error = H[both] / model.response[known & modelled]
     reach = [np.hypot(own[both], Z95 * sd[known & modelled]) for sd in (gain_sd, phase_sd)]
@@ -205,7 +195,7 @@ def draw_response(
     averages: float,
     fits: Sequence[tuple[str, np.ndarray]] = (),
 ) -> Chart:
-    """A measured response: gain and phase with 95 % intervals, and coherence.
+    """Draw a measured response: gain and phase with 95 % intervals, and coherence.
 
     Args:
         omega: (k,) [rad/s]
@@ -224,7 +214,7 @@ def draw_response(
     colours = itertools.cycle((style.VERMILLION, style.GREEN, style.PURPLE))
     for (label, H), color in zip(fits, colours, strict=False):
         turned = phase(H)
-        # As a whole: a transfer function is smooth, and its own phase tells its turns.
+        # The branch of the whole curve.
         apart = np.median((branch - turned)[seen]) if seen.any() else 0.0
         turned = turned + 360.0 * np.round(apart / 360.0)
         curves.append(_curve(label, omega, H, turned, color, 1.4))
@@ -242,17 +232,14 @@ def draw_response(
 
 
 def seen_of(omega: np.ndarray, pair: Any, averages: float) -> np.ndarray:
-    """The frequencies (k,) that tell the branch of the phase."""
+    """Return a mask (k,) of the frequencies that set the branch of the phase."""
     known = np.isfinite(pair.H) & (pair.sd < _WIDE * np.abs(pair.H))
-    # Of few averages chance makes much, but what passes for coherent is no chance.
     least = min(max(SEEN, _BY_CHANCE / averages), COHERENT)
     return known & (octave_mean(omega, pair.coherence) >= least)
 
 
 def branch_of(omega: np.ndarray, H: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """The phase (k,) [deg] at every frequency, on the branch of the nearest that are seen.
-
-    Unwrapped through noise it would turn by chance, and through a missing bin be lost.
+    """Return the phase (k,) [deg] on the branch of the nearest frequencies that are seen.
 
     Args:
         omega: (k,) [rad/s]

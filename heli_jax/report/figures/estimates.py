@@ -10,7 +10,6 @@ from heli_jax.identification.result import Estimate, Fit
 from heli_jax.identification.uncertainty.bootstrap import Bootstrap
 from heli_jax.identification.uncertainty.nuts import Posterior
 from heli_jax.report import style
-from heli_jax.report.style import subtitle
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -53,10 +52,7 @@ def _pairs(
     names = list(samples)[:MOST]
     n = len(names)
     side = min(style.WIDTH, 2.2 + 1.3 * n)
-    drawing = style.figure(side if n > 1 else 2.6, side, constrained=True)
-    # The title is wider than the cell that it stands above: it has a row of its own.
-    height = float(drawing.get_size_inches()[1])
-    drawing.set_layout_engine("constrained", rect=(0.0, 0.0, 1.0, 1.0 - 0.5 / height))
+    drawing = style.figure(side if n > 1 else 2.6, side)
     grid = drawing.subplots(n, n, squeeze=False, sharex="col")
     shown = slice(None, None, max(1, -(-next(iter(samples.values())).size // _DOTS)))
     for i, below in enumerate(names):
@@ -74,12 +70,9 @@ def _pairs(
         for ax in grid[i, i + 1 :]:
             ax.set_visible(False)
     _label(grid, names, fit)
-    first = grid[0, 0]
-    heading = first.set_title(title, loc="left", pad=19)
     diverged = "; ×: divergent" if marked is not None and marked.any() else ""
-    subtitle(first, f"blue: Gaussian, dotted: its 95 % ends{diverged}{_left_out(len(samples))}")
-    for text in (heading, first.texts[-1]):
-        text.set_in_layout(False)
+    left_out = f"; the first {MOST} of {len(samples)} parameters" if len(samples) > MOST else ""
+    style.head(drawing, title, f"blue: Gaussian, dotted: its 95 % ends{diverged}{left_out}")
     return drawing
 
 
@@ -112,16 +105,6 @@ def _interval_lines(draw: Callable[..., object], e: Estimate) -> None:
             draw(end, color=style.BLUE, lw=0.8, ls=":")
 
 
-def logarithmic(e: Estimate) -> bool:
-    """True if an estimate's interval reaches by equal factors and not by equal amounts."""
-    if e.lower95 is None or e.upper95 is None or not min(e.lower95, e.upper95) * e.value > 0:
-        return False
-    if not max(e.lower95, e.upper95) * e.value > 0:
-        return False
-    by_factors = abs(np.log(e.upper95 / e.value) + np.log(e.lower95 / e.value))
-    return bool(by_factors < abs(e.upper95 + e.lower95 - 2.0 * e.value) / abs(e.value))
-
-
 def gaussian_ellipse(fit: Fit, x: str, y: str) -> Float[np.ndarray, "2 n"] | None:
     """The curve within which 95 % of the fit's Gaussian approximation lie, of two parameters.
 
@@ -140,9 +123,7 @@ def gaussian_ellipse(fit: Fit, x: str, y: str) -> Float[np.ndarray, "2 n"] | Non
     curve = []
     for away, e in zip(unit, pair, strict=True):
         reach = _RADIUS * float(e.sd or 0.0) * away
-        curve.append(e.value * np.exp(reach / abs(e.value)) if logarithmic(e) else e.value + reach)
+        # By factors if the interval does not hold zero.
+        one_sign = (e.lower95 or 0.0) * (e.upper95 or 0.0) > 0.0
+        curve.append(e.value * np.exp(reach / abs(e.value)) if one_sign else e.value + reach)
     return np.array(curve)
-
-
-def _left_out(count: int) -> str:
-    return f"; the first {MOST} of {count} parameters" if count > MOST else ""

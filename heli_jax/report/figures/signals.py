@@ -192,47 +192,36 @@ def _stems(words: str, x: np.ndarray, y: np.ndarray, limit: np.ndarray) -> Panel
 
 
 _APART = "rotor_speed"
-"""the one output that would press others of its unit flat"""
-_KINDS = {
-    "m": "position",
-    "m/s": "velocity",
-    "rad": "attitude",
-    "rad/s": "rates",
-}
-_LENGTHS = (("m", 1.0), ("mm", 1e3), ("µm", 1e6))
+"""output with a panel of its own"""
 _STILL = 0.05
-"""span of an axis over the largest of its values, at least: what moves by less is nearly constant,
-and not drawn as if it were not"""
+"""smallest span of an axis over its largest value"""
 _LEAST = {"m": 0.01, "m/s": 0.02, "rad": 0.005, "rad/s": 0.01, "m/s^2": 0.05, "1": 0.02}
-"""by unit the span of an axis at least: about the resolution of such a vehicle's sensors"""
+"""smallest span of an axis by unit"""
 # States and signals of a model are classes of the user's own, with arrays (N,): annotated Any.
 
 
 def motion(run: Trajectory, model: Model) -> Chart:
-    """The outputs over time, those of a unit together: position, velocity, attitude, rates.
-
-    Shaded where the model's range was left.
-    """
+    """Draw the outputs over time, one panel for each unit, shaded outside the model's range."""
     shown = [n for n in naming.names(model.Outputs) if n != _APART]
-    groups = []
-    for unit, names in _by_unit(model.Outputs, shown):
-        kind = _KINDS.get(unit or "", names[0]) if len(names) > 1 else names[0]
-        groups.append((kind, unit, {n: getattr(run.outputs, n) for n in names}))
+    groups = [
+        (unit, {n: getattr(run.outputs, n) for n in names})
+        for unit, names in _by_unit(model.Outputs, shown)
+    ]
     return _over_time(run, f"Motion of {model.name}", groups)
 
 
 def sticks(run: Trajectory, model: Model) -> Chart:
-    """The inputs as they acted, and the rotor's speed where the model has it."""
+    """Draw the inputs as they acted, and the rotor speed if the model has it."""
     groups = []
     for unit, names in _by_unit(model.Inputs, list(naming.names(model.Inputs))):
         values = {n: np.asarray(getattr(run.inputs, n)) for n in names}
         if unit == "m":
-            unit, values = _short(values)
-        kind = "wind" if names[0].startswith("wind") else "sticks"
-        groups.append((kind if len(names) > 1 else names[0], unit, values))
+            # Sticks move by millimetres.
+            unit, values = "mm", {n: 1e3 * v for n, v in values.items()}
+        groups.append((unit, values))
     if _APART in naming.names(model.Outputs):
-        values = {_APART: getattr(run.outputs, _APART)}
-        groups.append(("rotor speed", naming.unit(model.Outputs, _APART), values))
+        speed = {_APART: getattr(run.outputs, _APART)}
+        groups.append((naming.unit(model.Outputs, _APART), speed))
     return _over_time(run, f"Sticks of {model.name}", groups)
 
 
@@ -245,34 +234,22 @@ def _by_unit(record: type, names: list[str]) -> list[tuple[str | None, list[str]
     return [(naming.unit(record, group[0]), group) for group in groups.values()]
 
 
-def _short(values: dict[str, np.ndarray]) -> tuple[str, dict[str, np.ndarray]]:
-    """Lengths [m] in the unit that suits them: a stick moves by millimetres."""
-    # One unit for all inputs of a panel, by the largest: they share its axis.
-    largest = max(float(np.max(np.abs(v), initial=0.0)) for v in values.values())
-    # The first unit in which the largest is 0.1 or more; metres where nothing moves.
-    unit, factor = next((u for u in _LENGTHS if largest * u[1] >= 0.1), ("m", 1.0))
-    return unit, {name: factor * v for name, v in values.items()}
-
-
-# Of each panel the words and the unit of its axis, and what it shows by name.
-type _Shown = tuple[str, str | None, Mapping[str, ArrayLike]]
+# Unit and signals of a panel.
+type _Shown = tuple[str | None, Mapping[str, ArrayLike]]
 
 
 def _over_time(run: Trajectory, title: str, groups: Sequence[_Shown]) -> Chart:
     t, note, shades = np.asarray(run.times), "", []
     left = [name for name, out in run.outside.items() if np.any(out)]
     if left:
-        # One shade for all limits together: their names stand above, and several would only darken.
         note = f"shaded where the model's range is left: {', '.join(left)}"
         outside = np.any([np.asarray(run.outside[name]) for name in left], axis=0)
-        # A zero at either end makes an edge of a stretch that begins or ends with the record.
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], outside.astype(int), [0]])))
-        for begin, end in edges.reshape(-1, 2).tolist():
-            # Up to the next sample, so that a single one outside can be seen.
-            shades.append((float(t[begin]), float(t[min(end, t.size - 1)])))
+        shades = [
+            (float(t[stretch.start]), float(t[min(stretch.stop, t.size - 1)]))
+            for stretch in np.ma.clump_masked(np.ma.array(t, mask=outside))
+        ]
     panels = []
-    for kind, unit, values in groups:
-        # Inputs are held from a sample to the next, as the simulation has it.
+    for unit, values in groups:
         series = [
             Series(name, t, np.asarray(y), style.CYCLE[k % len(style.CYCLE)])
             for k, (name, y) in enumerate(values.items())
@@ -280,12 +257,13 @@ def _over_time(run: Trajectory, title: str, groups: Sequence[_Shown]) -> Chart:
         if set(values) <= set(naming.names(type(run.inputs))):
             series = [s._replace(kind="step") for s in series]
         limits = _not_magnified(series, unit)
-        panels.append(panel(label(kind, unit), series, 1.1, limits=limits, shades=tuple(shades)))
+        words = label(", ".join(values), unit)
+        panels.append(panel(words, series, 1.1, limits=limits, shades=tuple(shades)))
     return Chart(title, "time [s]", time_limits(t), tuple(panels), note)
 
 
 def _not_magnified(series: Sequence[Series], unit: str | None) -> tuple[float, float]:
-    """Limits that do not blow up what is nearly constant to the height of its panel."""
+    """Return limits that do not magnify a nearly constant signal."""
     seen = np.concatenate([s.y[np.isfinite(s.y)] for s in series])
     low, high = (float(seen.min()), float(seen.max())) if seen.size else (0.0, 0.0)
     least = max(_STILL * max(abs(low), abs(high)), _LEAST.get(unit or "", 0.0))

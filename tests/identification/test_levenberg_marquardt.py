@@ -1,0 +1,76 @@
+"""When a search has converged, and how far it goes after a refused step: against NumPy."""
+
+import numpy as np
+import pytest
+
+from heli_jax.identification.estimation.levenberg_marquardt import (
+    Point,
+    Region,
+    gain_ahead,
+    judge_step,
+)
+
+RNG = np.random.default_rng(0)
+J = RNG.standard_normal((12, 4)) * [1.0, 1e-4, 30.0, 1e3]
+SIZES = np.linalg.norm(J, axis=0)
+Y = np.array([1.0, 2.0, 3.0, 4.0])
+BEGUN = Region(1e-5, np.inf)
+
+
+def residual(gain, J=J, scale=1.0):
+    """Orthogonal to the columns, and along them so much that a full step takes off `gain`."""
+    d = RNG.standard_normal(12)
+    along = J @ np.linalg.lstsq(J, d, rcond=None)[0]
+    return scale * (d - along) + along * np.sqrt(gain) / np.linalg.norm(along)
+
+
+@pytest.mark.parametrize("scale", [0.0, 1.0, 1e3])
+def test_the_gain_is_what_a_full_step_takes_off(scale):
+    assert gain_ahead(residual(1e-4, scale=scale), J, SIZES) == pytest.approx(1e-4, rel=1e-4)
+
+
+def test_an_unknown_that_stays_put_has_no_gain():
+    still = J * [1.0, 0.0, 1.0, 0.0]
+    r = residual(1e-4, still[:, [0, 2]], scale=1e3)
+    assert gain_ahead(r, still, SIZES * [1, 0, 1, 0]) == pytest.approx(1e-4, rel=1e-4)
+
+
+def test_what_is_no_number_has_not_converged():
+    assert gain_ahead(np.full(12, np.nan), J, SIZES) == np.inf
+
+
+def judged(r, step, cost, region=BEGUN):
+    """The judgement of a step to where half the sum of squares is `cost`."""
+    reached = Point(Y + step, np.full(12, np.sqrt(cost / 6.0)), J)
+    return judge_step(Point(Y, r, J), reached, region)
+
+
+def test_the_step_after_a_refused_one_is_shorter():
+    r = residual(1.0)
+    step = -np.linalg.lstsq(J, r, rcond=None)[0]
+    begin, slope, change = 0.5 * r @ r, r @ J @ step, np.linalg.norm(J @ step)
+    # The parabola through cost and slope here, and the cost there, has its lowest point at a third.
+    accept, region = judged(r, step, begin - 0.5 * slope)
+    assert not accept
+    assert region.damping > BEGUN.damping
+    assert region.radius == pytest.approx(change / 3.0)
+    # Near the ends of what is sensible, and where there is no number at all.
+    assert judged(r, step, begin)[1].radius == pytest.approx(0.5 * change)
+    for much in (1e6, np.inf, np.nan):
+        assert judged(r, step, begin - much * slope)[1].radius == pytest.approx(0.1 * change)
+
+
+def test_the_radius_grows_with_steps_that_do_as_predicted():
+    r = residual(1.0)
+    step = -np.linalg.lstsq(J, r, rcond=None)[0]
+    begin, slope, change = 0.5 * r @ r, r @ J @ step, np.linalg.norm(J @ step)
+    _, region = judged(r, step, begin - 0.5 * slope)
+    part = step / 3.0
+    predicted = slope / 3.0 + 0.5 * np.sum((J @ part) ** 2)
+    accept, grown = judged(r, part, begin + predicted, region)
+    assert accept
+    assert grown.radius == pytest.approx(change)
+    assert grown.damping < region.damping
+    accept, same = judged(r, part, begin + 0.5 * predicted, region)
+    assert accept
+    assert same == region
