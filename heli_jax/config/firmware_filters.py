@@ -24,8 +24,7 @@ class LoggedFilters(NamedTuple):
     settings: tuple[str, ...]
     """Settings that state them, as `NAME = value`."""
     unknown: tuple[str, ...]
-    """Settings of filters that move in flight or are of unknown kind, which no constants describe.
-    """
+    """Settings of filters without constants: they move in flight or are of unknown kind."""
 
 
 def logged_filters(firmware: str, settings: Settings, channel: str) -> LoggedFilters | None:

@@ -495,7 +495,7 @@ def _instrument_signals(model: Model, config: SignalsConfig, where: str) -> dict
 
 
 def _with_instruments(flight: Flight, instruments: Mapping[str, Signal]) -> Flight:
-    """Move the instruments of a flight from its inputs.
+    """Separate the instruments of a flight from its inputs.
 
     Args:
         flight: the flight.

@@ -247,8 +247,7 @@ _FOLDS = 20
 _ROUNDED = 10.0
 """Smallest ratio of noise to the power of the log's rounding, which is white after any filter."""
 _SEGMENT, _FEWEST = 256, 1500
-"""Samples of a spectral segment, and fewest samples of a record; its bands are then known to 10 %.
-"""
+"""Samples of a spectral segment, and fewest samples of a record, for an accuracy of 10 %."""
 
 
 def unfiltered_cautions(flight: Flight, outputs: Mapping[str, OutputConfig]) -> tuple[Finding, ...]:

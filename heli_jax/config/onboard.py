@@ -45,7 +45,7 @@ class RateLoopConfig(Section):
     """A flybarless unit (`with_rate_loop`)."""
 
     on: NamesOrPairs | None = None
-    """sticks, or the state of the rate by stick; default those of roll and pitch"""
+    """sticks, or {stick: state that is its rate}; default those of roll and pitch"""
     integral: bool = True
     """true: integral term Ki"""
     feedforward: bool = True
@@ -58,7 +58,7 @@ class GyroConfig(Section):
     """A gyro on the tail (`with_gyro`)."""
 
     on: NamesOrPairs | None = None
-    """pedal, or the state of the rate by pedal; default that of yaw"""
+    """pedal, or {pedal: state that is its rate}; default that of yaw"""
     heading_hold: bool = True
     """true: the pedal commands a rate that is held; false: damper only"""
     lag: bool = True
@@ -77,20 +77,20 @@ class SensorsConfig(Section):
     lowpass: list[str] = []
     """outputs with a first-order lag (tau_lowpass)"""
     delay: NamesOrPairs = []
-    """outputs with a delay, or the delay's parameter by output"""
+    """outputs with a delay, or {output: parameter of its delay}"""
     order: Order = ORDER
-    """states of the approximation of each delay"""
+    """number of states that approximate each delay"""
 
 
 class DelaysConfig(Section):
     """Delays of inputs and outputs (`with_delays`)."""
 
     inputs: NamesOrPairs = []
-    """names, or the parameter by name"""
+    """names, or {name: parameter}"""
     outputs: NamesOrPairs = []
-    """names, or the parameter by name"""
+    """names, or {name: parameter}"""
     order: Order = ORDER
-    """states of the approximation of each delay"""
+    """number of states that approximate each delay"""
 
 
 FROM_LOG = "from log"

@@ -281,7 +281,7 @@ def _gain_units(experiment: Experiment) -> dict[str, str]:
 def _first_guesses(
     experiment: Experiment, flights: Sequence[Flight], free: Mapping[str, Free]
 ) -> "tuple[dict[str, Free], EquationErrorStart | None]":
-    """Return the free parameters with their starts, and their search; None if they are given.
+    """Return the free parameters with their starts, and the equation-error result or None.
 
     Args:
         experiment: the configuration.

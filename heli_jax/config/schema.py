@@ -304,8 +304,7 @@ class Config(Section):
     """a model's name, package.module:name, or {linear: FILE}"""
     # A file, or its constants; the readers of vehicle files check both.
     vehicle: str | dict[str, Any] | None = None
-    """vehicle file, or its constants; optional if the model is a file, which has values of its own
-    """
+    """vehicle file, or its constants; optional if the model is a file, which has its own values"""
     corrections: dict[str, bool] | None = None
     """corrections of the paper's equations by name, on or off
     (`heli_jax.dynamics.helicopter.Corrections`); full helicopter only"""

@@ -308,7 +308,7 @@ def require_increasing(table: Table, name: str, stamps: np.ndarray) -> None:
 def require_likely(path: str, time: Signal, stamps: np.ndarray) -> None:
     """Refuse stamps (N,) in seconds that are plausible only in another unit.
 
-    Their name must state that unit, or nobody stated seconds.
+    This applies if their name states that unit, or if nobody stated seconds.
     """
     named, likely = split_unit(time.name)[1], likely_unit(stamps)
     if time.unit != "s" or likely == "s" or not (named == likely or time.assumed):

@@ -26,8 +26,7 @@ _SMALLEST = 300.0
 _SINGLE = 1e-6
 """Relative tolerance of a mark, for single precision and converted units."""
 _ABSURD = 1e9
-"""Magnitude in the log's own numbers above which nothing is a measurement, such as 1e10 and 3.4e38.
-"""
+"""Magnitude in the log's numbers above which nothing is a measurement, as 1e10 and 3.4e38."""
 _MOST, _FEW = 0.2, 2
 """Largest share of absurd samples, unless they have at most `_FEW` values. A counter may be as
 large half of the time."""

@@ -380,8 +380,8 @@ def common_times(
     Args:
         clocks: clocks of the topics, at least one; their times count from the log's beginning.
         rate: rate of the times [Hz].
-        on: clock of the same rate, with a sample at which the times begin. Its samples then stay on
-            the grid. A mean of two neighbours has less noise, and that noise is not white.
+        on: clock of the same rate, with a sample at which the times begin. Its samples then stay as
+            they are. A mean of two neighbours has less noise, and that noise is not white.
     """
     # No extrapolation: a topic is unknown before its first sample and after its last.
     start = max(float(clock.seconds[0]) for clock in clocks)

@@ -21,8 +21,7 @@ from heli_jax.flights.log import ChannelLog, Table, require_short_names, shown, 
 from heli_jax.regular_file import open_regular, require_regular
 
 _SNIFFED = 8192
-"""Bytes read to recognise a format: a DataFlash text log may begin with the firmware's own lines.
-"""
+"""Bytes read to recognise a format; a DataFlash text log may begin with the firmware's lines."""
 _TEXTS = (".csv", ".txt", ".tsv", ".asc", ".dat", ".log", ".lvm", ".prn", ".tab")
 _ARRAYS = (".mat", ".nc", ".h5", ".hdf5")
 """Endings that decide the format, because MATLAB 7.3, NetCDF 4 and HDF5 files begin alike."""

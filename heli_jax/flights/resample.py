@@ -18,8 +18,7 @@ from heli_jax.numerics.jumps import split
 _GAP_STEPS = 5.0
 _GAP_SECONDS = 0.25
 _GOES_DOWN = 0.9
-"""Ratio of new to old rate, below which frequencies between the two Nyquist frequencies could fold.
-"""
+"""Ratio of new to old rate below which frequencies between the Nyquist frequencies could fold."""
 _CELLS = 16
 """Parts of a grid step over which a held signal is averaged before the low-pass filter. The mean
 attenuates a signal at 0.4 of the rate by 0.1 %."""
@@ -103,7 +102,7 @@ def held_mean(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.
     lowest = np.minimum.reduceat(pieces, first)
     highest = np.maximum.reduceat(pieces, first)
     steps = np.diff(edges)[np.searchsorted(times, begins, side="right") - 1]
-    # Weighted before the product, because huge values times seconds could overflow.
+    # Weighted before the sum, because the sum of huge values times seconds could overflow.
     mean = np.add.reduceat(pieces * (np.diff(bounds) / steps), first)
     return np.clip(mean, lowest, highest)
 
@@ -275,7 +274,7 @@ _TAPS = 32
 """Even samples that contribute to one sample between them."""
 _TAPS_BETA = 8.0
 _PENALTY = 0.1
-"""Weight of the energy in the upper seventh of the old band; it keeps lost samples small."""
+"""Weight of the energy in the upper seventh of the old band; it acts where samples are lost."""
 _RIDGES = (1e-9, 1e-5, 1e-3, 3e-2, 1.0)
 """Candidate ridges on the difference from straight lines; the smallest follows the samples most
 closely."""
@@ -308,7 +307,7 @@ def decimate(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.n
 
 
 def even_samples(seconds: np.ndarray, values: np.ndarray, usual: float) -> tuple[float, np.ndarray]:
-    """Return the step [s] and samples (K,) at even steps, from the first stamp beyond the last."""
+    """Return an even step [s], and samples (K,) from the first stamp to beyond the last."""
     span = float(seconds[-1] - seconds[0])
     # Bounds the memory: at most four even samples for each sample.
     step = max(usual, span / (4 * seconds.size))

@@ -136,8 +136,7 @@ class Design:
     size: int
     """Number of elements."""
     values: Callable[[int, int], Columns]
-    """Function of (start, stop) that returns the values (stop - start,) of these elements by axis.
-    """
+    """Function of (start, stop) that returns their elements' values (stop - start,) by axis."""
     description: dict[str, Any]
     """Plain data that fully define the values; equal descriptions mean equal designs."""
     logarithmic: frozenset[str] = frozenset()

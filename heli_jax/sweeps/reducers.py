@@ -137,9 +137,8 @@ REDUCERS: dict[str, Streaming] = {
     "tic": Streaming((0.0, 0.0), _squares_and_power, _theil, True, "1"),
 }
 """Reducers of one signal: root mean square, mean, largest magnitude, largest, smallest and last
-value. Against the flight: root mean square error, the same over the measured signal's spread
-(nrmse, 0 is perfect), 100 (1 - nrmse) (fit), variance accounted for, Theil inequality coefficient.
-"""
+value. Against the flight: root mean square error; the same over the measured signal's spread
+(nrmse, 0 is perfect); 100 (1 - nrmse) (fit); variance accounted for; Theil coefficient."""
 
 LINEAR = ("modes", "margins")
 """Results of the model linearised at the start of the run: eigenvalues; gain and phase margin of a

@@ -54,8 +54,7 @@ class Split(NamedTuple):
     lanes: int
     """Batch size: elements computed in parallel on a device."""
     backend: str = "xla"
-    """Backend of the simulation: "xla", or "fused", one program of machine code for the whole run.
-    """
+    """Backend of the simulation: "xla", or "fused", one program of machine code for a run."""
 
     def chunks(self, size: int) -> int:
         """Return the number of chunks of a sweep of `size` elements."""

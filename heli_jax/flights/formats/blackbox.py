@@ -39,7 +39,11 @@ _DEGREES_PER_SECOND = "0x3f800000"
 
 @dataclass(frozen=True)
 class MainFrames:
-    """Frames of the control loop."""
+    """Frames of the control loop.
+
+    `columns` are (N,) by name, `times` (N,) [us] from the firmware's start, `starts` (N,) [bytes].
+    `dropped` frames could not be computed or have impossible times.
+    """
 
     columns: Mapping[str, np.ndarray]
     times: np.ndarray
@@ -168,8 +172,7 @@ def _losses(frames: Frames, main: MainFrames) -> tuple[Finding, ...]:
 # An unsigned field has the same bits.
 
 _LONGEST_JUMP = 10_000_000
-"""Longest step between frames [us], as in the firmware's own tools; a longer one is a read error.
-"""
+"""Longest step between frames [us], as in the firmware's tools; a longer one is misread."""
 
 
 class Runs(NamedTuple):
