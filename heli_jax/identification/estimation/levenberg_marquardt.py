@@ -100,12 +100,14 @@ def optimise(
     max_steps: int = 200,
     *,
     held: np.ndarray | None = None,
+    damping: float = _DAMPING,
     known: tuple[Array | np.ndarray, Array | np.ndarray] | None = None,
 ) -> Optimum:
     """Return the least-squares optimum from z0.
 
     Args:
         held: (q,) True for an unknown that stays at its start; none unless given.
+        damping: of the first step.
         known: residuals and Jacobian at z0, where they are at hand.
     """
     start, logarithms = np.asarray(z0, np.float64), ~without_size(layout)
@@ -122,7 +124,7 @@ def optimise(
         return Point(z, np.append(R[:, 0], ties @ (z - start)), np.vstack([R[:, 1:], ties]))
 
     with np.errstate(all="ignore"):  # simulations overflow on the way
-        at, region = linearise(start, known), Region(_DAMPING, np.inf)
+        at, region = linearise(start, known), Region(damping, np.inf)
         sizes, count = np.zeros(layout.size), measured_count(data)
         short, steps = not np.isfinite(at.squares), 1
         while True:
@@ -171,7 +173,10 @@ def fit_nuisances(
     held = np.arange(layout.size) < layout.first_nuisance
     if held.all():
         return z
-    return optimise(layout, data, noise, z, _NUISANCE_STEPS, held=held).z
+    # A nonlinear simulation may leave the record's motion by a long first step.
+    first = (_DAMPING,) if layout.model.linear else (_DAMPING, 0.01, 1.0)
+    runs = [optimise(layout, data, noise, z, _NUISANCE_STEPS, held=held, damping=d) for d in first]
+    return min(runs, key=lambda run: run.cost).z
 
 
 def gain_ahead(
