@@ -149,8 +149,9 @@ def _of_verdicts(fit: Fit) -> list[Gate]:
 def _of_parameter(name: str, estimate: Estimate) -> list[Gate]:
     def share(sd: float | None) -> float:
         # Without an sd, and for an estimate of exactly zero, the gate fails.
-        known = sd is not None and estimate.sd is not None and estimate.value
-        return 100.0 * abs(sd / estimate.value) if known else math.nan
+        if sd is None or estimate.sd is None or not estimate.value:
+            return math.nan
+        return 100.0 * abs(sd / estimate.value)
 
     return [
         _most("Cramér-Rao", name, share(estimate.sd), "%", CRAMER_RAO),
