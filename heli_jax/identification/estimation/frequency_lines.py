@@ -362,8 +362,8 @@ def resolved(m: Matrices, record: Record, whitening: Complex[Array, "K p p"]) ->
 
     def of_block(of: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         z, W, effects = of
-        Ad = m.Ad[None].astype(z.dtype)
-        R = jnp.linalg.inv(z[:, None, None] * jnp.eye(n, dtype=z.dtype)[None] - Ad)
+        unit = jnp.eye(n, dtype=z.dtype)[None]
+        R = jnp.linalg.inv(z[:, None, None] * unit - m.Ad[None].astype(z.dtype))
         H = W @ real(m.C[None].astype(z.dtype) @ R)
         basis = basis_of(H, effects)
         return real(R), H, basis.T @ basis
