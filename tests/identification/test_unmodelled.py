@@ -212,7 +212,7 @@ def test_nothing_is_missed_of_a_right_model(method, coloured):
     assert not [f for f in found.findings if f.code.startswith("dynamics.")]
 
 
-STICK = [Drive((0,), "input", ("d",), NARROW)]
+STICK = [Drive(0, "input", ("d",), NARROW)]
 
 
 def drawn(rng, noise):
@@ -268,7 +268,7 @@ def test_the_answer_through_a_filter_is_found_where_it_is():
     assert found.statistic == pytest.approx(N * np.log(less[0] / less[1]), rel=0.25)
     # Beside the same filter of the drive nothing of it is left to its cube.
     both = lines_of(e, u[:, None], np.stack([u, u**3], axis=1))
-    assert strongest([both], [Drive((1,), "amplitude", (), BROAD, (0,))]).p_value > 0.01
+    assert strongest([both], [Drive(1, "amplitude", (), BROAD, (0,))]).p_value > 0.01
 
 
 def wandering(rng):

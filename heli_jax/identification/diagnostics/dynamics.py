@@ -25,6 +25,7 @@ def unmodelled_dynamics(c: Context) -> Iterator[Finding]:
             *one.drive.of,
             value=one.p_value,
             shifts=one.shifts,
+            distrusts=one.far,
             output=one.output,
             of=one.drive.of,
             gain=one.gain,

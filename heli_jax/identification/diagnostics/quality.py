@@ -1,7 +1,6 @@
 """Signals that are cut off, stuck or astray.
 
-They are tested as logged, if the flight knows it: resampling hides flat tops, and does not
-repair them.
+They are tested as logged, where the flight knows it, since resampling hides flat tops.
 """
 
 from collections.abc import Iterator

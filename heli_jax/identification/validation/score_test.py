@@ -3,15 +3,15 @@ r"""Does a residual follow a drive through some filter, beyond what the estimate
 A mode that a model lacks leaves a residual that is a drive through a resonance, in a few lines of
 the record's spectrum: shares of the whole residual's power do not show it. So residual and
 sensitivities are whitened, and the residual is regressed on sensitivities and on the drive through
-each filter of a bank of second order: a score test for a model with such a mode. The states of a
-filter at the ends of the record are regressors too.
+each filter of a bank of second order: the gain of the likelihood in that direction is the score
+test for a model with such a mode. What the record's ends make of the filter's states takes part.
 
-The covariance of the score is that of random phases at the residual's own power, line by line, so
-that no shape of the noise is assumed. The p value of the largest statistic along a bank is Davies'
-bound by the variation of its root.
+The largest gain of the bank is compared with those of the same residual with phases drawn anew at
+each line. That keeps its spectrum, lines and humps of a disturbance too, and destroys nothing but
+what goes together with the drives, so that no shape of the noise has to be assumed.
 
-Sources: Ljung (1999), 16.6, for residuals against inputs; Rao (1948) for score tests; White (1980)
-for their covariance; Davies (1987) for the largest of many.
+Sources: Ljung (1999), 16.6, for residuals against inputs; Rao (1948) for score tests; Theiler and
+others (1992) for surrogates; Gumbel (1958) for the distribution of maxima.
 """
 
 import itertools
@@ -31,14 +31,22 @@ ORDER = 10
 NARROW = ((0.03, 0.05), (0.1, 0.15), (0.3, 0.4), (1.0, 0.8))
 """damping of the bank's filters, and the logarithm of the frequency from one to the next"""
 BROAD = NARROW[2:]
+_SURROGATES = 99
 _LINES = 16_000
 """of all records together at most, the lowest of each"""
 _LEAST = 20
 """lines of a record below which it is not tested"""
 _SAME = 1e-4
 """part of a column beyond which it says something that those before it do not"""
+_AT_LEAST = 14.0
+"""gain below which no p value is computed: by one filter alone chance makes it in 1 of 1000"""
 _ROUNDING = 1e-9
 """part of a column below which nothing is left of it"""
+_MEDIAN = 0.6745
+"""of the size of a standard normal number"""
+_EULER = 0.5772156649015329
+_AT_ONCE = 8
+"""residuals that are multiplied with all columns together"""
 
 
 class Lines(NamedTuple):
@@ -55,12 +63,12 @@ class Lines(NamedTuple):
 
 
 class Drive(NamedTuple):
-    """Known signals that a residual may follow."""
+    """Something known that a residual may follow."""
 
-    columns: tuple[int, ...]
+    column: int
     """of `Lines.drives`"""
     kind: Literal["input", "amplitude", "flights", "time"]
-    """an input through a mode or a lag; nonlinear functions of the motion; a parameter that differs
+    """an input through a mode or a lag; what is not linear of the motion; a parameter that differs
     between flights, or changes over the record"""
     of: tuple[str, ...] = ()
     """the input, or the flights"""
@@ -68,19 +76,19 @@ class Drive(NamedTuple):
     """damping of the filters that it is tried through, and the logarithm between their frequencies;
     it is tried without any as well unless it is an input"""
     beside: tuple[int, ...] = ()
-    """columns that are regressors through the same filter"""
+    """columns whose answer through the same filter is taken off first"""
     unknown: int | None = None
     """that changes"""
 
 
 class Strongest(NamedTuple):
-    """The drive and filter that a residual follows most surely."""
+    """The drive and filter that a residual follows most."""
 
     drive: Drive
     statistic: float
-    """score statistic; twice what the log-likelihood gains if the residual is white"""
+    """gain of twice the log-likelihood, by two numbers"""
     p_value: float
-    """of the largest statistic of all drives and filters"""
+    """that chance makes as much, by the best of all drives and filters"""
     damping: float
     """of the filter; infinite of none"""
     frequency: float
@@ -98,12 +106,13 @@ def lines_of(
     J: Float[np.ndarray, "N q"],
     drives: Float[np.ndarray, "N d"],
     holes: Sequence[int] = (),
+    most: float = np.inf,
 ) -> Lines | None:
-    """Whiten signals by the residual's autoregression; None if the record is too short, or if the
-    residual is zero.
+    """Whitened by the residual's autoregression; None of records too short or without a residual.
 
     Args:
         holes: the samples before which others are missing.
+        most: robust sds of the whitened residual, at which it is bounded (Huber, 1981).
     """
     n = e.size - ORDER
     if (n - 1) // 2 < max(_LEAST, 2 * J.shape[1]) or not np.std(e) > 0:
@@ -115,13 +124,17 @@ def lines_of(
     rows -= rows.mean(axis=1, keepdims=True)
     # Differences with the filter's own order left out have no samples from before the record.
     white = np.stack([np.convolve(c, h, "valid") for c in rows])
-    # Samples within the filter's order after a hole are left out: signals jump there.
+    # What jumps because samples are missing is no answer: the filter's order after a hole is as if
+    # nothing had been measured.
     white[:, across(holes, e.size)[ORDER:]] = 0.0
+    if np.isfinite(most):
+        most *= float(np.median(np.abs(white[0][white[0] != 0.0]))) / _MEDIAN
+        white[0] = np.clip(white[0], -most, most)
     v = np.asarray(scipy.fft.rfft(white))[:, 1 : 1 + (n - 1) // 2] / np.sqrt(n)
-    # Only rounding is left of a bias.
+    # Of a bias rounding alone is left, which no step of it makes up for.
     mean_squares = np.mean(np.real(v) ** 2 + np.imag(v) ** 2, axis=1, keepdims=True)
     v[(np.sqrt(mean_squares) <= _ROUNDING * scales)[:, 0]] = 0.0
-    # Scaled: the noise of records differs.
+    # Of one size in all records: their noise differs.
     size = float(np.sqrt(mean_squares[0, 0]))
     v /= size
     q = J.shape[1]
@@ -130,7 +143,7 @@ def lines_of(
 
 
 def across(holes: Sequence[int], size: int) -> np.ndarray:
-    """True (size,) for the samples within the order of `whitening` after a hole."""
+    """The samples (size,) to which the filter of `whitening` brings samples from before a hole."""
     after = np.zeros(size, bool)
     for first in holes:
         after[first : first + ORDER] = True
@@ -138,7 +151,7 @@ def across(holes: Sequence[int], size: int) -> np.ndarray:
 
 
 def whitening(e: np.ndarray, holes: Sequence[int] = ()) -> np.ndarray:
-    """Return the filter (ORDER + 1,) of an autoregression, by Yule and Walker.
+    """The filter (ORDER + 1,) of an autoregression, by Yule and Walker.
 
     Args:
         e: the signal (N,), of mean zero.
@@ -153,7 +166,8 @@ def whitening(e: np.ndarray, holes: Sequence[int] = ()) -> np.ndarray:
 
 
 def strongest(records: Sequence[Lines], drives: Sequence[Drive]) -> Strongest:
-    """Return the drive that the residual of one output follows most surely."""
+    """The strongest answer of the residual of one output to any of the drives, and the probability
+    that chance makes one as strong."""
     records = _lowest(records)
     e, J, X, angles = (
         np.concatenate(each)
@@ -161,141 +175,139 @@ def strongest(records: Sequence[Lines], drives: Sequence[Drive]) -> Strongest:
     )
     rows, residual = _real(J), _real(e[:, None])
     known = directions(rows, _SAME)
-    white = _without(known, residual)[:, 0]
-    white *= np.sqrt(white.size / max(white.size - known.shape[1], 1))
-    # What the record's ends make of a filter's states has a column for each record.
-    ends = np.repeat(np.eye(len(records)), [r.e.size for r in records], axis=1).T.astype(complex)
-    # From two periods in the longest record on.
+    white = _without(known, residual)
+    freedom, squares = white.size - known.shape[1], float(np.sum(white**2))
+    trials, known_lines = list(_trials(records, drives, X.T, angles)), _complex(known).T
+    gains = [each.gains(known_lines, _complex(white).T)[:, :, 0] for each in trials]
+    best = int(np.argmax([np.max(of) for of in gains]))
+    one, of = trials[best], gains[best]
+    of_filter, at = np.unravel_index(int(np.argmax(of)), of.shape)
+    drive, gain = one.drives[at], float(of[of_filter, at] * freedom / squares)
+    damping, frequency = one.filters[of_filter].tolist()
+    if not gain > _AT_LEAST:
+        nothing = np.zeros(J.shape[1])
+        return Strongest(drive, gain, 1.0, damping, frequency, nothing, nothing, 0.0)
+    # The same phases for the same residual, whoever tests it. In single precision, half the work:
+    # what chance makes is known to a tenth of itself.
+    turns = np.random.default_rng(0).random((e.size, _SURROGATES))
+    turns = (2.0 * np.pi * turns).astype(np.float32)
+    phases = np.cos(turns) + 1j * np.sin(turns)
+    anew = _real(_complex(white).astype(phases.dtype) * phases)
+    anew = _without(known.astype(np.float32), anew)
+    anew *= np.sqrt(freedom / np.sum(anew**2, axis=0))
+    of_chance = [each.gains(known_lines, _complex(anew).T).max(axis=(0, 1)) for each in trials]
+    own = one.beside + 2 * at
+    through = one.columns[[*range(one.beside), own, own + 1]]
+    steps = _steps(rows, _real((one.response[of_filter] * through).T), residual)
+    p_value = _by_chance(gain, np.max(of_chance, axis=0))
+    return Strongest(drive, gain, p_value, damping, frequency, *steps)
+
+
+class _Trial(NamedTuple):
+    """Filters, and the drives that are tried through them beside the same columns."""
+
+    response: Complex[np.ndarray, "f K"]
+    """of each filter at each line"""
+    filters: Float[np.ndarray, "f 2"]
+    """damping and frequency [rad a sample]; infinite damping is no filter"""
+    drives: tuple[Drive, ...]
+    columns: Complex[np.ndarray, "c2 K"]
+    """those beside first, then the drives, each by itself and one sample later"""
+
+    @property
+    def beside(self) -> int:
+        """The number of columns before those of the drives."""
+        return len(self.columns) - 2 * len(self.drives)
+
+    def gains(
+        self, known: Complex[np.ndarray, "q K"], residuals: Complex[np.ndarray, "r K"]
+    ) -> Float[np.ndarray, "f d r"]:
+        """The part of each residual's squares that each drive explains beyond what is known.
+
+        All is had from products of columns, which are sums over lines of what the filters have in
+        common: no column is filtered.
+
+        Args:
+            known: orthonormal; the residuals have nothing of it.
+        """
+        f, d, b = len(self.response), len(self.drives), self.beside
+        columns = self.columns
+        power = np.real(self.response) ** 2 + np.imag(self.response) ** 2
+        whole = np.stack([power @ np.real(columns * np.conj(v)).T for v in columns[:b]], axis=2)
+        own = columns[b:].reshape(d, 2, -1)
+        square, across = np.abs(own[:, 0]) ** 2, np.real(own[:, 0] * np.conj(own[:, 1]))
+        own = (power @ np.concatenate([square, across, across, square]).T).reshape(f, 2, 2, d)
+        own = np.moveaxis(own, 3, 1)
+        of_known, answers = self._products(known), self._products(residuals)
+
+        left = whole - of_known @ of_known[:, :b].mT
+        taken = left[:, b:] @ _inverse(left[:, :b], whole[:, :b])
+        answers = answers[:, b:] - taken @ answers[:, :b]
+        answers, of_known, left, taken = (
+            v.reshape(f, d, 2, -1) for v in (answers, of_known[:, b:], left[:, b:], taken)
+        )
+        over = _inverse(own - of_known @ of_known.mT - taken @ left.mT, own)
+        return np.sum(answers * (over @ answers), axis=2)
+
+    def _products(self, others: Complex[np.ndarray, "n K"]) -> Float[np.ndarray, "f c2 n"]:
+        """The products of the columns through each filter with others."""
+        response = _real(self.response.astype(others.dtype).T)
+        columns = self.columns.astype(others.dtype)
+        out = np.zeros((len(self.response), len(columns), len(others)), response.dtype)
+        for k in range(0, len(others), _AT_ONCE):
+            each = np.conj(columns)[:, None] * others[None, k : k + _AT_ONCE]
+            values = response.T @ _real(each.reshape(-1, each.shape[2]).T)
+            out[:, :, k : k + _AT_ONCE] = values.reshape(len(out), len(columns), -1)
+        return out
+
+
+def _trials(
+    records: Sequence[Lines],
+    drives: Sequence[Drive],
+    X: Complex[np.ndarray, "d K"],
+    angles: Float[np.ndarray, " K"],
+) -> Iterator[_Trial]:
+    """The drives by filter and by what stands beside them; the filters from two swings over the
+    longest record on."""
     low = 2.0 * min(float(record.angles[0]) for record in records)
     high = 0.9 * max(float(record.angles[-1]) for record in records)
     back = np.exp(-1j * angles)
-    best, paths = (np.inf, 0.0), 0
-    chosen: tuple[Drive, float, float, np.ndarray] | None = None
-    for (bank, beside, plain), group in itertools.groupby(
-        drives, lambda d: (d.bank, d.beside, d.kind != "input")
+    # What the record's ends make of a filter's states has a column for each record.
+    ends = np.repeat(np.eye(len(records)), [r.e.size for r in records], axis=1).astype(complex)
+    for (bank, plain, beside), group in itertools.groupby(
+        drives, lambda d: (d.bank, d.kind != "input", d.beside)
     ):
         those = tuple(group)
-        base = np.concatenate([ends, X[:, beside]], axis=1)
-        for damping, frequencies in _paths(bank, plain, low, high):
-            through = [_response(damping, w, back) for w in frequencies]
-            tested = [_statistics(h, base, X, those, back, known, white) for h in through]
-            for k, drive in enumerate(those):
-                values, ranks = zip(*(at[k] for at in tested), strict=True)
-                at = int(np.argmax(values))
-                chance = _davies(np.array(values), max(ranks))
-                paths += 1
-                if (chance, -values[at]) < best:
-                    best = (chance, -values[at])
-                    columns = np.concatenate([base, X[:, drive.columns]], axis=1)
-                    chosen = drive, damping, frequencies[at], through[at][:, None] * columns
-    assert chosen is not None
-    drive, damping, frequency, columns = chosen
-    columns = np.stack([columns, columns * back[:, None]], axis=2).reshape(len(back), -1)
-    steps = _steps(rows, _real(columns), residual)
-    # Bonferroni.
-    p_value = min(1.0, paths * best[0])
-    return Strongest(drive, -best[1], p_value, damping, frequency, *steps)
+        columns = np.concatenate([ends, X[[*beside]], X[[d.column for d in those]]])
+        columns = np.stack([columns, columns * back], axis=1).reshape(-1, len(back))
+        filters = [(np.inf, 0.0)] if plain else []
+        for damping, step in bank:
+            w = low
+            while w < high:
+                filters.append((damping, w))
+                # No finer than lines lie.
+                w *= np.exp(max(step, 0.25 * low / w))
+        yield _Trial(_responses(np.array(filters), back), np.array(filters), those, columns)
 
 
-def _paths(
-    bank: Sequence[tuple[float, float]], plain: bool, low: float, high: float
-) -> Iterator[tuple[float, list[float]]]:
-    """Filters of one damping, by frequency [rad a sample]; infinite damping is no filter."""
-    if plain:
-        yield np.inf, [0.0]
-    for damping, step in bank:
-        frequencies, w = [], low
-        while w < high:
-            frequencies.append(w)
-            # No finer than lines lie.
-            w *= np.exp(max(step, 0.25 * low / w))
-        if frequencies:
-            yield damping, frequencies
-
-
-def _statistics(
-    response: Complex[np.ndarray, " K"],
-    base: Complex[np.ndarray, "K b"],
-    X: Complex[np.ndarray, "K d"],
-    drives: Sequence[Drive],
-    back: Complex[np.ndarray, " K"],
-    known: Float[np.ndarray, "K2 q"],
-    white: Float[np.ndarray, " K2"],
-) -> list[tuple[float, int]]:
-    """Return by drive the score statistic of a residual through one filter, and its degrees of
-    freedom.
+def _responses(
+    filters: Float[np.ndarray, "f 2"], back: Complex[np.ndarray, " K"]
+) -> Complex[np.ndarray, "f K"]:
+    """The answer of each filter at each line, of one without a filter 1.
 
     Args:
-        base: regressors through the same filter.
-        known: orthonormal; the residual has nothing of it.
-        back: the response of a delay of one sample.
+        back: what a delay of one sample multiplies a line by.
     """
-    own = [c for drive in drives for c in drive.columns]
-    columns = response[:, None] * np.concatenate([base, X[:, own]], axis=1)
-    columns = np.stack([columns, columns * back[:, None]], axis=2).reshape(len(back), -1)
-    b, whole = 2 * base.shape[1], _real(columns)
-    left = _without(known, whole)
-    shows = np.linalg.norm(left[:, :b], axis=0) > _SAME * np.linalg.norm(whole[:, :b], axis=0)
-    beside = directions(left[:, :b][:, shows], _SAME)
-    left = _without(beside, left[:, b:])
-    sizes = np.maximum(np.linalg.norm(whole[:, b:], axis=0), 1e-300)
-    left /= sizes
-    e, out, first = white - beside @ (beside.T @ white), [], 0
-    for drive in drives:
-        those = slice(first, first + 2 * len(drive.columns))
-        first = those.stop
-        out.append(_score_statistic(left[:, those], e))
-    return out
-
-
-def _score_statistic(
-    columns: Float[np.ndarray, "K2 c"], e: Float[np.ndarray, " K2"]
-) -> tuple[float, int]:
-    """Return the score statistic of a residual along columns, and its degrees of freedom.
-
-    Args:
-        columns: without the regressors, over their sizes before these were taken off.
-    """
-    values, V = np.linalg.eigh(columns.T @ columns)
-    # Directions in which next to nothing is left say nothing.
-    kept = values > _SAME**2
-    if not kept.any():
-        return 0.0, 1
-    basis = columns @ (V[:, kept] / np.sqrt(values[kept]))
-    lines, power = _complex(basis), np.abs(_complex(e[:, None])) ** 2
-    # Of random phases at the residual's own power.
-    covariance = 0.5 * np.real((np.conj(lines) * power).T @ lines)
-    score = basis.T @ e
-    return float(score @ np.linalg.pinv(covariance, 1e-9, hermitian=True) @ score), score.size
-
-
-def _davies(values: Float[np.ndarray, " f"], freedom: int) -> float:
-    """Return a bound of the probability that chance makes the largest of chi-squared statistics
-    along a path of filters."""
-    M, s = float(np.max(values)), freedom
-    variation = float(np.sum(np.abs(np.diff(np.sqrt(np.maximum(values, 0.0))))))
-    density = 0.5 * (s - 1) * np.log(max(M, 1e-300)) - 0.5 * M - 0.5 * s * np.log(2.0)
-    density -= scipy.special.gammaln(0.5 * s)
-    return float(scipy.special.chdtrc(s, M) + variation * np.exp(density))
-
-
-def _response(
-    damping: float, w: float, back: Complex[np.ndarray, " K"]
-) -> Complex[np.ndarray, " K"]:
-    """Return the response of a filter at each line; 1 of one of infinite damping.
-
-    Args:
-        back: the response of a delay of one sample.
-    """
-    if not np.isfinite(damping):
-        return np.ones_like(back)
-    size = np.exp(-damping * w)
-    twice = 2.0 * size * np.cos(w * np.sqrt(max(1.0 - damping**2, 0.0)))
-    return 1.0 / (1.0 - twice * back + size**2 * back**2)
+    damping, w = filters.T
+    none = ~np.isfinite(damping)
+    damping = np.where(none, 1.0, damping)
+    size = np.where(none, 0.0, np.exp(-damping * w))
+    twice = 2.0 * size * np.cos(w * np.sqrt(np.maximum(1.0 - damping**2, 0.0)))
+    return 1.0 / (1.0 - np.outer(twice, back) + np.outer(size**2, back**2))
 
 
 def _lowest(records: Sequence[Lines]) -> list[Lines]:
-    """Return the records without their highest lines, where there are too many."""
+    """The records without the lines that are too many, of each the highest."""
     most = _LINES // len(records)
     return [
         Lines(r.e[:most], r.J[:most], r.drives[:most], r.angles[:most], r.size) for r in records
@@ -303,29 +315,69 @@ def _lowest(records: Sequence[Lines]) -> list[Lines]:
 
 
 def pulled_away(records: Sequence[Lines], k: int) -> float:
-    """Return the p value of the test that the residual of one output does not follow the
-    sensitivities of the first k unknowns, beside those of the others."""
+    """The probability that chance makes the residual follow the sensitivities of the parameters as
+    it does. At estimates that the answer to the inputs bears out it does so by chance alone.
+
+    Args:
+        records: those of one output; of their drives nothing is asked.
+    """
     e, J = (np.concatenate([record[i] for record in _lowest(records)]) for i in range(2))
     nuisances = directions(_real(J[:, k:]), _SAME) if J.shape[1] > k else np.zeros((2 * e.size, 0))
-    own, white = _real(J[:, :k]), _without(nuisances, _real(e[:, None]))[:, 0]
-    white *= np.sqrt(white.size / max(white.size - nuisances.shape[1], 1))
-    columns = _without(nuisances, own) / np.maximum(np.linalg.norm(own, axis=0), 1e-300)
-    statistic, freedom = _score_statistic(columns, white)
-    return float(scipy.special.chdtrc(freedom, statistic))
+    whole = _real(J[:, :k])
+    own = _without(nuisances, whole)
+    shows = np.linalg.norm(own, axis=0) > _SAME * np.linalg.norm(whole, axis=0)
+    if not shows.any():
+        return 1.0
+    basis, white = directions(own[:, shows], _SAME), _without(nuisances, _real(e[:, None]))
+    power, whole = np.abs(_complex(white)[:, 0]) ** 2, float(np.sum(white**2))
+
+    def by_phases(columns: np.ndarray) -> float:
+        """The mean over phases drawn anew of the residual's squares in the columns' span."""
+        return 0.5 * float(power @ np.sum(np.abs(_complex(columns)) ** 2, axis=1))
+
+    left = whole - by_phases(nuisances)
+    gain, by_chance = float(np.sum((basis.T @ white) ** 2)), by_phases(basis)
+    if not (by_chance > 0 and left > 0):
+        return 1.0
+    # With other phases a part of the residual is the nuisances', which a fit takes up.
+    by_chance *= whole / left
+    rank = basis.shape[1]
+    return float(scipy.special.chdtrc(rank, rank * gain / by_chance))
 
 
 def step_to_least(records: Sequence[Lines]) -> Float[np.ndarray, " q"]:
-    """Return the step of the unknowns to the least whitened residual."""
+    """The step of the unknowns to where the whitened residual is least."""
     e = _real(np.concatenate([record.e for record in records])[:, None])
     J = _real(np.concatenate([record.J for record in records]))
     return _steps(J, np.zeros((len(J), 2)), e)[1]
 
 
+def _inverse(left: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    """Inverse of what is left (..., n, n) of the columns' products, without directions in which
+    next to nothing is left; whole: products of the columns themselves."""
+    sizes = np.sqrt(np.maximum(np.einsum("...ii->...i", whole), 1e-300))
+    values, V = np.linalg.eigh(left / (sizes[..., :, None] * sizes[..., None, :]))
+    kept = values > _SAME**2
+    over = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)
+    V = V / sizes[..., :, None]
+    return V @ (over[..., :, None] * V.mT)
+
+
+def _by_chance(gain: float, others: Float[np.ndarray, " r"]) -> float:
+    """The probability that a gain is one of the others, which are maxima of about exponential
+    numbers."""
+    scale = float(np.std(others)) * np.sqrt(6.0) / np.pi
+    if not scale > 0:
+        return 1.0
+    middle = float(np.mean(others)) - _EULER * scale
+    return float(-np.expm1(-np.exp(-(gain - middle) / scale)))
+
+
 def _steps(
     J: Float[np.ndarray, "K2 q"], more: Float[np.ndarray, "K2 c"], e: Float[np.ndarray, "K2 1"]
 ) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"], float]:
-    """Return the change of the step of the unknowns by further columns, the step without these, and
-    the sum of the steps along the last two columns: a drive and the drive one sample later."""
+    """The step of the unknowns beside further columns less that without, that without, and the sum
+    of the steps along the last two columns: a drive and the drive one sample later."""
     columns = np.concatenate([J, more], axis=1)
     sizes = np.linalg.norm(columns, axis=0)
     columns = columns / np.where(sizes > 0, sizes, 1.0)
