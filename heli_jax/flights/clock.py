@@ -41,7 +41,8 @@ _BEGINNING = 0.1
 # Units of time, in words or at the end of a name.
 
 TIME_NAMES = {
-    *("t", "time", "timestamp", "timestamps", "seconds", "sec", "elapsed", "clock", "zeit", "temps")
+    *("t", "time", "timestamp", "timestamps", "seconds", "sec", "elapsed", "clock"),
+    *("zeit", "temps", "tempo", "tiempo"),
 }
 """Words in the names of clocks."""
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "day": 86400.0}

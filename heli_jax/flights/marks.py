@@ -260,6 +260,33 @@ _ONE_COUNT = 0.5
 looks the same."""
 _MOVES = 0.5
 """Smallest share of samples at which another output must move to show that the vehicle did."""
+_STALE = 0.02, 0.5
+"""Smallest and largest share of stale samples."""
+_FINE = 20.0
+"""Smallest usual move of an output with stale samples [smallest move]; by chance fewer than 2 % of
+its samples would repeat."""
+_NOISY = 0.3
+"""Smallest share of moves that turn back, which shows noise."""
+
+
+def stale(values: np.ndarray) -> np.ndarray:
+    """Return a mask of the samples of an output (N,) that a logger or a radio link wrote again.
+
+    Only noise of fine resolution shows them: it never repeats a value by itself.
+    """
+    seen = np.flatnonzero(~np.isnan(values))
+    at, y = np.zeros(values.shape, bool), values[seen]
+    with np.errstate(over="ignore"):
+        moves = np.diff(y)
+    sizes, ways = np.abs(moves[moves != 0]), np.sign(moves[moves != 0])
+    # A signal at the end of its range may be clipped.
+    low, high = np.min(y, initial=np.inf), np.max(y, initial=-np.inf)
+    again = (moves == 0) & (y[1:] > low) & (y[1:] < high)
+    if sizes.size < _REPEATED or not _STALE[0] <= again.mean() <= _STALE[1]:
+        return at
+    if np.median(sizes) >= _FINE * sizes.min() and np.mean(ways[1:] != ways[:-1]) >= _NOISY:
+        at[seen[1:][again]] = True
+    return at
 
 
 def usual_run(values: np.ndarray) -> int | None:
@@ -308,6 +335,14 @@ def repeats_removed(
         if stated[name] == "missing" and usual is None and lengths.size:
             # Stated by the user, so no further evidence is needed.
             usual = round(float(np.median(lengths)))
+        if stated[name] == "auto" and usual is None and (again := stale(y)).any():
+            made[name] = np.where(again, np.nan, y)
+            count = int(np.count_nonzero(again))
+            words = (
+                f"{count} samples of {name} repeat the one before, as its noise never does: they "
+                "are missing (`repeats: keep` keeps them)"
+            )
+            notes.append(note("repeats.missing", words, name, value=count))
         if stated[name] == "keep" or usual is None or usual < 2:
             continue
         if stated[name] == "auto" and not moving:

@@ -264,8 +264,8 @@ def lines(fit: Fit) -> tuple[Line, Line, Line]:
         stopped = "The optimiser stopped before an optimum, and these numbers are no result."
         return (
             Line("bad", "Not converged", stopped),
-            Line("none", "Identifiability not judged", "The data are asked at an optimum alone."),
-            Line("none", "Adequacy not judged", "A model is judged at an optimum."),
+            Line("none", "Identifiability not judged", "The analysis needs an optimum."),
+            Line("none", "Adequacy not judged", "The tests need an optimum."),
         )
     best, runs = sum(row.optimum == 1 for row in fit.starts), len(fit.starts)
     reached = f"The optimiser reached an optimum in {fit.steps} steps."
@@ -284,9 +284,7 @@ def lines(fit: Fit) -> tuple[Line, Line, Line]:
             for f in fit.findings
             if f.bad and f.brief and f.code.partition(".")[0] in _SPEAK_AGAINST
         ]
-        told = ["Nothing in the record speaks against the model"]
-        if against:
-            told = [f"The model explains most of the record, but {against[0]}"]
+        told = [f"In the record {against[0]}" if against else "No finding speaks against the model"]
         for agreement, how in (
             (fit.metrics, "simulated"),
             (fit.one_step, "one step ahead"),

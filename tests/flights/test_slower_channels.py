@@ -5,7 +5,7 @@ import pytest
 
 from heli_jax.errors import InputError
 from heli_jax.flights import Signal, read_flight
-from heli_jax.flights.marks import usual_run, without_repeats
+from heli_jax.flights.marks import stale, usual_run, without_repeats
 from heli_jax.flights.resample import Timed, at_nearest
 from heli_jax.numerics.white_noise import noise_guess
 
@@ -157,3 +157,18 @@ def test_noise_is_guessed_across_missing_samples():
     sparse[at] = x[at]
     assert noise_guess(sparse) == pytest.approx(0.01, rel=0.1)
     assert noise_guess(x) == pytest.approx(0.01, rel=0.05)
+
+
+def test_stale_rows_of_a_noisy_output_are_missing():
+    rng, t = np.random.default_rng(0), np.arange(1500) / 50.0
+    fresh = np.round(np.sin(2.0 * t) + 0.02 * rng.standard_normal(t.size), 5)
+    assert not stale(fresh).any()
+    written, again = fresh.copy(), np.zeros(t.size, bool)
+    for first in np.sort(rng.choice(np.arange(10, 1490), 60, replace=False)):
+        for k in range(first, first + int(rng.integers(1, 4))):
+            written[k], again[k] = written[k - 1], True
+    np.testing.assert_array_equal(stale(written), again)
+    # Coarse steps, a smooth signal and a clipped one repeat values by themselves.
+    assert not stale(np.round(fresh, 1)).any()
+    assert not stale(np.sin(2.0 * t)).any()
+    assert not stale(np.clip(fresh, -0.8, 0.8)).any()

@@ -36,9 +36,11 @@ def signals_shifted(c: Context) -> Iterator[Finding]:
     if not (c.arrived and c.explains) or c.instruments:
         return
     one = shift_in_time(c.problem, c.at, c.e, _outputs_in_doubt(c))
-    # A lag that is missing shows in the residual too, and more closely.
-    lags = any(x.drive.kind == "input" for x in c.unmodelled[0])
-    if one is None or (one.kind == "response" and lags):
+    if one is None:
+        return
+    # A mode or a lag that is missing explains the residual more closely than a delay does.
+    closer = any(x.drive.kind == "input" and x.gain > one.gain for x in c.unmodelled[0])
+    if one.kind == "response" and closer:
         return
     parts = {n: v / c.named[n] for n, v in one.moved.items() if c.named[n]}
     most = sorted(parts, key=lambda n: -abs(parts[n]))[:_NAMED]
