@@ -75,7 +75,7 @@ def shared_stamps(stamps: np.ndarray) -> str:
         return ""
     return (
         f"{still} of {stamps.size} rows have the time of the row before: log time with more "
-        "digits, or delete rows that were written twice"
+        "digits, delete rows that were written twice, or state the rate (time: {rate: HZ})"
     )
 
 

@@ -180,15 +180,15 @@ class Fit:
 
     @property
     def distrust(self) -> str:
-        """A sentence that belongs beside what the data determine; empty where all is trusted."""
-        each = [
-            n if d.shift is None else f"{n} (off by about {abs(d.shift):.2g}: {d.brief})"
-            for n, d in self.distrusts.items()
-        ]
-        if not each:
-            return ""
-        why = dict.fromkeys(d.brief for d in self.distrusts.values() if d.shift is None)
-        return f"Not trusted: {', '.join(each)}{f' ({"; ".join(why)})' if why else ''}."
+        """A sentence for each reason to distrust intervals; empty if all are trusted."""
+        by_reason: dict[str, list[str]] = {}
+        for name, d in self.distrusts.items():
+            size = "" if d.shift is None else f" (off by about {abs(d.shift):.2g})"
+            by_reason.setdefault(d.brief, []).append(name + size)
+        return " ".join(
+            f"Not trusted because {reason}: {', '.join(names)}."
+            for reason, names in by_reason.items()
+        )
 
     @property
     def notes(self) -> tuple[str, ...]:
