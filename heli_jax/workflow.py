@@ -255,8 +255,8 @@ def log_notes(problem: Problem) -> list[Finding]:
         notes += [
             note(
                 "hold.guessed",
-                f"{where}: {name} is taken as {flight.hold[name]} between samples, since it "
-                f"{reason}",
+                f"{where}: {name} is taken as {flight.hold[name]} between samples, because it "
+                f"{reason}; state hold: zero-order if a computer commanded it",
                 name,
             )
             for name, reason in flight.hold_reason.items()

@@ -75,9 +75,10 @@ def content_of(mapping: Mapping[str, Any]) -> Content:
     """
     # Unknown keys first, since a misspelt key is the most likely reason for a missing one.
     _known(mapping, _KEYS, "")
-    for key in ("name", "states", "inputs", "outputs", "parameters", "A"):
+    needed = ("name", "states", "inputs", "outputs", "parameters", "A")
+    for key in needed:
         if key not in mapping:
-            raise InputError(f"{key}: missing, expected one of a linear model's keys")
+            raise InputError(f"{key}: missing, a linear model needs {', '.join(needed)}")
     name = mapping["name"]
     if not isinstance(name, str) or not _TITLE.fullmatch(name):
         raise InputError(f"name: expected a short name such as roll, got {name!r:.60}")

@@ -57,9 +57,9 @@ def chosen_model(
     if name is None:
         vehicle = other_vehicle(log.autopilot)
         if vehicle:
-            problem = f"the log is of {vehicle}, and the models that are chosen for a log are of"
-            remedy = "expected --model NAME; heli-jax new-model makes one of your own"
-            raise wrong(path, f"{problem} helicopters; {remedy}")
+            problem = f"the log is of {vehicle}, and new chooses only helicopter models"
+            remedy = "expected --model NAME, such as linear:FILE.yaml, a model file of your own"
+            raise wrong(path, f"{problem}; {remedy}")
         name = _by_what_moves(log, path)
     # For roll and pitch there are the paper's model and a linear one: {linear: roll} is the latter.
     stated = name.strip().removeprefix("{").removesuffix("}")
