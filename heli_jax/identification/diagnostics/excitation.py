@@ -56,7 +56,7 @@ def nothing_follows(c: Context) -> Iterator[Finding]:
         else:
             yield found("excitation.free-motion", "note", name, value=rough, limit=LIMITS.noise)
     elif outputs and (share := max(f.explained for f in outputs)) < limit:
-        # The rest is chance, or inputs that follow the response, as in a rate loop on the ground.
+        # The common part is chance, or feedback to the inputs, as in a rate loop on the ground.
         by_chance = min(f.p_value for f in outputs) >= LIMITS.chance
         severity = "refuse" if by_chance or c.follows else "doubt"
         yield found(NOTHING_FOLLOWS, severity, value=max(share, 0.0), limit=limit)

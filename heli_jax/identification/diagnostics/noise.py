@@ -19,7 +19,7 @@ def residuals_white(c: Context) -> Iterator[Finding]:
     not_white = [name for name, w in c.whiteness.items() if not w.white] if c.fitted else []
     if not not_white:
         return
-    # Sort by the correlation at one sample, since the message shows this number.
+    # Select by the correlation at one sample, since the message shows this number.
     worst = max((c.whiteness[n] for n in not_white), key=lambda w: abs(w.lag1))
     objective, converged = c.at.layout.objective, c.status != "not-converged"
     allowed = objective.noise_model == "spectrum" or c.errors.coloured

@@ -3,7 +3,7 @@
 A wrong model can converge, and its parameters can be identifiable. So the simulated response of
 every fitted output is tested. The acceptance card requires a variance accounted for (VAF) of 0.9;
 Tischler and Remple (2012) and Jategaonkar (2006) use similar limits. A model is inadequate if it
-leaves more than a fifth of the signal beside white noise unexplained, twice what the card allows.
+leaves more than a fifth of the signal without its white noise unexplained, twice the card's limit.
 Between the two limits it is doubtful. White residuals make it adequate at any VAF, since only
 measurement noise remains. With filter error the simulation does not contain the disturbance, so
 its error is compared with the error that the estimated disturbance predicts.
@@ -51,7 +51,7 @@ class OutputAdequacy(NamedTuple):
     vaf: float
     """VAF of the simulation (with `Adequacy.ahead`, of predictions) over all fitted flights."""
     explained: float
-    """Explained share of the signal beside white noise."""
+    """Explained share of the signal without its white noise."""
     white: bool
     """True if the residuals (innovations) of all flights are white."""
     lag1: float
@@ -94,12 +94,10 @@ def is_unstable(problem: Problem, params: Any, growth: float = _GROWTH) -> bool:
     return False
 
 
-# params is Any: a record of a model's Params, whose class may be a user's own.
-
 EXPLAINED = 0.8
-"""Least explained share of the signal beside white noise."""
+"""Least explained share of the signal without its white noise."""
 NEARLY_WHITE = 0.1
-"""Largest share beside white noise in the variance of a residual that counts as noise."""
+"""Largest coloured share of the variance of a residual that counts as noise."""
 WORSE = -0.1
 """VAF below which a white residual is not noise alone; chance reaches a few hundredths below 0."""
 EXPECTED = 9.0
@@ -243,9 +241,11 @@ def _of_output(name: str, m: Metrics, evidence: Evidence, unstable: bool) -> Out
 
 
 def _explained(error: list[np.ndarray], measured: np.ndarray) -> tuple[float, float]:
-    """Return the explained share of the signal, and the share of the error, beside white noise.
+    """Return the explained share of the signal without white noise, and the error's coloured share.
 
-    `error` is by flight.
+    Args:
+        error: residuals (N,) by flight.
+        measured: the output over all flights.
     """
     with np.errstate(all="ignore"):  # a simulation that diverges overflows in its square
         residual, total = float(np.nanvar(np.concatenate(error))), float(np.nanvar(measured))

@@ -243,8 +243,8 @@ def feedback(
 
 def _rates_of(flight: Flight) -> tuple[float, ...]:
     """Return the sampling rates at which a flight is tested [Hz]."""
-    # At most the inputs' rate and half of the log's. The log does not show how a stick moved within
-    # a sample, so that the response to this motion would count as an innovation.
+    # Use no more than the inputs' rate and half of the log's. The log does not show how a stick
+    # moved within a sample, so the response to this motion would count as an innovation.
     frames = [0.5]
     for u in flight.inputs.values():
         at = np.flatnonzero(np.diff(u) != 0.0)
@@ -333,8 +333,8 @@ def _decimated(
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, np.ndarray], float]:
     """Average a flight down to a lower rate.
 
-    Return the inputs that move (N,), the outputs that are mostly measured (N,), the inputs' means
-    over parts of a sample (N, m), and the sample time [s].
+    Return the moving inputs (N,), the outputs (N,) that are mostly measured, the inputs' means over
+    parts of a sample (N, m), and the sample time [s].
 
     Args:
         earlier: shift of an input to earlier times [samples].

@@ -181,7 +181,7 @@ def _modes_that_show(
         # A mode slower than the record is a drift.
         if modes is None or abs(eigenvalue) < 2.0 * np.pi / (flight.n_samples * flight.dt):
             continue
-        # The mode of a filter alone is known.
+        # A mode of a filter alone is known: leave it out.
         right = modes.right[:, k]
         if np.linalg.norm(right[vehicle]) < 1e-6 * np.linalg.norm(right):
             continue

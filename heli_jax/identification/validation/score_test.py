@@ -127,7 +127,7 @@ def lines_of(
     rows -= rows.mean(axis=1, keepdims=True)
     # "valid" omits the first samples, for which the filter would need some before the record.
     white = np.stack([np.convolve(c, h, "valid") for c in rows])
-    # A jump across missing samples is no response: drop as many samples as the filter reaches back.
+    # A jump across missing samples is no response: drop all samples that the filter mixes.
     white[:, across(holes, e.size)[ORDER:]] = 0.0
     if np.isfinite(most):
         most *= float(np.median(np.abs(white[0][white[0] != 0.0]))) / _MEDIAN
@@ -205,7 +205,7 @@ def strongest(records: Sequence[Lines], drives: Sequence[Drive]) -> Strongest:
 
 
 class _Trial(NamedTuple):
-    """Filters, and the drives that are tested through them with the same columns beside."""
+    """Filters, and the drives that are tested through them after removing the same columns."""
 
     response: Complex[np.ndarray, "f K"]
     """Frequency response of each filter."""
@@ -213,7 +213,7 @@ class _Trial(NamedTuple):
     """Damping and frequency [rad/sample]; infinite damping is no filter."""
     drives: tuple[Drive, ...]
     columns: Complex[np.ndarray, "c2 K"]
-    """Columns beside, then the drives; each as it is and one sample later."""
+    """Columns that are removed first, then the drives; each also one sample later."""
 
     @property
     def beside(self) -> int:
@@ -267,7 +267,7 @@ def _trials(
     X: Complex[np.ndarray, "d K"],
     angles: Float[np.ndarray, " K"],
 ) -> Iterator[_Trial]:
-    """Yield the drives grouped by filters and columns beside.
+    """Yield the drives, grouped by their filters and by the columns that are removed first.
 
     The slowest filter has two periods in the longest record.
     """
@@ -361,7 +361,7 @@ def _inverse(left: np.ndarray, whole: np.ndarray) -> np.ndarray:
     Directions in which almost nothing remains are left out.
 
     Args:
-        left: products of what remains of the columns.
+        left: products of the remaining parts of the columns.
         whole: products of the columns themselves.
     """
     sizes = np.sqrt(np.maximum(np.einsum("...ii->...i", whole), 1e-300))

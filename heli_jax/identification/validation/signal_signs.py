@@ -21,7 +21,7 @@ from heli_jax.vehicle import of_helicopter
 
 
 _PAIRS = (("p", "phi"), ("q", "theta"), ("r", "psi"), ("r", "yaw"), ("p", "roll"), ("q", "pitch"))
-"""Usual names of rates and their angles, beside those of the model's axes."""
+"""Usual names of rates and their angles, in addition to the model's axes."""
 WITHIN = 0.5
 """Interval over which changes of an angle and its integrated rate are compared [s]."""
 PARTS = 10
@@ -203,7 +203,7 @@ def oversized(model: Model, flight: Flight) -> Iterator[tuple[str, float, float,
         if values is None or signal.unit not in ("rad", "rad/s") or signal.scale != 1.0:
             continue
         seen = np.abs(values[np.isfinite(values)])
-        # The unit in the file makes certain what the size alone does not.
+        # The unit in the file is certain evidence; the size alone is not.
         said = signal.contradicted == ("deg" if signal.unit == "rad" else "deg/s")
         # A motor's shaft makes any number of turns, and a rotor turns faster than any fuselage. So
         # may the angle of a user's nonlinear model, such as a pendulum.

@@ -1,8 +1,8 @@
 """Unmodelled dynamics in the residuals: a mode, a response that depends on amplitude, or one that
 changes over the record.
 
-Each output's residual in time is regressed on candidate drives, beyond what the sensitivities
-explain (`score_test`). This needs only a simulation, so it works for every estimation method:
+Each output's residual in time is regressed on the sensitivities and on candidate drives
+(`score_test`). This needs only a simulation, so it works for every estimation method. The drives:
 
 - the inputs through a bank of filters, for a missing mode or lag;
 - nonlinear functions of the inputs and of the simulated output, beyond the input through the same
@@ -356,7 +356,7 @@ def _lines(
         u, slopes = [np.asarray(inputs[n]) for n in moving], J[i, name][:, :k]
         known = np.stack([*u, *nonlinear(np.asarray(e.simulated[i][name]), u)], axis=1)
         X = [np.stack([own.of_input(v) for v in known.T], axis=1)]
-        # A change in one flight stands first, since it also looks like a jump halfway.
+        # One flight's changes come before those over time, since they may also look like a jump.
         X += [slopes[own.rows] * (other == place) for other in range(len(samples))]
         X += [(slopes * by[:, None])[own.rows] for by in (shape, np.sign(shape))]
         left = np.asarray(e.raw[i][name])[own.rows]
@@ -374,7 +374,7 @@ def _lines(
         names = [called[i] if i < len(called) else f"flight {i + 1}" for i, _ in samples]
         of = [names[place] for place, _ in lines]
         drives += [
-            # With two flights either one may be the odd one.
+            # With only two flights either may be the odd one.
             Drive(
                 first + place * k + c,
                 "flights",
