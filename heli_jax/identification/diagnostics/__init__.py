@@ -49,27 +49,27 @@ DIAGNOSTICS: tuple[Diagnostic, ...] = (
     search.prior_contradicted,
     search.profile_intervals,
 )
-"""causes first: of two findings as severe the first one is shown first"""
+"""All diagnostics, causes first: among equally severe findings this order decides."""
 
 MOOT: dict[str, tuple[str, ...]] = {
     "units.in-doubt": ("signs.rate-against-angle",),
     "signs.against-start": ("signs.rate-against-angle",),
     "timing.mode-past-nyquist": ("timing.logging-rate",),
 }
-"""by code those that say the same more surely, where they are more than a note"""
+"""Codes that replace a finding if they are more than a note, since they are more certain."""
 
 
 def diagnose(c: Context) -> tuple[Finding, ...]:
-    """All findings at a point, the most severe first."""
+    """Return all findings at a point, the most severe first."""
     findings = once(weighed((f for d in DIAGNOSTICS for f in d(c)), c.estimates))
     sure = {f.code for f in findings if f.bad}
-    # What changes the conclusion on a fit stays.
+    # Keep every finding that changes the conclusion on a fit.
     kept = [f for f in findings if f.denies or f.distrusts or not sure & set(MOOT.get(f.code, ()))]
     return tuple(sorted(kept, key=lambda f: _rank(f, c)))
 
 
 def _rank(f: Finding, c: Context) -> int:
-    """Order: exit codes first, then doubts, notes and what is good."""
+    """Return the rank of a finding: exit codes first, then doubts, notes and good results."""
     if f.denies or f.severity == "refuse":
         return 0
     if distrusted([f], c.estimates):

@@ -1,4 +1,4 @@
-"""Adequacy of the model, beside noise and disturbance."""
+"""Findings on the adequacy of the model."""
 
 from collections.abc import Iterator
 
@@ -16,7 +16,7 @@ from heli_jax.identification.validation.excitation import LEVEL
 
 
 def outputs_explained(c: Context) -> Iterator[Finding]:
-    """Outputs that the simulation, or predictions ahead, do not explain."""
+    """Find outputs that the simulation, or predictions ahead, do not explain."""
     if not c.fitted or c.adequacy.by_chance:
         return
     doubted = [o for o in c.adequacy.judged if not o.adequate or o.doubtful]
@@ -38,7 +38,7 @@ def outputs_explained(c: Context) -> Iterator[Finding]:
 
 
 def simulation_as_expected(c: Context) -> Iterator[Finding]:
-    """Outputs that look bad because of the estimated disturbance."""
+    """Find outputs with a low VAF that the estimated disturbance explains."""
     if not c.fitted or c.adequacy.by_chance:
         return
     if c.adequacy.ahead is not None:
@@ -56,7 +56,7 @@ def simulation_as_expected(c: Context) -> Iterator[Finding]:
 
 
 def outputs_unmoved(c: Context) -> Iterator[Finding]:
-    """Records of which nothing stands out of the noise, and outputs that never move."""
+    """Find records without a response above the noise, and outputs that never move."""
     if not c.fitted:
         return
     if c.adequacy.by_chance and c.adequacy.judged:
@@ -75,7 +75,10 @@ def outputs_unmoved(c: Context) -> Iterator[Finding]:
 
 
 def responses_explained(c: Context) -> Iterator[Finding]:
-    """Squared errors of fitted responses over their variance, which gusts do not change."""
+    """Test the squared errors of fitted responses over their variance.
+
+    Gusts do not change this ratio.
+    """
     if c.responses is None or c.unrelated:
         return
     if c.responses.outside:
@@ -93,11 +96,11 @@ def responses_explained(c: Context) -> Iterator[Finding]:
 
 
 _SURE = 1e-4
-"""p value below which a residual that follows the excitation takes all intervals away"""
+"""P-value below which a residual that follows the excitation makes all intervals untrusted."""
 
 
 def residual_follows_excitation(c: Context) -> Iterator[Finding]:
-    """Residuals in frequency that still follow what excites the vehicle."""
+    """Find residuals in frequency that still follow the excitation."""
     if not c.fitted or c.unrelated:
         return
     level, failed = LEVEL / max(len(c.followed), 1), c.failed
@@ -118,7 +121,10 @@ def residual_follows_excitation(c: Context) -> Iterator[Finding]:
 
 
 def outputs_follow_excitation(c: Context) -> Iterator[Finding]:
-    """Records of which no output follows the excitation: residuals that do not are no merit."""
+    """Find records in which no output follows the excitation.
+
+    A residual that does not follow it is then no sign of a good model.
+    """
     if not c.unrelated:
         return
     least = min(c.unrelated.values())
@@ -135,11 +141,11 @@ def outputs_follow_excitation(c: Context) -> Iterator[Finding]:
     )
 
 
-# Do the estimates predict flights that they were not fitted to?
+# Held-out flights.
 
 
 def held_out_predicted(c: Context) -> Iterator[Finding]:
-    """Flights held out that the model does not predict."""
+    """Find held-out flights that the model does not predict."""
     held = c.held_out
     astray = [
         s.flight
@@ -168,10 +174,10 @@ def held_out_predicted(c: Context) -> Iterator[Finding]:
                     flight=label,
                     **furthest._asdict(),
                 )
-    # With gusts in the model, or no simulation in the fit, a simulation says little.
+    # A simulation shows little if gusts are in the model, or if the fit does not simulate.
     elif c.at.layout.noise_model == "white":
         for name, m in pooled_metrics(held.signals).items():
-            # By more than chance makes of an output that does not respond.
+            # An output that does not respond may be slightly worse than its mean by chance.
             if not m.vaf >= WORSE:
                 code = "held-out.worse-than-mean"
                 yield found(code, "doubt", name, value=m.vaf, denies=True, limit=WORSE)

@@ -1,4 +1,4 @@
-"""Context of the diagnostics: one point of a problem, and everything computed there."""
+"""Context of the diagnostics: one point of a problem, with everything computed there."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -69,29 +69,31 @@ from heli_jax.messages import sentence
 
 
 class HeldOut(NamedTuple):
-    """The flights held out, predicted."""
+    """Predictions of the held-out flights."""
 
     signals: tuple[Signals, ...] = ()
     free_run: tuple[Signals, ...] = ()
-    """with windows: simulated in one piece"""
+    """Simulation in one piece, if the fit uses windows."""
     in_frequency: HeldOutFrequency | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """A point of a problem, and what is computed there on demand: the start values before a fit, or
-    where the search of a fit ended."""
+    """A point of a problem, with results that are computed on demand.
+
+    The point is the start values before a fit, else the end of the search.
+    """
 
     problem: Problem
     at: Solution
     e: Evaluation
-    """what the point tells"""
+    """Evaluation at the point."""
     start: Evaluation
-    """the same at the start values"""
+    """Evaluation at the start values."""
     before: Verdict
-    """what the data determine at the start values"""
+    """Identifiability at the start values."""
     optimum: RelaxedOptimum | None = None
-    """where the search ended; None before a fit"""
+    """End of the search; None before a fit."""
 
     @property
     def fitted(self) -> bool:
@@ -105,7 +107,7 @@ class Context:
 
     @cached_property
     def flights(self) -> list[tuple[str, Flight]]:
-        """The fitted flights, by what each is called."""
+        """The fitted flights with their labels."""
         training = self.problem.training
         return list(zip(labels(training), training, strict=True))
 
@@ -116,7 +118,7 @@ class Context:
 
     @property
     def named(self) -> dict[str, float]:
-        """By unknown of interest its value [SI]."""
+        """Value of each unknown of interest [SI]."""
         names = self.at.layout.of_interest
         return {n: float(v) for n, v in zip(names, self.e.named, strict=True)}
 
@@ -130,11 +132,11 @@ class Context:
         """Frequencies that the inputs excite, and outputs that follow them."""
         return excitation_of(self.problem)
 
-    # What is left of the record.
+    # Residuals of the record.
 
     @cached_property
     def signals(self) -> tuple[Signals, ...]:
-        """The fitted flights as measured and as simulated."""
+        """Measured and simulated signals of the fitted flights."""
         return signals_of(self.problem.training, self.e.simulated, self.e.innovations)
 
     @cached_property
@@ -144,12 +146,12 @@ class Context:
 
     @cached_property
     def whiteness(self) -> dict[str, Whiteness]:
-        """By 'flight/output', of the innovations where there are some, else of the residuals."""
+        """Whiteness of the innovations, or else of the residuals, by 'flight/output'."""
         return whiteness_of(self.signals, self.e, self.problem.training, self.at.layout)
 
     @cached_property
     def correlated(self) -> dict[str, float]:
-        """By pair of outputs the correlation of their residuals."""
+        """Correlation of the residuals by pair of outputs."""
         return correlated_residuals(self.signals)
 
     @property
@@ -159,15 +161,15 @@ class Context:
 
     @property
     def independent(self) -> bool:
-        """True if they are white, and independent between outputs."""
+        """True if the residuals, or innovations, are white and not correlated between outputs."""
         return self.white and not self.correlated
 
-    # Who moves the inputs.
+    # Feedback to the inputs.
 
     @cached_property
     def feedback(self) -> tuple[Feedback, ...]:
-        """By flight and input, whether it follows the response."""
-        # A late log looks like feedback: each input at the time at which it acted.
+        """Test results for feedback, by flight and input."""
+        # A late log looks like feedback: shift each input to the time at which it acted.
         delays = {n: (e.value, e.sd) for n, e in self.estimates.items()} if self.arrived else {}
         return feedback_of(self.problem, delays)
 
@@ -182,13 +184,12 @@ class Context:
 
     @property
     def held(self) -> bool:
-        """True in frequency if the model is unstable and a record does not grow."""
+        """True for a fit in frequency if the model is unstable and a record does not grow."""
         return bool(self.moved) and any(pole > 0.0 for pole in self._held_poles)
 
     @cached_property
     def moved(self) -> dict[str, float]:
-        """In frequency: by unknown of interest the part of its information that may come from
-        feedback."""
+        """Share of information that may be feedback, by unknown of interest, in frequency."""
         if not self.arrived or self.unrelated:
             return {}
         poles = self._held_poles
@@ -196,17 +197,17 @@ class Context:
 
     @cached_property
     def instruments(self) -> tuple[str, ...]:
-        """The inputs that are taken by their instrument."""
+        """Inputs that are taken by instrument."""
         if self.responses is not None:
             return self.responses.instruments
         by_instrument = self.at.data.flights[0].by_instrument is not None
         return instruments_of(self.problem) if by_instrument else ()
 
-    # Whether the model explains the record.
+    # Adequacy of the model.
 
     @cached_property
     def responses(self) -> ResponseAgreement | None:
-        """Agreement of the model's responses with the measured ones, if these are fitted."""
+        """Agreement of the model's responses with the measured ones, if responses are fitted."""
         if not self.fitted:
             return None
         layout, data, noise, z = self.at
@@ -214,7 +215,7 @@ class Context:
 
     @cached_property
     def followed(self) -> dict[str, Followed]:
-        """In frequency: by output, the part of its residual that follows the excitation."""
+        """Part of the residual that follows the excitation, by output, in frequency."""
         objective = self.at.layout.objective
         if objective.noise_model != "spectrum" or objective.fits_responses:
             return {}
@@ -222,16 +223,18 @@ class Context:
 
     @property
     def failed(self) -> dict[str, Followed]:
-        """Outputs of `followed` that follow by more than chance."""
+        """Outputs of `followed` whose residual follows the excitation beyond chance."""
         level = LEVEL / max(len(self.followed), 1)
         return {n: f for n, f in self.followed.items() if f.p_value < level}
 
     @cached_property
     def expected_error(self) -> dict[str, float] | None:
-        """By output the power of the simulation's error over that which the disturbance lets
-        expect; None where the simulation has to explain the record by itself."""
+        """Power of the simulation's error over that expected from the disturbance, by output.
+
+        None if the simulation alone must explain the record.
+        """
         layout = self.at.layout
-        # With every disturbance gone it is as with output error.
+        # Without any significant disturbance the fit is that of output error.
         if layout.disturbance and set(layout.disturbance) <= set(self.absent):
             return None
         at = self.at
@@ -239,8 +242,10 @@ class Context:
 
     @cached_property
     def ahead(self) -> bool:
-        """True if predictions some seconds ahead are judged in place of a simulation: the model is
-        unstable, or gusts moved it beyond where it is nearly linear."""
+        """True if predictions some seconds ahead are tested in place of a simulation.
+
+        The model is unstable, or gusts moved it beyond the range in which it is nearly linear.
+        """
         expected = self.expected_error
         return expected is not None and (
             is_unstable(self.problem, self.params)
@@ -249,8 +254,10 @@ class Context:
 
     @cached_property
     def unmodelled(self) -> tuple[list[Unmodelled], tuple[float, dict[str, float]]]:
-        """Known drives that the residuals follow beyond chance, and the values that the inputs ask
-        for; empty unless an optimum follows the record and no input follows the response."""
+        """Drives that the residuals follow beyond chance, and values that the inputs prefer.
+
+        Empty unless the fit converged, explains the record, and no input follows the response.
+        """
         asked = self.arrived and self.explains and not (self.instruments or self.ahead)
         if not asked or self.follows:
             return [], (1.0, {})
@@ -260,15 +267,17 @@ class Context:
 
     @cached_property
     def adequacy(self) -> Adequacy:
-        """Adequacy of the fitted outputs in time; empty for those judged in frequency."""
+        """Adequacy of the fitted outputs in time; empty for a fit in frequency."""
         if self.responses is not None or self.followed or self.unrelated:
             return Adequacy(by_chance=bool(self.unrelated))
         return assess(self.problem, self.params, self._evidence)
 
     @cached_property
     def unrelated(self) -> dict[str, float]:
-        """In frequency: by output, the probability that it follows the excitation by chance, if
-        that holds of every output; else empty."""
+        """Probability that each output follows the excitation by chance, in frequency.
+
+        Empty if any output follows it significantly.
+        """
         if not (self.fitted and self.at.layout.noise_model == "spectrum"):
             return {}
         p_values = {n: f.p_value for n, f in self.excitation.outputs.items()}
@@ -294,11 +303,11 @@ class Context:
         against = {n: error[n] / expected[n] if expected[n] > 0 else np.inf for n in error}
         return Evidence(tuple(records), agreement, self.whiteness, against, ahead=SECONDS)
 
-    # What the estimates are, and how far off they may be.
+    # Estimates and their uncertainty.
 
     @property
     def absent(self) -> tuple[str, ...]:
-        """The parameters of disturbances that are not significant."""
+        """Parameters of disturbances that are not significant."""
         if self.optimum is None:
             return ()
         ratio = self.optimum.ratio
@@ -307,7 +316,7 @@ class Context:
 
     @cached_property
     def fast_modes(self) -> list[FastMode]:
-        """By flight the mode that its samples cannot show, after a fit."""
+        """Mode that a flight's samples cannot show, by flight, after a fit."""
         if not self.fitted:
             return []
         noise = measurement_noise(self.problem, self.at.noise.sd)
@@ -316,7 +325,7 @@ class Context:
 
     @cached_property
     def errors(self) -> StandardErrors:
-        """Standard errors of the estimates; none where the model explains nothing."""
+        """Standard errors of the estimates; none if the model explains nothing."""
         errors = standard_errors(
             self.problem,
             self.at,
@@ -343,7 +352,7 @@ class Context:
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict on what the data determine at the point."""
+        """Verdict on identifiability at the point."""
         return self.errors.verdict if self.fitted else self.before
 
     @property
@@ -355,37 +364,36 @@ class Context:
 
     @cached_property
     def estimates(self) -> dict[str, Estimate]:
-        """Free parameters, gains of the inputs and the time shift; none before a fit."""
+        """Estimates of free parameters, input gains and the time shift; none before a fit."""
         if not self.fitted:
             return {}
         return self._bounded(estimates_of(self.problem, self.at, self.e, self.errors))
 
     @cached_property
     def nuisance(self) -> dict[str, Estimate]:
-        """All other unknowns: the disturbance, initial states, biases, offsets."""
+        """Estimates of all other unknowns: disturbance, initial states, biases, offsets."""
         layout = self.at.layout
         found = {k: v for k, v in self.estimates.items() if k not in layout.free}
-        # A method that does not see initial states and biases has no interval of them.
+        # A fit in frequency does not determine initial states and biases, so has no intervals.
         if layout.noise_model != "spectrum":
             found |= self._bounded(flight_nuisances(self.problem, self.at, self.e, self.errors))
         gone = {n: without_disturbance(found[n], size=n in layout.sigmas) for n in self.absent}
         return found | gone
 
     def _bounded(self, estimates: dict[str, Estimate]) -> dict[str, Estimate]:
-        """The estimates; of a search that did not arrive without intervals, since slopes where it
-        stopped bound nothing."""
+        """Return the estimates, without intervals if the fit did not converge."""
         if self.status != "not-converged":
             return estimates
         return {n: e.without_interval() for n, e in estimates.items()}
 
     @cached_property
     def noise(self) -> dict[str, float]:
-        """Standard deviation of the measurement noise as 'flight/output' [SI]."""
+        """Standard deviation of the measurement noise by 'flight/output' [SI]."""
         return noise_by_name(self.problem, self.at.noise, scales_of(self.at.layout, self.at.z))
 
     @cached_property
     def held_out(self) -> HeldOut:
-        """The flights held out, with their own initial states and biases."""
+        """Predictions of the held-out flights, with their own initial states and biases."""
         problem, at = self.problem, self.at
         flights = tuple(f for f in problem.flights if f.hold_out)
         if not flights or not self.fitted:
@@ -401,5 +409,5 @@ class Context:
 
     @cached_property
     def rounding(self) -> bool:
-        """True if the numbers are rounding, as of a filter with too little noise."""
+        """True if the numbers are rounding, as in a filter with too little noise."""
         return self.at.layout.objective.ill_conditioned(self.problem, self.e, self.noise)

@@ -1,4 +1,4 @@
-"""Does the residual still follow something that is known: an input, the amplitude, the time?"""
+"""Findings on residuals that still follow an input, the amplitude, or time."""
 
 from collections.abc import Iterator
 
@@ -16,7 +16,7 @@ _CODES = {
 
 
 def unmodelled_dynamics(c: Context) -> Iterator[Finding]:
-    """Unmodelled dynamics: a mode, a response that depends on amplitude, or one that changes."""
+    """Find a missing mode, or a response that depends on amplitude, flight or time."""
     for one in c.unmodelled[0]:
         yield found(
             _CODES[one.drive.kind],
@@ -36,7 +36,7 @@ def unmodelled_dynamics(c: Context) -> Iterator[Finding]:
 
 
 def inputs_ask_otherwise(c: Context) -> Iterator[Finding]:
-    """Other values than the fit's that the response to the inputs alone asks for."""
+    """Find parameters whose values by the response to the inputs alone differ from the fit's."""
     p, shifts = c.unmodelled[1]
     if shifts:
         yield found(

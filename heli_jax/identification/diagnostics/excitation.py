@@ -1,4 +1,4 @@
-"""Excitation by the inputs, and the manoeuvre that would add most."""
+"""Findings on the excitation by the inputs, and on the next manoeuvre."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,38 +14,38 @@ from heli_jax.identification.unknowns.layout import unpack
 from heli_jax.identification.validation.excitation import least_rough
 
 NOTHING_FOLLOWS = "excitation.nothing-follows"
-"""code of a record in which no output follows the inputs"""
+"""Code of a record in which no output follows the inputs."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits from which a record is doubted, and from which a number is told."""
+    """Limits for findings on a record."""
 
     nothing: float = 0.2
-    """part of the power of each output that follows the inputs, below which nothing is found in the
-    record: a vehicle that was not flying had 0.11"""
+    """Share of an output's power that must follow the inputs; a vehicle on the ground had 0.11."""
     chance: float = 0.1
-    """p value of the output that follows the inputs most surely, from which on none is taken to: of
-    a vehicle in strong gusts it is far less"""
+    """Least p-value at which no output follows the inputs; in strong gusts it is far smaller."""
     together: float = 0.8
-    """coherence of two inputs, the others taken out, from which on they move together: the variance
-    of what each does is 1 / (1 - 0.8) = 5 times as large as if the other were still"""
+    """Partial coherence of two inputs from which on they move together.
+
+    The variance of their effects is then 1 / (1 - 0.8) = 5 times that with the other input still.
+    """
     noise: float = 0.5
-    """mean squared step of an output over that of white noise, above which it shows no motion"""
+    """Mean squared step of an output over that of white noise, above which it shows no motion."""
     better: float = 0.98
-    """of the sd that the same record again would leave: less is no reason to fly something else"""
+    """Largest sd after the next flight over that after the same record again, to suggest it."""
 
 
 LIMITS = Limits()
 
 
 def _explained(c: Context) -> bool:
-    """True if a fit shows by itself that the inputs excite what is asked."""
+    """True if a fit itself proves enough excitation: it converged to an adequate model."""
     return c.fitted and c.status == "converged" and not c.adequacy.denied
 
 
 def nothing_follows(c: Context) -> Iterator[Finding]:
-    """Records in which no output follows the inputs, or no input moves."""
+    """Find records in which no output follows the inputs, or no input moves."""
     if _explained(c):
         return
     limit, outputs = LIMITS.nothing, c.excitation.outputs.values()
@@ -56,15 +56,14 @@ def nothing_follows(c: Context) -> Iterator[Finding]:
         else:
             yield found("excitation.free-motion", "note", name, value=rough, limit=LIMITS.noise)
     elif outputs and (share := max(f.explained for f in outputs)) < limit:
-        # What the two have in common is chance, or comes from inputs that follow the response: a
-        # rate loop on the ground.
+        # The common part is chance, or feedback to the inputs, as in a rate loop on the ground.
         by_chance = min(f.p_value for f in outputs) >= LIMITS.chance
         severity = "refuse" if by_chance or c.follows else "doubt"
         yield found(NOTHING_FOLLOWS, severity, value=max(share, 0.0), limit=limit)
 
 
 def excited_bands(c: Context) -> Iterator[Finding]:
-    """The bands that the inputs excite, and the outputs that follow."""
+    """Report the bands that the inputs excite, and the outputs that follow."""
     if c.fitted:
         return
     following = {
@@ -85,7 +84,7 @@ def excited_bands(c: Context) -> Iterator[Finding]:
 
 
 def inputs_together(c: Context) -> Iterator[Finding]:
-    """Inputs that move together, so that their effects cannot be separated."""
+    """Find inputs that move together, so that their effects cannot be separated."""
     for names, coherence in () if _explained(c) else c.excitation.pairs:
         if coherence >= LIMITS.together:
             yield found(
@@ -99,7 +98,7 @@ def inputs_together(c: Context) -> Iterator[Finding]:
 
 
 def gusts_guessed(c: Context) -> Iterator[Finding]:
-    """Sizes of disturbances that are what the record says at the start values."""
+    """Report sizes of disturbances that were estimated from the record at the start values."""
     guessed = [] if c.fitted else unstated_gusts(c.problem)
     if guessed:
         taken = unpack(c.at.layout, c.at.data, c.at.z).noise
@@ -109,8 +108,7 @@ def gusts_guessed(c: Context) -> Iterator[Finding]:
 
 
 def next_flight(c: Context) -> Iterator[Finding]:
-    """The manoeuvre that narrows the widest interval most, if one does more than the same record
-    again."""
+    """Suggest the manoeuvre that narrows the widest interval more than the same record again."""
     plan = None if c.fitted else plan_next_flight(c.problem, c.at, c.e)
     if plan is None or not plan.after < LIMITS.better * plan.again:
         return

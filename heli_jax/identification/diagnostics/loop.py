@@ -1,4 +1,4 @@
-"""Feedback from the response to the inputs, and its effect on the estimates."""
+"""Findings on feedback from the response to the inputs, and its effect on the estimates."""
 
 from collections.abc import Iterator, Sequence
 
@@ -17,11 +17,11 @@ from heli_jax.identification.validation.follows_response import LEVEL
 
 FEEDBACK = "loop.feedback"
 _HELD = 1.0
-"""a mode that grows by e to this over a record shows that its vehicle is held"""
+"""Growth of an unstable mode over a record that only a loop prevents [e-foldings]."""
 
 
 def inputs_follow_response(c: Context) -> Iterator[Finding]:
-    """A closed loop, and what it does to estimates by this method."""
+    """Find a closed loop, and its effect on estimates by this method."""
     present = [one for one in c.feedback if one.present]
     objective, names = objective_of(c.problem.method), tuple(c.estimates)
     harmed = c.arrived and not c.independent and objective.noise_model == "white"
@@ -32,12 +32,12 @@ def inputs_follow_response(c: Context) -> Iterator[Finding]:
             least = min(c.feedback, key=lambda one: one.p_value)
             yield found("loop.no-feedback", "ok", least.input, value=least.p_value, level=LEVEL)
         return
-    # With disturbances in the model and white innovations the noise model is right, and the direct
-    # estimate is unbiased in a closed loop too.
+    # White innovations show that the noise model is right. With disturbances in the model the
+    # direct estimate is then unbiased in a closed loop too.
     if objective.noise_model == "disturbance" and c.fitted and c.white:
         return
     code = "loop.feedback-filtered" if objective.noise_model == "disturbance" else FEEDBACK
-    # Before a fit it is a doubt about the record; after one the residuals say whether it harms.
+    # Before a fit feedback is a doubt; after one the residuals show whether it biases estimates.
     severity = "note" if c.fitted and not harmed else "doubt"
     inputs = tuple(dict.fromkeys(one.input for one in present))
     if objective.noise_model == "spectrum" and set(inputs) <= set(instruments_of(c.problem)):
@@ -65,18 +65,18 @@ def inputs_follow_response(c: Context) -> Iterator[Finding]:
 
 
 def _frees_a_delay(problem: Problem, late: Sequence[str]) -> str:
-    """Parameters to free, to tell inputs that are logged late from a closed loop."""
+    """Return the parameters to free, to distinguish late inputs from a closed loop."""
     own = dict(problem.model.delays)
     asked = problem.nuisance.time_shift or all(own.get(name) in problem.free for name in late)
     return "" if asked or not late else "fit.nuisance.time_shift, or delays of the model"
 
 
 def moved_by_feedback(c: Context) -> Iterator[Finding]:
-    """Parameters that feedback may have moved in frequency, where no excitation was logged."""
+    """Find parameters that feedback may have biased in frequency, if no excitation was logged."""
     by = c.instruments
     closed = any(one.present for one in c.feedback) or (c.held and not by)
     direct = [one for one in c.feedback if one.input not in by]
-    # Whoever closes the loop of an input with an instrument may move the others as well.
+    # Feedback to an input with an instrument may go to the other inputs as well.
     inputs = list(dict.fromkeys(one.input for one in [f for f in direct if f.present] or direct))
     if not (c.moved and closed) or (by and not inputs):
         return
@@ -99,7 +99,7 @@ def moved_by_feedback(c: Context) -> Iterator[Finding]:
 
 
 def weak_instruments(c: Context) -> Iterator[Finding]:
-    """Parameters on which the logged excitation has too little information."""
+    """Find parameters on which the logged excitation has too little information."""
     names = weak_by_instrument(c.problem, c.at) if c.arrived else ()
     if names:
         yield found("loop.weak-instrument", "doubt", *names, distrusts=names, limit=STRONG)

@@ -1,4 +1,4 @@
-"""Whiteness of residuals or innovations, and disturbances that are not significant."""
+"""Findings on whiteness of residuals or innovations, and on disturbances."""
 
 from collections.abc import Iterator
 
@@ -9,16 +9,17 @@ from heli_jax.identification.estimation.disturbance_search import NO_DISTURBANCE
 
 COLOURED, TOO_NARROW = "noise.residuals-coloured", "noise.intervals-too-narrow"
 _FAR_TOO_NARROW = 0.2
-"""autocorrelation at one sample from which on intervals that do not allow for it are withdrawn:
-with it they are too narrow by more than a fifth, or the noise is not where the model has it"""
+"""Autocorrelation at one sample above which intervals that ignore it are not trusted.
+
+They are then too narrow by more than a fifth, or the noise model is wrong."""
 
 
 def residuals_white(c: Context) -> Iterator[Finding]:
-    """Residuals or innovations that are not white, and what that does to the intervals."""
+    """Find residuals or innovations that are not white, and the effect on the intervals."""
     not_white = [name for name, w in c.whiteness.items() if not w.white] if c.fitted else []
     if not not_white:
         return
-    # By the correlation at one sample, which is the number that the sentence gives.
+    # Select by the correlation at one sample, since the message shows this number.
     worst = max((c.whiteness[n] for n in not_white), key=lambda w: abs(w.lag1))
     objective, converged = c.at.layout.objective, c.status != "not-converged"
     allowed = objective.noise_model == "spectrum" or c.errors.coloured
@@ -37,14 +38,14 @@ def residuals_white(c: Context) -> Iterator[Finding]:
 
 
 def residuals_correlated(c: Context) -> Iterator[Finding]:
-    """Residuals of several outputs that are correlated, for which the intervals allow."""
+    """Find correlated residuals of several outputs, for which the intervals allow."""
     if c.fitted and c.errors.coloured and c.correlated:
         pairs, rho = list(c.correlated), list(c.correlated.values())
         yield found("noise.outputs-correlated", "note", *pairs, correlations=rho)
 
 
 def disturbance_shows(c: Context) -> Iterator[Finding]:
-    """Disturbances that were searched for and are not significant."""
+    """Find disturbances that were estimated and are not significant."""
     if c.optimum is None:
         return
     absent = c.absent

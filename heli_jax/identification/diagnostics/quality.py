@@ -1,6 +1,6 @@
-"""Signals that are cut off, stuck or astray.
+"""Findings on signals that saturate, are stuck, or have stray samples.
 
-They are tested as logged, where the flight knows it, since resampling hides flat tops.
+If possible they are tested as logged, since resampling hides flat tops.
 """
 
 from collections.abc import Iterator
@@ -12,11 +12,11 @@ from heli_jax.flights.signal_facts import DROP_SHARE, RAIL_SHARE, STUCK_SECONDS
 from heli_jax.identification.diagnostics.context import Context
 
 _CUT_OFF = 0.02
-"""part of an output's samples at its rails from which on no model of them is adequate"""
+"""Share of an output's samples at its limits from which on no model of it is adequate."""
 
 
 def saturation(c: Context) -> Iterator[Finding]:
-    """Signals that rest at an end of their range."""
+    """Find signals that rest at an end of their range."""
     cut = [
         (label, name, kind, facts)
         for label, flight in c.flights
@@ -40,7 +40,7 @@ def saturation(c: Context) -> Iterator[Finding]:
 
 
 def stuck_outputs(c: Context) -> Iterator[Finding]:
-    """Outputs that stay at one value while other signals move, or jump to one again and again."""
+    """Find outputs that stay at one value while others move, or often jump to one value."""
     for label, flight in c.flights:
         signals = flight.source.outputs if flight.source else {}
         for (name, _), facts in flight.facts.items():
@@ -75,7 +75,7 @@ def stuck_outputs(c: Context) -> Iterator[Finding]:
 
 
 def strays(c: Context) -> Iterator[Finding]:
-    """Samples that may stand for no value and are kept."""
+    """Find stray samples that may be placeholders for missing values; the fit uses them."""
     for label, flight in c.flights:
         for (name, _), facts in flight.facts.items():
             for odd in facts.strays:

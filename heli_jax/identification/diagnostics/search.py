@@ -1,4 +1,4 @@
-"""The end of the search, and what was stated beforehand: bounds, priors, a band."""
+"""Findings on the search of a fit, and on bounds, priors and logs."""
 
 from collections.abc import Iterator
 
@@ -8,11 +8,11 @@ from heli_jax.identification.diagnostics.context import Context
 
 STOPPED = "search.stopped"
 FAR = 3.0
-"""standard deviations of a prior at which an estimate contradicts it"""
+"""Distance from a prior's mean at which an estimate contradicts it [sd of the prior]."""
 
 
 def at_bound(c: Context) -> Iterator[Finding]:
-    """Estimates at their bounds, which the data contradict."""
+    """Find estimates at their bounds, which the data contradict."""
     for name, estimate in c.estimates.items():
         if estimate.at_bound:
             value = estimate.value
@@ -20,14 +20,14 @@ def at_bound(c: Context) -> Iterator[Finding]:
 
 
 def search_stopped(c: Context) -> Iterator[Finding]:
-    """A search that did not converge."""
-    # Rounding has a remedy of its own.
+    """Find a search that did not converge."""
+    # Rounding has its own finding and remedy.
     if c.optimum is not None and not (c.arrived or c.rounding):
         yield found(STOPPED, "doubt", value=float(sum(s for s, _ in c.optimum.trace)))
 
 
 def search_told(c: Context) -> Iterator[Finding]:
-    """Notes of the search and the method on how the optimum was reached."""
+    """Report notes of the search and of the method on the optimum."""
     if c.optimum is not None:
         names = [label for label, _ in c.flights]
         yield from c.optimum.notes
@@ -35,7 +35,7 @@ def search_told(c: Context) -> Iterator[Finding]:
 
 
 def prior_contradicted(c: Context) -> Iterator[Finding]:
-    """Estimates far from their priors."""
+    """Find estimates far from their priors."""
     for name, free in c.problem.free.items() if c.fitted else ():
         if free.prior is not None:
             away = abs(c.estimates[name].value - free.prior.mean) / free.prior.sd
@@ -51,13 +51,13 @@ def prior_contradicted(c: Context) -> Iterator[Finding]:
 
 
 def profile_intervals(c: Context) -> Iterator[Finding]:
-    """Intervals that are those of the profile likelihood."""
+    """Report intervals by the profile likelihood."""
     if c.fitted and c.errors.limits:
         yield found("uncertainty.profile-interval", "note", *c.errors.limits)
 
 
 def log_cautions(c: Context) -> Iterator[Finding]:
-    """Cautions of the logs on signals that bias a fit to them; once where flights agree."""
+    """Report cautions of the logs on signals that bias a fit, each sentence once."""
     said: dict[str, Finding] = {}
     flights = tuple(c.problem.flights)
     for label, flight in zip(labels(flights), flights, strict=True):

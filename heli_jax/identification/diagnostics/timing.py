@@ -1,4 +1,4 @@
-"""Findings on rates of samples, and on signals at another time than their log has them."""
+"""Findings on sampling rates, and on signals at another time than in the log."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,19 +26,19 @@ _CODES = {
     "hold": "timing.likelier-hold",
 }
 _NAMED = 3
-"""parameters that a sentence names at most"""
+"""Largest number of parameters in a sentence."""
 _SEEN = 1e-3
-"""of a parameter, below which a move is not named: of one held by a prior alone it is rounding"""
+"""Least relative change of a parameter that is named; with a prior alone it is rounding."""
 
 
 def signals_shifted(c: Context) -> Iterator[Finding]:
-    """Signals at another time, or inputs of the other hold: what explains the record best."""
+    """Find signals at another time, or inputs with the other hold, if this explains more."""
     if not (c.arrived and c.explains) or c.instruments:
         return
     one = shift_in_time(c.problem, c.at, c.e, _outputs_in_doubt(c))
     if one is None:
         return
-    # A mode or a lag that is missing explains the residual more closely than a delay does.
+    # A missing mode or lag may explain the residual better than a delay.
     closer = any(x.drive.kind == "input" and x.gain > one.gain for x in c.unmodelled[0])
     if one.kind == "response" and closer:
         return
@@ -60,15 +60,15 @@ def signals_shifted(c: Context) -> Iterator[Finding]:
 
 
 def _outputs_in_doubt(c: Context) -> list[str]:
-    """Return the outputs that may be late: of several those whose residuals are not white."""
-    # A single one is not told from its inputs; a model that explains too little tells no time.
+    """Return the outputs that may be late: of several, those whose residuals are not white."""
+    # A single late output looks like early inputs; an inadequate model shows no time shift.
     if len(c.metrics) < 2 or c.e.innovations or c.adequacy.denied:
         return []
     return sorted({key.rsplit("/", 1)[1] for key, w in c.whiteness.items() if not w.white})
 
 
 def loop_between_samples(c: Context) -> Iterator[Finding]:
-    """Inputs of a closed loop that act faster than they are logged."""
+    """Find inputs of a closed loop that act faster than they are logged."""
     follow = {(one.flight, one.input) for one in c.feedback if one.present}
     for label, flight in c.flights:
         for name in flight.inputs:
@@ -89,7 +89,7 @@ def loop_between_samples(c: Context) -> Iterator[Finding]:
 
 
 def modes_past_nyquist(c: Context) -> Iterator[Finding]:
-    """Modes that the samples cannot show, whose aliases fit as well."""
+    """Find modes that the samples cannot show, whose aliases fit equally well."""
     for mode in c.fast_modes:
         yield found(
             "timing.mode-past-nyquist",
@@ -105,7 +105,7 @@ def modes_past_nyquist(c: Context) -> Iterator[Finding]:
 
 
 def rates_enough(c: Context) -> Iterator[Finding]:
-    """Rates of inputs and outputs against the fastest mode that matters."""
+    """Compare rates of inputs and outputs with the fastest mode that matters."""
     if c.fitted:
         yield from of_rates(c.problem, measurement_noise(c.problem, c.at.noise.sd), c.params)
     else:
@@ -115,11 +115,13 @@ def rates_enough(c: Context) -> Iterator[Finding]:
 def of_rates(
     problem: Problem, sd: Sequence[Mapping[str, Any]], params: Any = None
 ) -> Iterator[Finding]:
-    """Findings on logging rates, which need no simulation; where all are enough the lowest alone.
+    """Compare logging rates with the model's modes; if all suffice, report only the lowest.
+
+    This needs no simulation.
 
     Args:
-        sd: by flight and output the noise that is assumed, SI.
-        params: the model's Params with the estimates in place, SI; the start values unless given.
+        sd: standard deviation of the assumed noise, by flight and output [SI].
+        params: the model's Params with the estimates in place [SI]; by default the start values.
     """
     where = "start values" if params is None else "estimates"
     params = problem.start_params() if params is None else params
@@ -158,4 +160,4 @@ DIAGNOSTICS = (
     modes_past_nyquist,
     rates_enough,
 )
-"""causes first"""
+"""Diagnostics of timing, causes first."""

@@ -1,7 +1,7 @@
-"""Signs and units of signals.
+"""Findings on signs and units of signals.
 
-What a record shows of that by itself is little: degrees fit as well as radians, and a turned input
-as well as a right one, with estimates that are off by 57 or of the other sign.
+A record alone shows little of them. Degrees fit as well as radians, with estimates off by 57. An
+inverted input fits as well as a right one, with estimates of the other sign.
 """
 
 from collections.abc import Iterator
@@ -26,21 +26,25 @@ from heli_jax.identification.validation.signal_signs import (
 
 @dataclass(frozen=True)
 class Limits:
-    """From which sizes on signs and units are doubted."""
+    """Limits from which signs and units are in doubt."""
 
     factor: float = 1.3
-    """of an angle's change over that of its integrated rate: coupled rotation and sensors that are
-    off by a fifth"""
+    """Largest ratio of an angle's change to that of its integrated rate.
+
+    It allows for coupled rotation and a sensor scale error of a fifth."""
     degrees: float = 1.3
-    """factor about 57.3 that is still degrees read as radians"""
+    """Largest factor from 57.3 that still counts as degrees read as radians."""
     scale: float = 1.12
-    """the same by the 95 % interval: a sensor off by a tenth, and of pitch and heading the cosine
-    of the bank"""
+    """Largest ratio by the 95 % interval.
+
+    It allows for a sensor scale error of a tenth. For pitch and heading it also allows for the
+    cosine of the bank angle."""
     scale_of_roll: float = 1.04
-    """of the bank, whose rate is p but for what the tangent of the pitch angle lets in: that goes
-    with another motion, and changes no factor by more than a hundredth or two"""
+    """The same for the bank angle, whose rate is p plus coupling by the tangent of the pitch angle.
+
+    The coupling follows another motion and changes the ratio by at most 0.01 to 0.02."""
     near_zero: float = 0.2
-    """of an estimate, below which a start says nothing of its sign"""
+    """Start value over the estimate, below which the start value does not state a sign."""
 
 
 LIMITS = Limits()
@@ -49,7 +53,7 @@ _ROLL = frozenset({"phi", "roll"})
 
 
 def rate_against_angle(c: Context) -> Iterator[Finding]:
-    """Angles that do not move as the integral of their rate."""
+    """Find angles that do not move as the integral of their rate."""
     for label, flight in c.flights:
         for rate, angle in rates_and_angles(c.problem.model):
             if not {rate, angle} <= flight.outputs.keys():
@@ -76,7 +80,7 @@ def rate_against_angle(c: Context) -> Iterator[Finding]:
                     **numbers,
                 )
             elif low > most or high < 1.0 / most:
-                # A scale, a unit or the clock is off: each parameter depends on one of them.
+                # A scale, a unit or the clock is wrong, and every parameter depends on one of them.
                 yield found(
                     "units.rate-scale",
                     "doubt",
@@ -92,7 +96,7 @@ def rate_against_angle(c: Context) -> Iterator[Finding]:
 
 
 def against_file(c: Context) -> Iterator[Finding]:
-    """Signals of which the file states another unit than the configuration."""
+    """Find signals for which file and configuration state different units."""
     for label, flight in c.flights:
         source = flight.source
         for name, signal in ({**source.inputs, **source.outputs} if source else {}).items():
@@ -110,7 +114,7 @@ def against_file(c: Context) -> Iterator[Finding]:
 
 
 def size_of_angles(c: Context) -> Iterator[Finding]:
-    """Angles and rates that are too large for the unit that they are read in."""
+    """Find angles and rates that are too large for their unit."""
     for label, flight in c.flights:
         yield from in_degrees(c.problem.model, label, flight, _estimates(c))
 
@@ -118,7 +122,7 @@ def size_of_angles(c: Context) -> Iterator[Finding]:
 def in_degrees(
     model: Model, label: str, flight: Flight, estimates: tuple[str, ...] = ()
 ) -> Iterator[Finding]:
-    """Angles and rates of a flight that look like degrees read as radians."""
+    """Find angles and rates of a flight that look like degrees read as radians."""
     for name, size, limit, flown, certain in oversized(model, flight):
         assert flight.source is not None
         signal = flight.source.outputs[name]
@@ -139,13 +143,15 @@ def in_degrees(
 
 
 def _estimates(c: Context) -> tuple[str, ...]:
-    """All estimates, since any may depend on the unit; none before an optimum."""
+    """Return all estimates, since any may depend on the unit; none if the fit did not converge."""
     return () if c.status == "not-converged" else tuple(c.estimates)
 
 
 def outputs_against_start(c: Context) -> Iterator[Finding]:
-    """Outputs that move against those simulated at the start values; in a fit where the model does
-    not explain the record, since else it found the right sign."""
+    """Find outputs that move against those simulated at the start values.
+
+    After a fit this is tested only if the model is inadequate: otherwise it has the right sign.
+    """
     if c.fitted and not c.adequacy.denied:
         return
     flights = [flight for _, flight in c.flights]
@@ -162,8 +168,10 @@ def outputs_against_start(c: Context) -> Iterator[Finding]:
 
 
 def turned_from_start(c: Context) -> Iterator[Finding]:
-    """Parameters whose sign is surely not that of their start values: an inverted signal fits as
-    well, and only the start value shows it."""
+    """Find parameters with a sign that differs significantly from their start values.
+
+    An inverted signal fits equally well, so only the start value shows it.
+    """
     turned = {}
     for name, free in c.problem.free.items() if c.arrived else ():
         e = c.estimates[name]

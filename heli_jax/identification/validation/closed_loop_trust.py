@@ -1,19 +1,18 @@
-r"""Estimates that feedback may have moved, where no excitation was logged.
+r"""Bias of estimates by feedback, if no excitation was logged.
 
-Feedback brings the disturbances of the vehicle into its inputs. The direct response is then off by
-the part $\gamma^2$ of the input that comes from feedback. The record does not show that part, but
-it bounds it in two ways:
+Feedback brings the disturbances of the vehicle into its inputs. The direct response is then biased
+by the share $\gamma^2$ of the input that comes from feedback. The record does not show that share,
+but bounds it in two ways:
 
-- Feedback of one output at a constant gain brings in $|k|^2 S_{ee}$ of $S_{uu}$, which is nowhere
-  more than the input. The largest such gain is taken, in the mean over the outputs, since nobody
-  knows which is fed back. A loop acts at low frequencies, where gusts are large in the residual.
-- The loop that holds an unstable vehicle has a bandwidth of at least twice its unstable pole: below
-  that frequency the whole input may be feedback.
+- Feedback of one output at a constant gain adds $|k|^2 S_{ee}$ to $S_{uu}$, at no frequency more
+  than the input. The bound uses the largest such gain, averaged over the outputs, since the
+  feedback path is unknown. A loop acts at low frequencies, where gusts dominate the residual.
+- The loop that stabilises an unstable vehicle has a bandwidth of at least twice its unstable pole.
+  Below that frequency the whole input may be feedback.
 
-A parameter's part is the mean over the frequencies, weighted by their information on it. It does
-not show that there is a loop: parameters are named where inputs follow the response, or where the
-model is unstable and the record does not grow. Inputs that are taken by instrument bring in
-nothing.
+A parameter's share is the mean over frequency, weighted by the information on the parameter. It
+does not prove a loop. Parameters are reported only if inputs follow the response, or if the model
+is unstable and the record does not grow. Inputs taken by instrument add nothing.
 
 Sources: L. Ljung, System Identification (1999), 13.4, for the direct estimate's bias; Astrom and
 Murray, Feedback Systems (2008), 11.4, for the bandwidth that an unstable pole requires.
@@ -47,28 +46,30 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Noise, Solution
 
 MAY_BE = 0.25
-"""part of a parameter's information that may come from feedback, from which on it is not trusted"""
+"""Share of a parameter's information that may be feedback, above which it is not trusted."""
 BESIDE = 0.05
-"""the same where other inputs are taken by instrument: the effect of an input is off by that part
-at least, in a fit that should not be affected by feedback"""
+"""The same if other inputs are taken by instrument.
+
+The effect of an input has at least this bias, in a fit that feedback should not affect."""
 _GROWS = 3.0
-"""e-foldings of the model's fastest growing mode over a record, from which on a loop holds it"""
+"""Growth of the model's fastest mode over a record that only a loop prevents [e-foldings]."""
 _REACHES = 2.0
-"""times an unstable pole, up to which the loop that holds it has to act: with less bandwidth no
-feedback has margins (Astrom and Murray, 2008, section 11.4)"""
+"""Least bandwidth of the stabilising loop over the unstable pole.
+
+With less bandwidth no feedback has margins (Astrom and Murray, 2008, section 11.4)."""
 _SEEN = 2.0
-"""times the residual's power, above which an output shows the response: only such frequencies bound
-the gain"""
+"""Output power over the residual's, above which a frequency bounds the feedback gain."""
 _PART = 0.05
-"""sd of the Gaussian that smooths the spectra, as a part of the frequency"""
+"""Standard deviation of the Gaussian that smooths the spectra, as a share of the frequency."""
 
 
 def moved_by_feedback(at: Solution, poles: Sequence[float]) -> dict[str, float]:
-    """Return by unknown of interest the part of its information that may come from feedback, 0 to
-    1; empty in the time domain, and where every input that moves is taken by instrument.
+    """Return the share of information that may be feedback, 0 to 1, by unknown of interest.
+
+    Empty in the time domain, and if every moving input is taken by instrument.
 
     Args:
-        poles: of `held_poles`; zero for an estimate by instrument.
+        poles: the result of `held_poles`; zero for an estimate by instrument.
     """
     layout = at.layout
     if layout.noise_model != "spectrum":
@@ -88,8 +89,10 @@ def moved_by_feedback(at: Solution, poles: Sequence[float]) -> dict[str, float]:
 
 
 def _room_of_records(at: Solution) -> list[Float[np.ndarray, " K"]]:
-    """Return by record and line the part of the inputs that may be feedback; empty if all inputs
-    are taken by instrument."""
+    """Return by record and line the share of the inputs that may be feedback.
+
+    Empty if all inputs are taken by instrument.
+    """
     layout, data, noise, _ = at
     joint, inputs = [], list(naming.asdict(data.flights[0].inputs))
     for record in records_of(layout):
@@ -110,13 +113,13 @@ def _room_of_records(at: Solution) -> list[Float[np.ndarray, " K"]]:
 
 
 def _room_of_responses(at: Solution) -> list[Float[np.ndarray, " k"]]:
-    """Return this part for fitted responses, by line of their windows."""
+    """Return this share for fitted responses, by line of their windows."""
     layout, data, noise, z = at
     w, density = noise.whitening.windows, np.asarray(noise.whitening.density)
     direct = np.array([n not in w.instruments for n in w.inputs])
     if not direct.any():
         return []
-    # A method of the objective: its module stands above this one in the order of imports.
+    # Call a method of the objective, since this module must not import the objective's.
     E = np.asarray(layout.objective.errors_in_windows(layout, data, noise, z))
     joint = np.concatenate([np.asarray(w.U), np.asarray(w.Y)], axis=2)
     S, See = (np.einsum("wka,wkb->kab", v, np.conj(v)) / len(v) for v in (joint, E))
@@ -126,7 +129,7 @@ def _room_of_responses(at: Solution) -> list[Float[np.ndarray, " k"]]:
 def shares(
     part: Float[np.ndarray, "q q"], whole: Float[np.ndarray, "q q"]
 ) -> Float[np.ndarray, " q"]:
-    """Return the share that each unknown has of a part of the information, 0 to 1."""
+    """Return each unknown's share of a part of the information, 0 to 1."""
     sd = np.sqrt(np.maximum(np.diagonal(whole), 1e-300))
     # A parameter that is not identifiable has no standard deviation.
     covariance = np.linalg.pinv(whole / np.outer(sd, sd), rcond=1e-12, hermitian=True)
@@ -136,8 +139,10 @@ def shares(
 
 
 def held_poles(at: Solution) -> list[float]:
-    """Return by flight |p| [rad/s] of the fastest unstable mode of the model that the record would
-    show and does not: a loop holds it. 0 where there is none."""
+    """Return by flight |p| [rad/s] of the fastest unstable mode that a loop stabilises; else 0.
+
+    The record would show the mode's growth and does not.
+    """
     layout, data, *_, z = at
     if layout.noise_model != "spectrum" or layout.objective.fits_responses:
         return [0.0]
@@ -148,7 +153,7 @@ def held_poles(at: Solution) -> list[float]:
         y = [np.asarray(flight.outputs[n]) for n in names]
         half = len(y[0]) // 2
         grown = max(float(np.nanstd(v[half:]) / max(np.nanstd(v[:half]), 1e-300)) for v in y)
-        # Without a loop it would grow by half of the e-foldings from one half to the other.
+        # Without a loop the second half would exceed the first by half of the e-foldings.
         growing = modes[2 * half * np.real(modes) > _GROWS]
         alone = np.max(np.real(growing), initial=0.0)
         stays = alone > 0.0 and np.log(grown) < 0.5 * half * alone
@@ -159,7 +164,7 @@ def held_poles(at: Solution) -> list[float]:
 def _room(
     W: np.ndarray, S: np.ndarray, See: np.ndarray, direct: np.ndarray
 ) -> Float[np.ndarray, " k"]:
-    """Return by frequency the part of the input that feedback at a constant gain may bring in.
+    """Return by frequency the share of the input that feedback at a constant gain may add.
 
     Args:
         W: whitening (k, p, p).
@@ -185,8 +190,10 @@ def _room(
 def information(
     at: Solution, weights: Sequence[Float[np.ndarray, " K"]]
 ) -> Float[np.ndarray, "q q"]:
-    """Return the information on the unknowns of interest, each frequency times its weight; weights
-    by record, or one array for the lines of fitted responses."""
+    """Return the information on the unknowns of interest, with a weight for each frequency.
+
+    Weights are by record, or one array for the lines of fitted responses.
+    """
     layout, data, noise, z = at
     q = len(layout.of_interest)
     if not any(np.any(w) for w in weights):
@@ -203,28 +210,27 @@ def information(
             for W, w in zip(noise.whitening, weights, strict=True)
         )
     )
-    # The compiled function of the fit with other weights, without the rows of priors.
+    # Reuse the fit's compiled function with other weights; leave out the rows of priors.
     J = np.asarray(residual_and_jacobian(layout, data, weighed, z).J)[:q, :q]
     return J.T @ J
 
 
-# Estimates by instrument that are not trusted, since the excitation is weak at their frequencies.
+# Estimates by instrument with weak excitation at their frequencies.
 #
-# An input follows its excitation only where that has power. Elsewhere estimate and interval rest on
-# chance coherence. This concerns speed derivatives most: their slow mode lies below the lowest
-# frequency of a sweep.
+# An input follows its excitation only at frequencies where that has power. Elsewhere estimate and
+# interval depend on chance coherence. Speed derivatives are affected most, since their slow mode
+# lies below the lowest frequency of a sweep.
 #
-# Sources: Cragg and Donald (1993) for several inputs: the least canonical correlation with the
+# Sources: Cragg and Donald (1993) for the least canonical correlation of several inputs with their
 # instruments; Stock and Yogo (2005) for the limit of F.
 
 
 _WEAK = 0.25
-"""part of a parameter's information from frequencies of a weak instrument, above which it is not
-trusted"""
+"""Share of a parameter's information with a weak instrument, above which it is not trusted."""
 
 
 def weak_by_instrument(problem: Problem, at: Solution) -> tuple[str, ...]:
-    """Return the unknowns of interest with too little information by instrument; () without any."""
+    """Return the unknowns of interest with too little information by instrument."""
     layout, data, noise, _ = at
     if layout.noise_model != "spectrum" or not instruments_of(problem):
         return ()
@@ -259,8 +265,9 @@ def _followed(
     signals: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]],
     spans: Sequence[tuple[int, int]],
 ) -> tuple[list[Float[np.ndarray, " K"]], list[Float[np.ndarray, " K"]]]:
-    """Return by record and line the least squared canonical correlation of the inputs with their
-    instruments, and its F.
+    """Return the least squared canonical correlation of inputs and instruments, and its F.
+
+    Both are by record and line.
 
     Args:
         signals: by record the inputs (N,) of its flight, and their parts that follow instruments.

@@ -1,13 +1,13 @@
 """Excitation: the power of a signal that follows others, in bands of a record's lines.
 
-In a narrow band a response is a constant gain, so that least squares over the band's lines gives
+In a narrow band a response is a constant gain. Least squares over the band's lines therefore gives
 the power of a signal that follows others. The likelihood ratio is compared with chance (Wilks, for
-complex normal errors). This gives
+complex normal errors). The results are
 
-- the part of the outputs that follows the excitation: the logged one where inputs are taken by
+- the part of the outputs that follows the excitation: the logged excitation if inputs are taken by
   instrument, else the inputs;
-- the part of a residual in frequency that does, which is zero for the right model. Nothing is
-  simulated, so that it holds for unstable vehicles. By instrument it is the test of
+- the part of a residual in frequency that follows it, which is zero for the right model. The test
+  needs no simulation, so it is valid for unstable vehicles. By instrument it is the test of
   overidentification (Sargan, 1958);
 - the coherence between inputs.
 
@@ -36,29 +36,30 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Solution
 
 LEVEL = 0.01
-"""of the test of all outputs together"""
+"""Significance level of the test of all outputs together."""
 _FIRST, _GROWTH = 12, 1.15
-"""lines of the lowest band, and the ratio of the widths of one band and the next"""
+"""Lines of the lowest band, and ratio of the widths of one band and the next."""
 _LOW, _HIGH = 0.05, 0.95
-"""parts of an input's power below the edges of its band"""
+"""Shares of an input's power below the edges of its band."""
 _LEAST_POWER = 1e-3
-"""least density of power that excites, as a part of an input's largest"""
+"""Least power density that excites, as a share of an input's largest."""
 _SEEN = 0.8
-"""least part of an output's samples that is measured: gaps are bridged by straight lines"""
+"""Least share of an output's samples that are measured; straight lines bridge gaps."""
 _ROUNDING = 1e-6
-"""part of the inputs' power below which a combination of them is rounding"""
+"""Share of the inputs' power below which a combination of them is rounding."""
 
 
 class Followed(NamedTuple):
-    """The part of a signal that follows the excitation."""
+    """Part of a signal that follows the excitation."""
 
     p_value: float
-    """probability that noise follows as much by chance"""
+    """Probability that noise follows as much by chance."""
     explained: float
-    """part of an output's power that follows the excitation; for a residual, the part of that power
-    which the model explains"""
+    """Share of an output's power that follows the excitation.
+
+    For a residual: share of that power which the model explains."""
     by_chance: float = 0.0
-    """standard deviation of that part"""
+    """Standard deviation of that share."""
 
 
 class Pair(NamedTuple):
@@ -66,30 +67,30 @@ class Pair(NamedTuple):
 
     inputs: tuple[str, str]
     coherence: float
-    """partial, in the mean over frequencies weighted by the power that both have"""
+    """Partial coherence, averaged over frequency with the power of both inputs as weight."""
 
 
 class Excitation(NamedTuple):
-    """Inputs of some flights, and the outputs that follow them."""
+    """Inputs of flights, and the outputs that follow them."""
 
     powers: dict[str, tuple[float, float]]
-    """by input that moves, the band [Hz] of 90 % of its power"""
+    """Band [Hz] with 90 % of the power of each input that moves."""
     outputs: dict[str, Followed]
-    """by output; without those that lack samples or never move; empty for short records"""
+    """Results by output that moves and is mostly measured; empty for short records."""
     pairs: tuple[Pair, ...]
-    """of the inputs that move, the most coherent first"""
+    """Pairs of inputs that move, the most coherent first."""
 
 
 def excitation_of(problem: Problem) -> Excitation:
     """Return the excitation of the fitted flights."""
     flights, by = problem.training, instruments_of(problem)
-    # The lines of a flight at rest would leave too few lines of other flights in a band.
+    # The lines of a flight at rest would displace those of other flights in a band.
     flown = [f for f in flights if any(np.ptp(u) > 0 for u in f.inputs.values())]
     if not flown:
         return Excitation({}, {}, ())
     names = [n for n in flown[0].inputs if any(np.ptp(f.inputs[n]) > 0 for f in flown)]
     lines = [lines_of(np.stack([f.inputs[n] for n in names], 1)) * f.dt**0.5 for f in flown]
-    # The lines of all flights in one order, as if from one record.
+    # Sort the lines of all flights by frequency, as if from one record.
     each = zip(flown, lines, strict=True)
     hz = np.concatenate([np.arange(1, len(v) + 1) / (f.n_samples * f.dt) for f, v in each])
     order = np.argsort(hz, kind="stable")
@@ -114,8 +115,8 @@ def _outputs(flights: Sequence[Flight], by: Sequence[str]) -> dict[str, Followed
         measured = {n: y for n, y in measured.items() if np.ptp(y) > 0}
         if X is None or not measured:
             continue
-        # A signal that ends elsewhere than it began, as a slow mode does, has a jump, which is in
-        # all lines: the test is also made without a straight line between its ends.
+        # A slow mode ends away from its start, and this jump is in all lines of the spectrum.
+        # The test is therefore repeated without the straight line between the ends.
         above = [y - np.linspace(y[0], y[-1], y.size) for y in measured.values()]
         for k, v in enumerate((list(measured.values()), above)):
             y = lines_of(np.stack(v, axis=1))
@@ -140,8 +141,10 @@ def _outputs(flights: Sequence[Flight], by: Sequence[str]) -> dict[str, Followed
 def _drives(
     flight: Flight, by: Sequence[str], part: slice = slice(None)
 ) -> Complex[np.ndarray, "K m"] | None:
-    """Return the transform of the excitation of a part of a flight: the logged one of the inputs
-    `by` instrument, else the inputs; None if nothing moves."""
+    """Return the transform of the excitation in a part of a flight; None if nothing moves.
+
+    The excitation is the logged one for inputs `by` instrument, else the inputs.
+    """
     drives = [flight.instruments[n] if n in by else u for n, u in flight.inputs.items()]
     moving = [v[part] for v in drives if np.ptp(v[part]) > 0]
     return lines_of(np.stack(moving, axis=1)) if moving else None
@@ -166,7 +169,7 @@ def _pairs(X: Complex[np.ndarray, "K m"], moving: Sequence[str]) -> tuple[Pair, 
         P = np.linalg.pinv(S / np.outer(size, size), rcond=_ROUNDING, hermitian=True)
         own = np.real(np.diag(P))
         part = np.abs(P) ** 2 / np.maximum(np.outer(own, own), 1e-300)
-        # Less the coherence that is expected by chance.
+        # Subtract the coherence that is expected by chance.
         n = band.stop - band.start - m + 2
         coherences.append(np.clip((n * part - 1.0) / (n - 1), 0.0, 1.0))
     if not powers:
@@ -174,7 +177,7 @@ def _pairs(X: Complex[np.ndarray, "K m"], moving: Sequence[str]) -> tuple[Pair, 
     parts = np.stack(powers) / np.maximum(np.sum(powers, axis=0), 1e-300)
     pairs = []
     for a, b in itertools.combinations(range(m), 2):
-        # Where both have power, the effect of one can be taken for that of the other.
+        # Only frequencies at which both have power can confuse their effects.
         weights = np.minimum(parts[:, a], parts[:, b])
         values = np.stack(coherences)[:, a, b]
         mean = float(weights @ values / max(float(np.sum(weights)), 1e-300))
@@ -191,11 +194,9 @@ def _band_slices(lines: int, m: int) -> Iterator[slice]:
 
 
 def least_rough(flights: Sequence[Flight]) -> tuple[str, float]:
-    """Return the smoothest output, and its mean squared step from sample to sample over that of
-    white noise (von Neumann).
+    """Return the smoothest output, and its mean squared step over that of white noise.
 
-    Args:
-        flights: with one output at least.
+    This is von Neumann's ratio. The flights must have at least one output.
     """
 
     def roughness(y: Float[np.ndarray, " N"]) -> float:
@@ -208,8 +209,9 @@ def least_rough(flights: Sequence[Flight]) -> tuple[str, float]:
 
 
 def residual_against_excitation(problem: Problem, at: Solution) -> dict[str, Followed]:
-    """Return by output the part of its residual that follows the excitation; outputs of too few
-    lines are left out.
+    """Return by output the part of its residual that follows the excitation.
+
+    Outputs with too few lines are left out.
     """
     errors = jax.device_get(errors_of_lines(*at).errors)
     by = instruments_of(problem) if at.data.flights[0].by_instrument is not None else ()
@@ -222,12 +224,13 @@ def errors_against_excitation(
     errors: Sequence[Complex[np.ndarray, "K p"]],
     by: Sequence[str],
 ) -> dict[str, Followed]:
-    """Return by output the part of errors that follows the excitation; outputs of too few lines are
-    left out.
+    """Return by output the part of errors that follows the excitation.
+
+    Outputs with too few lines are left out.
 
     Args:
-        flights: those of the layout, fitted or held out.
-        at: where they are evaluated.
+        flights: flights of the layout, fitted or held out.
+        at: point at which they are evaluated.
     """
     layout, _, noise, _ = at
     sums: dict[str, np.ndarray] = {}
@@ -245,7 +248,7 @@ def errors_against_excitation(
             # The test assumes noise of constant power in each band: divide by the noise's spectrum.
             sizes[id(W)] = np.sqrt(np.sum(np.abs(root) ** 2, axis=2))
         bands = _in_bands(np.stack([e, y], axis=2), X, sizes[id(W)])
-        # Not the model's response: that of a wrong model may be larger than the measured output.
+        # Scale by the measured output: the response of a wrong model may be larger.
         asked, scale = bands.asked, bands.scale
         powers = np.sum((asked * scale)[:, :, None] * bands.followed, axis=0)
         chance = np.sum(asked * bands.rank * (scale * bands.per_line[:, :, 0]) ** 2, axis=0)
@@ -268,28 +271,30 @@ class _Bands(NamedTuple):
 
     lines: Float[np.ndarray, "b 1"]
     rank: Float[np.ndarray, "b p"]
-    """of the excitation"""
+    """Rank of the excitation."""
     whole: Float[np.ndarray, "b p c"]
     parts: Float[np.ndarray, "b p c"]
-    """explained by the excitation"""
+    """Power that the excitation explains."""
     scale: Float[np.ndarray, "b p"]
-    """mean square of the divisors of the signals"""
+    """Mean square of the signals' divisors."""
     excited: Bool[np.ndarray, " b"]
-    """True where an excitation has power"""
+    """True where an excitation has power."""
 
     @property
     def per_line(self) -> Float[np.ndarray, "b p c"]:
-        """Power that is not explained, per line."""
+        """Unexplained power per line."""
         return np.maximum(self.whole - self.parts, 0.0) / (self.lines - self.rank)[:, :, None]
 
     @property
     def followed(self) -> Float[np.ndarray, "b p c"]:
-        """Power that follows the excitation, less that expected by chance."""
+        """Power that follows the excitation, less the power expected by chance."""
         return self.parts - self.rank[:, :, None] * self.per_line
 
     def test(self) -> Float[np.ndarray, "p 2"]:
-        """Return by output the likelihood ratio of its first signal with and without the
-        excitation, and its degrees of freedom."""
+        """Return by output the likelihood ratio of its first signal, with its degrees of freedom.
+
+        The ratio compares models with and without the excitation.
+        """
         asked, n, m = self.asked, self.lines, self.rank
         share = self.parts[:, :, 0] / np.where(asked, self.whole[:, :, 0], np.inf)
         statistic = np.where(asked, -(2.0 * n - m - 1.0) * np.log1p(-share), 0.0)
@@ -311,13 +316,13 @@ def _in_bands(
     """Regress signals on an excitation in each band.
 
     Args:
-        size: divisors of each output, or (s = 1) of all; one unless given.
+        size: divisors of each output, or (s = 1) of all; 1 by default.
     """
     size = np.ones((len(X), 1)) if size is None else size
     found = list[tuple[_Bands, np.ndarray]]()
     for band in _band_slices(*X.shape):
         over = 1.0 / size[band].T
-        # All outputs at once: each divides the excitation by its own size.
+        # Each output divides the excitation by its own size.
         Q, R = np.linalg.qr(X[None, band] * over[:, :, None])
         along = np.abs(np.einsum("pii->pi", R))
         kept = along > 1e-9 * np.max(along, axis=1, initial=0.0, keepdims=True)

@@ -38,38 +38,40 @@ class Validation(NamedTuple):
 
     e: Evaluation
     free_run: tuple[dict[str, np.ndarray], ...] | None
-    """with windows: by flight and output the simulation (N,) without windows, from the initial
-    state of the first one; None without windows"""
+    """By flight and output the simulation (N,) in one piece, from the first window's initial state.
+
+    None without windows."""
 
 
 def validate(
     problem: Problem, layout: Layout, z: Array, noise: Noise, held: tuple[Flight, ...]
 ) -> Validation:
-    """Predict held-out flights with the estimates; only their initial states (of every window) and
-    biases are fitted.
+    """Predict held-out flights with the estimates.
+
+    Only their initial states (of every window) and biases are fitted.
 
     Args:
         z: (q,) the optimum of the fitted flights in `layout`.
     """
-    # Shared unknowns are first in z and in the same order, whichever flights there are.
+    # Shared unknowns come first in z, in the same order for any flights.
     other = layout_of(problem, held)
-    # Initial states and biases are in no line of a spectrum, but in time.
+    # A spectrum contains no initial states and biases: fit them in time.
     if other.objective.noise_model == "spectrum":
         other = replace(other, objective=objective_of("output-error"))
     data, first = data_of(problem, held, other), layout.first_nuisance
-    # Those of a linear model are found in one step from any point, also from zero.
+    # For a linear model one step finds them from any point, also from zero.
     begin = jnp.zeros(other.size - first, z.dtype)
     if not problem.model.linear:
         begin = start_vector(other, data, problem)[first:]
     their_noise = _noise_of(problem, layout, noise, held)
     full = jnp.concatenate([z[:first], begin])
     if other.noise_model == "disturbance":
-        # Those of a simulation would take gusts for a bias, which the innovations then have.
+        # Fit by innovations: a simulation would take gusts for a bias.
         full = fit_nuisances(other, data, their_noise, full)
     else:
         full = in_time(other, data, their_noise, full)
     e = evaluate(other, data, their_noise, full)
-    # With windows the agreement is that of many short simulations; one without windows shows drift.
+    # Windows give many short simulations; only a simulation in one piece shows drift.
     free_run = None
     if any(count > 1 for count, _ in other.windows):
         one_piece, whole = _in_one_piece(other, full)
@@ -78,15 +80,17 @@ def validate(
 
 
 def _noise_of(problem: Problem, layout: Layout, noise: Noise, held: tuple[Flight, ...]) -> Noise:
-    """Return the noise of held-out flights: the estimate if all flights share it, else a guess from
-    their own records."""
-    # A spectrum needs flights with the same outputs, and is not needed in time.
+    """Return the noise of held-out flights: the estimate if flights share it, else a guess.
+
+    The guess is from their own records.
+    """
+    # A spectrum needs flights with the same outputs, and the fit in time does not need it.
     in_rows = layout.noise_model != "spectrum"
     guess = first_noise(problem, held) if in_rows else first_noise_sizes(problem, held)
     if layout.noise_model != "disturbance":
         return guess
     known = {n: s for flight in noise.sd for n, s in flight.items()}
-    # An output that no fitted flight has keeps its guess.
+    # Outputs that no fitted flight has keep their guess.
     return guess._replace(
         sd=tuple({n: known.get(n, s) for n, s in flight.items()} for flight in guess.sd)
     )
@@ -102,22 +106,22 @@ def _in_one_piece(layout: Layout, z: Array) -> tuple[Layout, Array]:
     return replace(layout, windows=windows, continuity=None), z[np.concatenate(kept)]
 
 
-# Tests of held-out flights in frequency. Nothing is simulated, so that they hold for unstable
-# models too, and gusts raise the noise.
+# Tests of held-out flights in frequency. They need no simulation, so they are valid for unstable
+# models too. Gusts only raise the noise.
 #
-# Each flight has its own noise spectrum. One Gauss-Newton step from the fit's estimates to the
-# flight's own is compared with the errors of both (Chow's test). And the residual must not follow
-# the excitation by more than the output does.
+# Each flight has its own noise spectrum. One Gauss-Newton step leads from the fit's estimates to
+# the flight's own; it is compared with the errors of both (Chow's test). Also, the residual must
+# not follow the excitation by more than the output does.
 #
 # Source: Chow (1960).
 
 
 _ROUNDS = 3
-"""iterations for the spectrum of the flight's noise"""
+"""Iterations for the spectrum of the flight's noise."""
 _NO_EFFECT = 1e-10
-"""eigenvalue over the largest one, below which a direction has no effect"""
+"""Eigenvalue over the largest one, below which a direction has no effect."""
 _SURE = 0.05
-"""largest sd of an explained part that is reported"""
+"""Largest standard deviation of an explained share that is reported."""
 
 
 class Furthest(NamedTuple):
@@ -125,29 +129,31 @@ class Furthest(NamedTuple):
 
     parameter: str
     own: float
-    """estimate from the flight alone, after one step [SI]"""
+    """Estimate from the flight alone, after one step [SI]."""
     fitted: float
     sds: float
-    """joint standard deviations between the two"""
+    """Difference in joint standard deviations."""
 
 
 class HeldOutFlight(NamedTuple):
-    """A held-out flight."""
+    """Test results of a held-out flight."""
 
     flight: str
     estimates_p_value: float | None
-    """probability that the flight's own estimates are as far from those of the fit by chance; null
-    if they cannot be compared"""
+    """Probability that the flight's own estimates differ as much from the fit's by chance.
+
+    None if they cannot be compared."""
     furthest: Furthest | None
     explained: dict[str, float]
-    """by output the part that the model explains of the power that follows the excitation; below 0
-    it is worse than no model; only if its sd is at most 0.05"""
+    """Share of the power following the excitation that the model explains, by output.
+
+    Below 0 the model is worse than none. Reported if its standard deviation is at most 0.05."""
     worse: tuple[str, ...]
-    """outputs that a model without any response explains better"""
+    """Outputs that a model without any response explains better."""
 
     @property
     def differs(self) -> bool:
-        """True if the flight's own estimates differ."""
+        """True if the flight's own estimates differ from the fit's."""
         return self.estimates_p_value is not None and self.estimates_p_value < LEVEL
 
 
@@ -156,7 +162,7 @@ class HeldOutFrequency(NamedTuple):
 
     flights: tuple[HeldOutFlight, ...]
     not_judged: tuple[str, ...]
-    """flights that cannot be compared with the fitted ones"""
+    """Flights that cannot be compared with the fitted ones."""
 
 
 def validate_in_frequency(
@@ -183,8 +189,11 @@ def validate_in_frequency(
 
 
 def _comparable(problem: Problem, at: Solution, flight: Flight, *, feedback: bool) -> Flight | None:
-    """Return the flight with the outputs that can be compared; None if there are none, no
-    instrument moves, or inputs follow the outputs and no instrument is used."""
+    """Return the flight with the outputs that can be compared.
+
+    None if there are none, if no instrument moves, or if inputs follow the outputs and no
+    instrument is used.
+    """
     by = instruments_of(problem)
     if feedback or (by and not any(np.ptp(flight.instruments.get(n, [0.0])) > 0 for n in by)):
         return None
@@ -201,7 +210,7 @@ def _judged(
     problem: Problem, at: Solution, fitted: Evaluation, label: str, flight: Flight
 ) -> HeldOutFlight | None:
     """Test one flight; None if its errors have no spectrum."""
-    # At the lines of the full flight, also after a fit of responses.
+    # Use the lines of the full flight, also after a fit of responses.
     problem = replace(problem, method="frequency-error")
     layout = layout_of(problem, (flight,))
     data, noise = data_of(problem, (flight,), layout), first_noise(problem, (flight,))
@@ -217,7 +226,7 @@ def _judged(
         return None
     there = Solution(layout, data, noise, z)
     made = residual_and_jacobian(*there)
-    # A row for each parameter and one for the rest of the errors, without those of priors.
+    # One row per parameter and one for the remaining errors; rows of priors are left out.
     r, J = np.asarray(made.r)[: q + 1], np.asarray(made.J)[: q + 1, :q]
     by = instruments_of(problem) if data.flights[0].by_instrument is not None else ()
     errors = jax.device_get(errors_of_lines(*there).errors)
@@ -232,8 +241,9 @@ def _judged(
 def _own_estimates(
     r: Float[np.ndarray, " r"], J: Float[np.ndarray, "r q"], at: Solution, fitted: Evaluation
 ) -> tuple[float | None, Furthest | None]:
-    """Return the p-value of the difference of the flight's own estimates, and the furthest one;
-    None if the two determine no direction in common.
+    """Return the p-value of the flight's own estimates against the fit's, and the furthest one.
+
+    None if flight and fit determine no direction in common.
 
     Args:
         r: errors of the flight over its noise.
@@ -250,7 +260,7 @@ def _own_estimates(
     kept = sums > _NO_EFFECT * sums[-1]
     root = vectors[:, kept] / np.sqrt(sums[kept])
     shares, turned = np.linalg.eigh(root.T @ own @ root)
-    # Directions that only one of the two determines cannot be compared.
+    # A direction can be compared only if both flight and fit determine it.
     both = (shares > _NO_EFFECT) & (shares < 1.0 - _NO_EFFECT)
     if not both.any():
         return None, None

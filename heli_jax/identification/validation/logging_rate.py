@@ -1,9 +1,9 @@
 """Sampling rates of a log against the modes of the model, at the start values or the estimates.
 
-Outputs that are sampled at less than twice the frequency of a mode show its aliases. An input that
-moves between its samples is known at the samples alone: a straight line misses a part
-(pi f / rate)^2 / 3 of a motion at f, a staircase pi f / rate. At twice the frequency nothing of the
-motion is left; at five times the frequency a line misses a seventh.
+Outputs that are sampled at less than twice a mode's frequency show its aliases. An input is known
+only at its samples: of a motion at f, straight lines between them miss the part
+(pi f / rate)^2 / 3, a staircase pi f / rate. At a rate of 2 f the samples show nothing of the
+motion; at 5 f straight lines miss a seventh.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,57 +27,58 @@ from heli_jax.numerics.white_noise import white_part
 @dataclass(frozen=True)
 class _Limits:
     hopeless: float = 2.0
-    """samples in a period of a mode, below which it is not visible"""
+    """Samples per period below which a mode is not visible."""
     settled: float = 1.0
-    """the same for a mode that does not oscillate, whose period is 2 pi time constants"""
+    """The same for a mode that does not oscillate, whose period is 2 pi time constants."""
     enough: float = 5.0
-    """samples in a period of a mode, from which on it is visible"""
+    """Samples per period from which on a mode is visible."""
     shows: float = 3.0
-    """motion of an output by a mode over its noise, from which on the mode matters"""
+    """Least motion of an output over its noise for a mode to matter."""
     part: float = 0.1
-    """the same over the output's motion, since the noise guessed from slow samples is too large"""
+    """The same over the output's motion, since the noise guessed from slow samples is too large."""
     regular: float = 0.8
-    """least share of the steps of a staircase that have the usual length, for a slow clock"""
+    """Least share of a staircase's steps with the usual length, for a slow clock."""
     slower: float = 1.05
-    """step of a topic over that of the grid, from which on it is longer"""
+    """Sample interval over the grid's, from which on a signal is slower than the grid."""
     bends: int = 8
-    """samples in a row at which straight lines bend; if more, each is a sample of the signal"""
+    """Longest run of samples at which straight lines bend; in a longer run each is a sample."""
     levels: int = 10
-    """fewest distinct values of a staircase; commanded steps have fewer"""
+    """Fewest distinct values of a staircase; commanded steps have fewer."""
     steps: int = 20
-    """fewest steps of a staircase"""
+    """Fewest steps of a staircase."""
     fast_share: float = 0.005
-    """part of an input's power above a quarter of its rate, from which on it may move between its
-    samples"""
+    """Share of an input's power above a quarter of its rate, for motion between its samples."""
     falls: float = 0.5
-    """power density there over that of the octave below, likewise"""
+    """Least power density there over that of the octave below, likewise."""
 
 
 RATE = _Limits()
 
 
 class Modes(NamedTuple):
-    """A linearised model along its eigenvectors."""
+    """Linearised model in its eigenvectors."""
 
     at: OperatingPoint
     eigenvalues: np.ndarray
-    """(n,) [1/s]"""
+    """Eigenvalues (n,) [1/s]."""
     right: np.ndarray
-    """(n, n) a mode a column"""
+    """Right eigenvectors (n, n), one per column."""
     left: np.ndarray
-    """(n, n) a mode a row"""
+    """Left eigenvectors (n, n), one per row."""
     A: np.ndarray
     B: np.ndarray
     C: np.ndarray
 
-    # An integrator has no end of its response to a step.
+    # The step response of an integrator is infinite.
     @np.errstate(divide="ignore", invalid="ignore")
     def strongest(
         self, k: int, problem: Problem, flight: Flight, noise: Mapping[str, Any]
     ) -> tuple[float, str, str]:
-        """Return the part of mode k in the response of an output to a step of an input's size, over
-        the output's noise (sd, SI), where that is largest, with the input's and the output's name.
-        If no input moves: the same of the free motion, all of which is the mode that shows best."""
+        """Return the largest part of mode k in an output's step response, with input and output.
+
+        The step has the input's size; the part is relative to the output's noise (sd, SI). If no
+        input moves, the part is that of the free motion, relative to the most visible mode.
+        """
         outputs = naming.names(problem.model.Outputs)
         best = (0.0, "", "")
         if not any(np.ptp(u) > 0 for u in flight.inputs.values()):
@@ -97,9 +98,7 @@ class Modes(NamedTuple):
 
 
 def _modes_of(problem: Problem, params: Any, flight: Flight) -> Modes | None:
-    """Return the model's modes about the point that stands for a flight; None where its matrices
-    are not finite.
-    """
+    """Return the model's modes at a flight's operating point; None if a matrix is not finite."""
     at = operating_point(
         problem.model, params, flight.inputs, flight.outputs, flight.dt, substeps=problem.substeps
     )
@@ -108,31 +107,31 @@ def _modes_of(problem: Problem, params: Any, flight: Flight) -> Modes | None:
     if not all(np.isfinite(M).all() for M in (A, B, C)):
         return None
     eigenvalues, right = np.linalg.eig(A)
-    # A defective matrix has no inverse of its vectors: the least squares one spreads the residues.
+    # The eigenvectors of a defective matrix have no inverse: the pseudoinverse spreads residues.
     return Modes(at, eigenvalues, right, np.linalg.pinv(right), A, B, C)
 
 
-# Rates beside the modes that show.
+# Rates against the visible modes.
 
 
 class _Mode(NamedTuple):
-    """A mode that shows in the record."""
+    """Mode that is visible in the record."""
 
     hz: float
-    """its natural frequency"""
+    """Natural frequency [Hz]."""
     swings: bool
     input: str
     output: str
 
 
 class Rate(NamedTuple):
-    """The rate of signals beside the fastest mode that they have to show."""
+    """Rate of signals, and the fastest mode that they must show."""
 
     signals: tuple[str, ...]
     hz: float
     mode: _Mode
     least: float
-    """samples in a period of the mode, below which nothing of it is seen"""
+    """Samples per period below which the mode is not visible."""
 
     @property
     def samples(self) -> float:
@@ -143,8 +142,9 @@ class Rate(NamedTuple):
 def rates_against_modes(
     problem: Problem, params: Any, flight: Flight, noise: Mapping[str, Any]
 ) -> list[Rate]:
-    """Return the rates of inputs that move, and of outputs, against the fastest mode that matters;
-    none if no mode does. Params and the noise's sd by output are in SI.
+    """Return the rates of moving inputs, and of outputs, against the fastest mode that matters.
+
+    The list is empty if no mode matters. Params and the noise's sd by output are in SI.
     """
     modes = sorted(_modes_that_show(problem, params, flight, noise))
     if not modes:
@@ -157,7 +157,7 @@ def rates_against_modes(
             rates.append(Rate((name,), rate, felt[-1], RATE.hopeless))
     of = {y: output_rate(flight, y) for y in flight.outputs}
     fastest = max(of.values())
-    # A decay has no alias, but between two samples all of it may be over.
+    # A decay has no alias, but it may end between two samples.
     least = RATE.hopeless if modes[-1].swings else RATE.settled
     outputs = tuple(y for y in of if of[y] == fastest)
     return [*rates, Rate(outputs, fastest, modes[-1], least)]
@@ -166,7 +166,7 @@ def rates_against_modes(
 def _modes_that_show(
     problem: Problem, params: Any, flight: Flight, noise: Mapping[str, Any]
 ) -> Iterator[_Mode]:
-    """Yield the modes that show in the response to a step of an input's size."""
+    """Yield the modes that are visible in the response to a step of an input's size."""
     sizes = {}
     for name, y in flight.outputs.items():
         own = RATE.part * float(np.nanstd(y))
@@ -181,7 +181,7 @@ def _modes_that_show(
         # A mode slower than the record is a drift.
         if modes is None or abs(eigenvalue) < 2.0 * np.pi / (flight.n_samples * flight.dt):
             continue
-        # The mode of a filter alone is known.
+        # A mode of a filter alone is known: leave it out.
         right = modes.right[:, k]
         if np.linalg.norm(right[vehicle]) < 1e-6 * np.linalg.norm(right):
             continue
@@ -191,23 +191,25 @@ def _modes_that_show(
 
 
 def input_rate(flight: Flight, name: str, u: Float[np.ndarray, " N"]) -> float | None:
-    """Return the rate [Hz] at which an input was sampled while it moved; None if it does not move,
-    or if it is known between its samples because it was commanded in steps."""
+    """Return the rate [Hz] at which a moving input was sampled.
+
+    None if it does not move, or if it is known between its samples since it was commanded in steps.
+    """
     if np.ptp(u) == 0:
         return None
     step = flight.logged_step(name, "input")
-    # A slower topic's own clock is known, and its straight lines are those of the grid.
+    # The clock of a slower signal is known; the grid interpolates it by straight lines.
     slower = 1.0 / step if step > RATE.slower * flight.dt else None
     if flight.hold[name] != "zero-order":
         moving = split(u)[1] if flight.hold[name] == "mixed" else u
         return slower or _corner_rate(flight.dt, moving)
-    # Held because somebody said so: then it is known at all times.
+    # With a hold that the user stated the input is known at all times.
     if name not in flight.hold_reason:
         return None
     at = np.flatnonzero(np.diff(u) != 0)
     if at.size < RATE.steps or np.unique(u).size < RATE.levels:
         return None
-    # All steps of a slow clock's staircase have one length, but for rounding.
+    # All steps of a slow clock's staircase have the same length, up to rounding.
     stairs = np.diff(at)
     usual = float(np.median(stairs))
     regular = np.mean(np.abs(stairs - usual) <= max(1.0, 0.05 * usual))
@@ -219,7 +221,7 @@ def input_rate(flight: Flight, name: str, u: Float[np.ndarray, " N"]) -> float |
 def _corner_rate(dt: float, u: np.ndarray) -> float:
     """Return the rate of the samples between which an input follows straight lines."""
     bends = np.abs(np.diff(u, 2))
-    # A quantile: one outlier would make the corners look like rounding.
+    # Quantiles, since one outlier would make all corners look like rounding.
     low, high = np.quantile(u, [0.01, 0.99])
     corners = np.flatnonzero(bends > 1e-6 * ((high - low) or np.ptp(u)))
     if corners.size < RATE.steps:
@@ -231,31 +233,31 @@ def _corner_rate(dt: float, u: np.ndarray) -> float:
         return 1.0 / dt
     within = np.arange(corners.size) - np.repeat(begins, sizes)
     steps = np.diff(corners[within % 2 == 0])
-    # Where it rests there are no corners.
+    # A resting input has no corners: leave out the long steps.
     return 1.0 / (float(np.mean(steps[steps <= 1.5 * np.median(steps)])) * dt)
 
 
 def output_rate(flight: Flight, name: str) -> float:
-    """Return the rate [Hz] of the samples of an output that are there."""
+    """Return the rate [Hz] of an output's measured samples."""
     seen = np.flatnonzero(np.isfinite(flight.outputs[name]))
     usual = float(np.median(np.diff(seen))) if seen.size > 1 else float(flight.n_samples)
     return 1.0 / max(usual * flight.dt, flight.logged_step(name, "output"))
 
 
 def power_between_samples(flight: Flight, name: str) -> tuple[float, float] | None:
-    """Return the rate [Hz] of an input, and the part of its power above a quarter of it; None if
-    that power falls off before half of the rate.
+    """Return the rate [Hz] of an input, and the share of its power above a quarter of that rate.
 
-    A controller that runs faster than the log moves its input between the samples.
+    None if the power falls off before half of the rate. A controller that runs faster than the log
+    moves its input between the samples.
     """
     u = flight.inputs[name]
-    # Held because somebody said so: then it is known between its samples.
+    # With a hold that the user stated the input is known between its samples.
     rate = input_rate(flight, name, u) if name in flight.hold_reason else None
     if rate is None:
         return None
     v = u[:: max(round(1.0 / (rate * flight.dt)), 1)]
     power = np.abs(np.fft.rfft(np.diff(v) * np.hanning(v.size - 1))) ** 2
-    # Differences take off what is slow; the power itself is that over their gain.
+    # Differences remove slow drift; dividing by their gain restores the power.
     power = power[1:] / np.sin(0.5 * np.pi * np.arange(1, power.size) / power.size) ** 2
     quarter, half = power.size // 4, power.size // 2
     last, before = (float(np.mean(x)) for x in (power[half:], power[quarter:half]))
@@ -265,25 +267,26 @@ def power_between_samples(flight: Flight, name: str) -> tuple[float, float] | No
 
 # Modes past the Nyquist frequency, and the free parameters that move them.
 #
-# Samples at a rate f do not distinguish w + 2 pi f from w. So an optimum with a mode past the
-# Nyquist frequency is one of many that fit as well, each with a narrow interval.
+# Samples at a rate f do not distinguish w + 2 pi f from w. A mode past the Nyquist frequency
+# therefore has aliases that fit equally well, each with a narrow interval.
 
 
 _NEAR = 0.8
-"""part of the Nyquist frequency, from which on an alias of a mode fits as well"""
+"""Share of the Nyquist frequency from which on an alias of a mode fits equally well."""
 _MOVED = 1e-6
-"""relative change of a mode for that of a parameter, below which the mode is known"""
+"""Relative change of a mode over that of a parameter, below which the mode is known."""
 _TURNED = 0.2
-"""relative change of its frequency, from which on a parameter can move the mode to an alias; 0.5 if
-the frequency goes with the parameter's root"""
+"""Least relative change of the frequency over that of a parameter that can move it to an alias.
+
+The ratio is 0.5 if the frequency goes with the parameter's square root."""
 _SWINGS = 10.0
-"""frequency over decay, above which a mode oscillates even if it decays within a sample"""
+"""Frequency over decay, above which a mode oscillates even if it decays within a sample."""
 _STEP = 1e-4
-"""relative step of the parameters for these changes"""
+"""Relative step of the parameters for these changes."""
 
 
 class FastMode(NamedTuple):
-    """A mode of a flight at or past the Nyquist frequency that free parameters move."""
+    """Mode of a flight at or past the Nyquist frequency that depends on free parameters."""
 
     flight: str
     frequency: float
@@ -291,14 +294,14 @@ class FastMode(NamedTuple):
     nyquist: float
     """[rad/s]"""
     undetermined: tuple[str, ...]
-    """the free parameters that can take it to an alias, where it shows in an output"""
+    """Free parameters that can move the mode to an alias, if it is visible in an output."""
 
 
 def measurement_noise(
     problem: Problem, sd: Sequence[Mapping[str, Any]]
 ) -> tuple[dict[str, float], ...]:
-    """Return by flight and output the sd of the noise in residuals without what a model misses."""
-    # The residuals of a wrong optimum are larger than the noise, and would hide its fast mode.
+    """Return by flight and output the noise's sd, without the errors of the model."""
+    # The residuals of a wrong optimum exceed the noise and would hide its fast mode.
     return tuple(
         {n: max(min(float(s), white_part(flight.outputs[n])), 1e-300) for n, s in one.items()}
         for flight, one in zip(problem.training, sd, strict=True)
@@ -310,11 +313,11 @@ def fast_modes(
     values: Mapping[str, float],
     noise: Sequence[Mapping[str, Any]] | None = None,
 ) -> list[FastMode]:
-    """Return by flight the fastest mode that its samples cannot show and that is not known.
+    """Return by flight the fastest unknown mode that its samples cannot show.
 
     Args:
-        values: of the free parameters, SI; gains and shifts among them move no mode.
-        noise: sd by flight and output, SI; None leaves `undetermined` empty.
+        values: values of the free parameters [SI]; gains and shifts among them move no mode.
+        noise: sd by flight and output [SI]; None leaves `undetermined` empty.
     """
     fast = []
     for i, flight in enumerate(problem.training):
@@ -322,12 +325,12 @@ def fast_modes(
         modes, nyquist = _modes_of(problem, problem.params_with(here), flight), np.pi / flight.dt
         if modes is None:
             continue
-        # The imaginary part alone: a fast decay without oscillation has no alias.
+        # Only the imaginary part counts: a fast decay without oscillation has no alias.
         swing, decay = np.imag(modes.eigenvalues), -np.real(modes.eigenvalues)
         if not np.any(swing >= _NEAR * nyquist):
             continue
         slopes = _relative_slopes(problem, here, [n for n in here if n not in flight.known], modes)
-        # A filter or a servo whose constants are given is simulated as it is, and has no alias.
+        # A filter or servo with known constants is simulated as it is and has no alias.
         past = swing >= _NEAR * nyquist
         past &= np.any([np.abs(s) > _MOVED for s in slopes.values()], axis=0)
         if not past.any():
@@ -353,8 +356,10 @@ def fast_modes(
 def _relative_slopes(
     problem: Problem, here: Mapping[str, float], names: Sequence[str], modes: Modes
 ) -> dict[str, np.ndarray]:
-    """Return by parameter the relative changes (n,), complex, of the eigenvalues for a relative
-    change of it: first-order perturbation of simple eigenvalues."""
+    """Return by parameter the relative sensitivities (n,), complex, of the eigenvalues to it.
+
+    First-order perturbation of simple eigenvalues.
+    """
     slopes = {}
     for name in names:
         value = here[name]

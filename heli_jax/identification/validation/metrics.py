@@ -11,58 +11,59 @@ from heli_jax.flights.resample import PASSED
 
 
 class Metrics(NamedTuple):
-    """Agreement of one output; NaN where a signal never moves."""
+    """Agreement of one output; NaN if a signal never moves."""
 
     vaf: float
-    """variance accounted for, 1 - var(residual)/var(measured)"""
+    """Variance accounted for, 1 - var(residual)/var(measured)."""
     nrmse_fit_percent: float
-    """100 (1 - |residual| / |measured - mean|)"""
+    """100 (1 - |residual| / |measured - mean|)."""
     rmse: float
-    """in the output's SI unit"""
+    """Rms error in the output's SI unit."""
     tic: float
-    """Theil inequality coefficient, 0 (equal) to 1"""
+    """Theil inequality coefficient, 0 (equal) to 1."""
     bias: float
-    """part of the mean squared error that a wrong mean makes (Theil's bias proportion)"""
+    """Share of the mean squared error from a wrong mean (Theil's bias proportion)."""
     variance: float
-    """part that a wrong size of the motion makes (his variance proportion)"""
+    """Share from a wrong size of the motion (Theil's variance proportion)."""
     covariance: float
-    """the rest: what does not move together; the three make 1"""
+    """Share from uncorrelated motion; the three shares sum to 1."""
 
 
 BAND99 = 2.5758293035489004
-"""half width of the 99 % band of a white residual's correlation, times sqrt(N): the 99.5 % point of
-the normal distribution"""
+"""Half width of the 99 % band of a white residual's correlation, times sqrt(N).
+
+It is the 99.5 % point of the normal distribution."""
 
 _HUGE = 1e100
 _MOSTLY_MISSING = 0.4
-"""part of the samples that are measured, below which a signal counts as a slower one"""
+"""Share of measured samples below which a signal counts as a slower one."""
 
 NO_METRICS = Metrics(*[float("nan")] * 7)
 
 
 FAR = 1e4
-"""error over variance of the signal, above which a simulation in gusts diverges"""
+"""Squared error over the signal's variance, above which a simulation in gusts diverges."""
 
 
 def diverges(m: Metrics, times: float = 10.0) -> bool:
-    """True if a simulation is not finite, or its error has several times the signal's variance."""
+    """True if a simulation is not finite, or its squared error is over `times` the variance."""
     return not np.isfinite(m.rmse) or m.vaf < 1.0 - times
 
 
 @np.errstate(over="ignore", invalid="ignore")
 def metrics(measured: np.ndarray, simulated: np.ndarray) -> Metrics:
-    """Agreement of two signals (N,) where something is measured (not NaN)."""
+    """Return the agreement of two signals (N,) over the measured samples (not NaN)."""
     seen = ~np.isnan(measured)
     measured, simulated = measured[seen], simulated[seen]
     residual = measured - simulated
     motion = np.linalg.norm(measured - measured.mean())
-    # The rounding of a constant is no motion.
+    # Rounding of a constant is no motion.
     motion = motion if motion > 1e-9 * np.linalg.norm(measured) else 0.0
     rms = np.sqrt(np.mean(measured**2)) + np.sqrt(np.mean(simulated**2))
     mse = float(np.mean(residual**2))
     rmse = mse**0.5
-    # Theil's decomposition: the mean squared error is the sum of the squared difference of the
-    # means, that of the standard deviations, and 2 (1 - r) times their product.
+    # Theil's decomposition of the mean squared error: squared difference of the means, squared
+    # difference of the standard deviations, and 2 (1 - r) times their product.
     bias = (measured.mean() - simulated.mean()) ** 2 / mse if mse > 0 else float("nan")
     variance = (measured.std() - simulated.std()) ** 2 / mse if mse > 0 else float("nan")
     return Metrics(
@@ -83,32 +84,32 @@ class Whiteness(NamedTuple):
 
     white: bool
     p_value: float
-    """of the Ljung-Box test over `lags` lags, for all signals that are tested together"""
+    """P-value of the Ljung-Box test over `lags` lags, for all signals that are tested together."""
     lags: int
     outside: float
-    """share of the lags outside the 99 % band"""
+    """Share of the lags outside the 99 % band."""
     lag1: float
-    """autocorrelation at one sample, or at the shortest lag of which enough pairs are seen"""
+    """Autocorrelation at one sample, or at the shortest lag with enough measured pairs."""
 
 
 def _padded(n: int, lags: int) -> int:
-    """Return the size of a transform of n samples without wrap-around up to so many lags."""
+    """Return the size of a transform of n samples without wrap-around up to `lags` lags."""
     return cast(int, scipy.fft.next_fast_len(n + lags, real=True))
 
 
 def autocorrelation(residual: np.ndarray, lags: int) -> np.ndarray:
-    """Autocorrelation (lags + 1,) from lag 0, by the biased estimate; NaN counts as the mean."""
+    """Return the biased autocorrelation (lags + 1,) from lag 0; NaN counts as the mean."""
     r = _centred(residual)
     n = r.size
     size = _padded(n, lags)
     spectrum = np.abs(np.fft.rfft(r, size)) ** 2
-    # Divided by n, not by the pairs at each lag: only so is the sequence positive semi-definite.
+    # Divide by n and not by the pairs at each lag, to keep the sequence positive semi-definite.
     c = np.fft.irfft(spectrum, size)[: lags + 1] / n
     return c / c[0] if c[0] > 0 else np.concatenate([[1.0], np.zeros(lags)])
 
 
 def cross_correlation(u: np.ndarray, residual: np.ndarray, lags: int) -> np.ndarray:
-    """Correlation (2 lags + 1,) of u(t - lag) with the residual, lags from -lags to lags.
+    """Return the correlation (2 lags + 1,) of u(t - lag) with the residual, from -lags to lags.
 
     Args:
         u: one signal (N,), any unit; NaN counts as its mean.
@@ -117,7 +118,7 @@ def cross_correlation(u: np.ndarray, residual: np.ndarray, lags: int) -> np.ndar
     a, b = _centred(u), _centred(residual)
     n = a.size
     size = _padded(n, lags)
-    # Gaps are at the mean and divided by n all the same: they draw the correlation towards zero.
+    # Gaps count as the mean and in n, which reduces the correlation.
     c = np.fft.irfft(np.conj(np.fft.rfft(a, size)) * np.fft.rfft(b, size), size) / n
     # The inverse transform keeps negative lags at its end.
     both = np.concatenate([c[-lags:], c[: lags + 1]])
@@ -129,50 +130,49 @@ def cross_correlation(u: np.ndarray, residual: np.ndarray, lags: int) -> np.ndar
 def _centred(signal: np.ndarray) -> np.ndarray:
     # A missing sample at the mean adds nothing to any sum of products.
     centred = np.where(np.isnan(signal), 0.0, signal - np.nanmean(signal))
-    # Correlations have no size; of a simulation that diverges the squares would overflow.
+    # Correlations are independent of scale; the squares of a diverged simulation would overflow.
     size = np.max(np.abs(centred), initial=0.0)
     return centred / size if _HUGE < size < np.inf else centred
 
 
 def sequence(signal: np.ndarray) -> np.ndarray:
-    """Return a signal (N,), or its measured samples in a row where most are missing.
+    """Return a signal (N,), or only its measured samples if most are missing.
 
-    The samples of a slow sensor on a fast grid have no lag with many pairs: lags are then counted
-    in its own samples.
+    A slow sensor on a fast grid has few pairs at any lag, so its lags count its own samples.
     """
     return signal[kept(signal)]
 
 
 def kept(signal: np.ndarray) -> np.ndarray:
-    """True (N,) for the samples that `sequence` keeps."""
+    """Return True (N,) for the samples that `sequence` keeps."""
     seen = ~np.isnan(signal)
     return seen if seen.mean() < _MOSTLY_MISSING else np.ones_like(seen)
 
 
 def lags_for(n: int) -> int:
-    """Number of lags for a record of n samples: a quarter of it, at most 500."""
-    # Beyond a quarter an autocorrelation is the mean of too few products (Box and Jenkins).
+    """Return the number of lags for a record of n samples: a quarter of n, at most 500."""
+    # Autocorrelations at longer lags average too few products (Box and Jenkins).
     return max(1, min(n // 4, 500))
 
 
 def whiteness(
     residual: np.ndarray, together: int = 1, fitted: np.ndarray | None = None
 ) -> Whiteness:
-    """The Ljung-Box test at 1 % on residuals (N,); NaN where nothing is measured.
+    """Test residuals for whiteness (Ljung-Box, 1 %).
 
     Args:
-        residual: (N,), any unit.
-        together: number of signals that are tested side by side, for the p value.
-        fitted: (N, k) of `seen_autocorrelation`.
+        residual: (N,), any unit; NaN where nothing is measured.
+        together: number of signals that are tested together, for the p-value.
+        fitted: (N, k), see `seen_autocorrelation`.
     """
     fitted = None if fitted is None else fitted[kept(residual)]
     residual = sequence(residual)
     n = int(np.count_nonzero(~np.isnan(residual)))
     _, r, pairs, whole = seen_autocorrelation(residual, fitted)
     lags = r.size
-    # Of the squared autocorrelation at a lag white noise expects one over the pairs seen there.
+    # The expected squared autocorrelation of white noise is one over the number of pairs.
     q = (n + 2) / max(n, 1) * np.cumsum(r**2 * pairs)
-    # A short autocorrelation is significant at few lags, and not at many: both are tested.
+    # A short autocorrelation is significant over few lags and not over many: test both.
     short = min(lags, 20)
     p_all, p_short = (_chance(q[k - 1], k, n) for k in (lags, short))
     # Two tests of each signal (Sidak, 1967).
@@ -182,39 +182,43 @@ def whiteness(
 
 
 _SPREAD = 2.2
-"""times lags over samples, part by which the variance of Ljung and Box's statistic is above twice
-the lags (4000 records of white noise each of 200 to 4000 samples)"""
+"""Relative excess variance of the Ljung-Box statistic over chi-squared, per lags over samples.
+
+Measured on 4000 records of white noise each of 200 to 4000 samples."""
 
 
 def _chance(statistic: float, lags: int, samples: int) -> float:
-    """Probability that white noise exceeds Ljung and Box's statistic.
+    """Return the probability that white noise exceeds the Ljung-Box statistic.
 
-    Its mean is the number of lags; its variance is above that of chi-squared where these are a
-    large part of the samples. A scaled chi-squared has both.
+    Its mean is the number of lags. Its variance exceeds that of chi-squared if lags are a large
+    share of the samples. A scaled chi-squared matches both.
     """
     wide = 1.0 + _SPREAD * lags / max(samples, 1)
     return float(scipy.special.chdtrc(lags / wide, statistic / wide))
 
 
 def band99(pairs: np.ndarray, whole: np.ndarray) -> np.ndarray:
-    """Band that holds 99 % of white noise's autocorrelations (lags,), as `seen_autocorrelation`
-    counts them times the part of the record that a lag leaves."""
+    """Return the 99 % band (lags,) of white noise for the biased autocorrelation.
+
+    Arguments are results of `seen_autocorrelation`.
+    """
     return BAND99 * np.sqrt(whole / pairs)
 
 
 def seen_autocorrelation(
     residual: np.ndarray, fitted: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Lags in samples, autocorrelation over the pairs of samples that are seen, the number of
-    these, and the part of the record that a lag leaves, each (lags,), at the shortest lags at which
-    enough are seen; at all of them where nothing is missing.
+    """Return the autocorrelation over the measured pairs of samples.
+
+    The results (lags,) are the lags in samples, the autocorrelation, the number of pairs, and the
+    share 1 - lag/N of the record. They hold the shortest lags with enough pairs.
 
     Args:
         residual: (N,), NaN where nothing is measured.
-        fitted: (N, k) rows of the orthonormal directions along which all unknowns moved the
-            signals. Least squares leaves nothing along them: white noise of variance s^2 ends with
-            the covariance s^2 (1 - U U'), whose autocovariance is taken off. Without it many free
-            initial states make the residuals of a right model look coloured.
+        fitted: (N, k) rows of the orthonormal directions U along which the unknowns move the
+            signals. Least squares leaves nothing along them: white noise of variance s^2 becomes a
+            residual of covariance s^2 (1 - U U'). Its autocovariance is corrected. Otherwise many
+            free initial states would make the residuals of a right model look coloured.
     """
     seen = ~np.isnan(residual)
     r = _centred(residual)
@@ -225,47 +229,46 @@ def seen_autocorrelation(
     def products(x: np.ndarray) -> np.ndarray:
         return np.fft.irfft(np.abs(np.fft.rfft(x, size)) ** 2, size)
 
-    # How many pairs are seen at each lag is the autocorrelation of the mask, whole numbers but for
-    # the rounding of the transform.
+    # The numbers of pairs are the autocorrelation of the mask, up to rounding of the transform.
     all_seen = n - np.arange(at[-1] + 1.0)
     pairs, c = all_seen if count == n else np.round(products(seen.astype(float))), products(r)
     if fitted is not None:
         taken = sum((products(u) for u in fitted.T), np.zeros_like(c))
         c = c + c[0] / max(count - taken[0], 1.0) * taken
-    # With every second sample missing no pair is an odd lag apart; a lag of few pairs is noise that
-    # the division by them would blow up.
+    # Leave out lags of few pairs, which are noise. With every second sample missing, odd lags have
+    # no pairs at all.
     at = at[pairs[at] >= min(0.1 * count, 0.75 * n)][: lags_for(count)]
     if at.size == 0 or not c[0] > 0:
         return np.ones(1, int), np.zeros(1), np.ones(1), np.ones(1)
     return at, c[at] / c[0] * count / pairs[at], pairs[at], 1.0 - at / n
 
 
-# Whiteness of what was low-passed on its way to a lower rate.
+# Whiteness of signals that were decimated.
 #
-# Where a flight has fewer samples a second than its log, a low-pass has taken away what the new
-# rate cannot hold, and with it the last fifth of its band: white noise of a sensor comes out with
-# an autocorrelation of +0.13 at one sample, which a long record tells from none. That is no
-# disturbance and no dynamics that a model lacks. Below that fifth the spectrum is as it was:
-# sampled as fast as this band needs and no faster, what is white there is white.
+# Decimation applies a low-pass that also removes the last fifth of the new band. A sensor's white
+# noise then has an autocorrelation of +0.13 at one sample, which is significant in a long record.
+# This is neither a disturbance nor a missing mode. The lower part of the band is unchanged, so
+# whiteness is tested at the lower rate that this part needs.
 
 
 _FEWER = 0.9
-"""times the flight's sample time, below which the log's is that of a faster clock"""
+"""Sample time of the log over the flight's, below which the log is faster."""
 _SEEN = 0.95
-"""part of the samples that a spectrum needs"""
+"""Least share of measured samples for a spectrum."""
 
 
 def is_decimated(flight: Flight, output: str) -> bool:
-    """True if an output was logged at a higher rate than the flight has."""
+    """True if an output was logged at a higher rate than the flight's."""
     facts = None if flight.source is None else flight.source.facts.get((output, "output"))
     return facts is not None and facts.usual < _FEWER * flight.dt
 
 
 def whiteness_in_band(innovations: np.ndarray, together: int) -> Whiteness:
-    """As `whiteness`, of the band that the low-pass of a lower rate passes, where all of it is not.
+    """Test for whiteness as `whiteness` does; if that fails, in the band that decimation passes.
 
     Args:
         innovations: (N,) over their standard deviations, NaN where nothing is measured.
+        together: number of signals that are tested together, for the p-value.
     """
     found, seen = whiteness(innovations, together), np.isfinite(innovations)
     if found.white or np.mean(seen) < _SEEN:

@@ -1,14 +1,14 @@
-r"""Does a residual follow a drive through some filter, beyond what the estimates could take up?
+r"""Score test of a residual against drives through a bank of filters.
 
-A mode that a model lacks leaves a residual that is a drive through a resonance, in a few lines of
-the record's spectrum: shares of the whole residual's power do not show it. So residual and
-sensitivities are whitened, and the residual is regressed on sensitivities and on the drive through
-each filter of a bank of second order: the gain of the likelihood in that direction is the score
-test for a model with such a mode. What the record's ends make of the filter's states takes part.
+A missing mode leaves a residual that is a drive through a resonance. It shows in a few lines of the
+spectrum, and hardly in the residual's total power. So residual and sensitivities are whitened, and
+the residual is regressed on the sensitivities and on the drive through each second-order filter of
+a bank. The gain in likelihood is the score test for a model with that mode. The regression includes
+the filter's initial and final states.
 
-The largest gain of the bank is compared with those of the same residual with phases drawn anew at
-each line. That keeps its spectrum, lines and humps of a disturbance too, and destroys nothing but
-what goes together with the drives, so that no shape of the noise has to be assumed.
+The largest gain is compared with those of surrogates: the same residual with random phases at each
+line. Surrogates keep the spectrum and lose only the correlation with the drives, so that the test
+assumes no shape of the noise.
 
 Sources: Ljung (1999), 16.6, for residuals against inputs; Rao (1948) for score tests; Theiler and
 others (1992) for surrogates; Gumbel (1958) for the distribution of maxima.
@@ -27,26 +27,26 @@ from jaxtyping import Complex, Float
 from heli_jax.identification.estimation.evaluation import directions
 
 ORDER = 10
-"""of the autoregression that whitens"""
+"""Order of the autoregression that whitens."""
 NARROW = ((0.03, 0.05), (0.1, 0.15), (0.3, 0.4), (1.0, 0.8))
-"""damping of the bank's filters, and the logarithm of the frequency from one to the next"""
+"""Damping of the bank's filters, and step of the logarithm of their frequency."""
 BROAD = NARROW[2:]
 _SURROGATES = 99
 _LINES = 16_000
-"""of all records together at most, the lowest of each"""
+"""Largest number of lines of all records together; the lowest of each are taken."""
 _LEAST = 20
-"""lines of a record below which it is not tested"""
+"""Fewest lines of a record that is tested."""
 _SAME = 1e-4
-"""part of a column beyond which it says something that those before it do not"""
+"""Least share of a column that is independent of the columns before it."""
 _AT_LEAST = 14.0
-"""gain below which no p value is computed: by one filter alone chance makes it in 1 of 1000"""
+"""Least gain for which a p-value is computed; one filter exceeds it by chance in 1 of 1000."""
 _ROUNDING = 1e-9
-"""part of a column below which nothing is left of it"""
+"""Share of a column below which the rest is rounding."""
 _MEDIAN = 0.6745
-"""of the size of a standard normal number"""
+"""Median size of a standard normal number."""
 _EULER = 0.5772156649015329
 _AT_ONCE = 8
-"""residuals that are multiplied with all columns together"""
+"""Number of residuals that are multiplied with all columns together."""
 
 
 class Lines(NamedTuple):
@@ -54,31 +54,32 @@ class Lines(NamedTuple):
 
     e: Complex[np.ndarray, " K"]
     J: Complex[np.ndarray, "K q"]
-    """sensitivities of e"""
+    """Sensitivities of e."""
     drives: Complex[np.ndarray, "K d"]
     angles: Float[np.ndarray, " K"]
-    """of the lines [rad a sample]"""
+    """Frequencies of the lines [rad/sample]."""
     size: float
-    """of the residual, whitened and before it was scaled to one"""
+    """Rms of the whitened residual before it was scaled to one."""
 
 
 class Drive(NamedTuple):
-    """Something known that a residual may follow."""
+    """Known signal that a residual may follow."""
 
     column: int
-    """of `Lines.drives`"""
+    """Column in `Lines.drives`."""
     kind: Literal["input", "amplitude", "flights", "time"]
-    """an input through a mode or a lag; what is not linear of the motion; a parameter that differs
-    between flights, or changes over the record"""
+    """An input through a mode or a lag; a nonlinear function of the motion; a parameter that
+    differs between flights, or changes over the record."""
     of: tuple[str, ...] = ()
-    """the input, or the flights"""
+    """The input, or the flights."""
     bank: tuple[tuple[float, float], ...] = ()
-    """damping of the filters that it is tried through, and the logarithm between their frequencies;
-    it is tried without any as well unless it is an input"""
+    """Damping of the filters, and step of the logarithm of their frequency.
+
+    Drives other than inputs are also tested without a filter."""
     beside: tuple[int, ...] = ()
-    """columns whose answer through the same filter is taken off first"""
+    """Columns whose response through the same filter is removed first."""
     unknown: int | None = None
-    """that changes"""
+    """The unknown that changes."""
 
 
 class Strongest(NamedTuple):
@@ -86,19 +87,19 @@ class Strongest(NamedTuple):
 
     drive: Drive
     statistic: float
-    """gain of twice the log-likelihood, by two numbers"""
+    """Gain of twice the log-likelihood, by two coefficients."""
     p_value: float
-    """that chance makes as much, by the best of all drives and filters"""
+    """Probability of this gain by chance, for the best of all drives and filters."""
     damping: float
-    """of the filter; infinite of none"""
+    """Damping of the filter; infinite without a filter."""
     frequency: float
-    """of the filter [rad a sample]"""
+    """Frequency of the filter [rad/sample]."""
     shift: Float[np.ndarray, " q"]
-    """by which the unknowns move where the filter is in the model"""
+    """Change of the unknowns if the model includes the filter."""
     step: Float[np.ndarray, " q"]
-    """of the unknowns to where the whitened residual is least without it"""
+    """Step of the unknowns to the smallest whitened residual without the filter."""
     amount: float
-    """of the drive that the residual asks for, counted as a step of an unknown is"""
+    """Estimated coefficient of the drive, in the units of a step of an unknown."""
 
 
 def lines_of(
@@ -108,33 +109,34 @@ def lines_of(
     holes: Sequence[int] = (),
     most: float = np.inf,
 ) -> Lines | None:
-    """Whitened by the residual's autoregression; None of records too short or without a residual.
+    """Return the spectra of a record's signals, whitened by the residual's autoregression.
+
+    None if the record is too short or has no residual.
 
     Args:
         holes: the samples before which others are missing.
-        most: robust sds of the whitened residual, at which it is bounded (Huber, 1981).
+        most: bound of the whitened residual [robust sds] (Huber, 1981).
     """
     n = e.size - ORDER
     if (n - 1) // 2 < max(_LEAST, 2 * J.shape[1]) or not np.std(e) > 0:
         return None
     h = whitening(e - e.mean(), holes)
-    # A signal a row: NumPy is quick along its last axis alone.
+    # One signal per row: NumPy is fast only along the last axis.
     rows = np.concatenate([e[None], J.T, drives.T])
     scales = np.sqrt(np.mean(rows**2, axis=1, keepdims=True))
     rows -= rows.mean(axis=1, keepdims=True)
-    # Differences with the filter's own order left out have no samples from before the record.
+    # "valid" omits the first samples, for which the filter would need some before the record.
     white = np.stack([np.convolve(c, h, "valid") for c in rows])
-    # What jumps because samples are missing is no answer: the filter's order after a hole is as if
-    # nothing had been measured.
+    # A jump across missing samples is no response: drop all samples that the filter mixes.
     white[:, across(holes, e.size)[ORDER:]] = 0.0
     if np.isfinite(most):
         most *= float(np.median(np.abs(white[0][white[0] != 0.0]))) / _MEDIAN
         white[0] = np.clip(white[0], -most, most)
     v = np.asarray(scipy.fft.rfft(white))[:, 1 : 1 + (n - 1) // 2] / np.sqrt(n)
-    # Of a bias rounding alone is left, which no step of it makes up for.
+    # A bias leaves only rounding here. Set it to zero, so that nothing is regressed on it.
     mean_squares = np.mean(np.real(v) ** 2 + np.imag(v) ** 2, axis=1, keepdims=True)
     v[(np.sqrt(mean_squares) <= _ROUNDING * scales)[:, 0]] = 0.0
-    # Of one size in all records: their noise differs.
+    # Scale each record to the same size, since noise differs between records.
     size = float(np.sqrt(mean_squares[0, 0]))
     v /= size
     q = J.shape[1]
@@ -143,7 +145,7 @@ def lines_of(
 
 
 def across(holes: Sequence[int], size: int) -> np.ndarray:
-    """The samples (size,) to which the filter of `whitening` brings samples from before a hole."""
+    """Return True (size,) for samples at which the `whitening` filter reaches across a hole."""
     after = np.zeros(size, bool)
     for first in holes:
         after[first : first + ORDER] = True
@@ -151,23 +153,22 @@ def across(holes: Sequence[int], size: int) -> np.ndarray:
 
 
 def whitening(e: np.ndarray, holes: Sequence[int] = ()) -> np.ndarray:
-    """The filter (ORDER + 1,) of an autoregression, by Yule and Walker.
+    """Return the whitening filter (ORDER + 1,) by the Yule-Walker equations.
 
     Args:
         e: the signal (N,), of mean zero.
         holes: the samples before which others are missing.
     """
-    # With zeros between no sample is compared with one beyond a hole.
+    # Zeros in a hole keep products of samples across it out of the sums.
     e = np.insert(e, np.repeat(np.asarray(holes, int), ORDER), 0.0)
     c = np.array([float(e[: e.size - k] @ e[k:]) for k in range(ORDER + 1)]) / e.size
-    # A little white noise, so that a residual without any has a filter too.
+    # A little white noise keeps the equations regular if the residual has none.
     c[0] *= 1.0 + 1e-9
     return np.concatenate([[1.0], -scipy.linalg.solve_toeplitz(c[:-1], c[1:])])
 
 
 def strongest(records: Sequence[Lines], drives: Sequence[Drive]) -> Strongest:
-    """The strongest answer of the residual of one output to any of the drives, and the probability
-    that chance makes one as strong."""
+    """Return the drive and filter that one output's residual follows most, with its p-value."""
     records = _lowest(records)
     e, J, X, angles = (
         np.concatenate(each)
@@ -187,8 +188,8 @@ def strongest(records: Sequence[Lines], drives: Sequence[Drive]) -> Strongest:
     if not gain > _AT_LEAST:
         nothing = np.zeros(J.shape[1])
         return Strongest(drive, gain, 1.0, damping, frequency, nothing, nothing, 0.0)
-    # The same phases for the same residual, whoever tests it. In single precision, half the work:
-    # what chance makes is known to a tenth of itself.
+    # A fixed seed gives the same phases each time. Single precision halves the work; the surrogate
+    # distribution is known to about 10 % anyway.
     turns = np.random.default_rng(0).random((e.size, _SURROGATES))
     turns = (2.0 * np.pi * turns).astype(np.float32)
     phases = np.cos(turns) + 1j * np.sin(turns)
@@ -204,31 +205,30 @@ def strongest(records: Sequence[Lines], drives: Sequence[Drive]) -> Strongest:
 
 
 class _Trial(NamedTuple):
-    """Filters, and the drives that are tried through them beside the same columns."""
+    """Filters, and the drives that are tested through them after removing the same columns."""
 
     response: Complex[np.ndarray, "f K"]
-    """of each filter at each line"""
+    """Frequency response of each filter."""
     filters: Float[np.ndarray, "f 2"]
-    """damping and frequency [rad a sample]; infinite damping is no filter"""
+    """Damping and frequency [rad/sample]; infinite damping is no filter."""
     drives: tuple[Drive, ...]
     columns: Complex[np.ndarray, "c2 K"]
-    """those beside first, then the drives, each by itself and one sample later"""
+    """Columns that are removed first, then the drives; each also one sample later."""
 
     @property
     def beside(self) -> int:
-        """The number of columns before those of the drives."""
+        """Number of columns before those of the drives."""
         return len(self.columns) - 2 * len(self.drives)
 
     def gains(
         self, known: Complex[np.ndarray, "q K"], residuals: Complex[np.ndarray, "r K"]
     ) -> Float[np.ndarray, "f d r"]:
-        """The part of each residual's squares that each drive explains beyond what is known.
+        """Return the power of each residual that each drive explains beyond the known columns.
 
-        All is had from products of columns, which are sums over lines of what the filters have in
-        common: no column is filtered.
+        All filters share the products of unfiltered columns, so that no column is filtered.
 
         Args:
-            known: orthonormal; the residuals have nothing of it.
+            known: orthonormal columns, to which the residuals are orthogonal.
         """
         f, d, b = len(self.response), len(self.drives), self.beside
         columns = self.columns
@@ -250,7 +250,7 @@ class _Trial(NamedTuple):
         return np.sum(answers * (over @ answers), axis=2)
 
     def _products(self, others: Complex[np.ndarray, "n K"]) -> Float[np.ndarray, "f c2 n"]:
-        """The products of the columns through each filter with others."""
+        """Return the products of the filtered columns with other signals."""
         response = _real(self.response.astype(others.dtype).T)
         columns = self.columns.astype(others.dtype)
         out = np.zeros((len(self.response), len(columns), len(others)), response.dtype)
@@ -267,12 +267,14 @@ def _trials(
     X: Complex[np.ndarray, "d K"],
     angles: Float[np.ndarray, " K"],
 ) -> Iterator[_Trial]:
-    """The drives by filter and by what stands beside them; the filters from two swings over the
-    longest record on."""
+    """Yield the drives, grouped by their filters and by the columns that are removed first.
+
+    The slowest filter has two periods in the longest record.
+    """
     low = 2.0 * min(float(record.angles[0]) for record in records)
     high = 0.9 * max(float(record.angles[-1]) for record in records)
     back = np.exp(-1j * angles)
-    # What the record's ends make of a filter's states has a column for each record.
+    # One column per record for the filter's states at the record's ends.
     ends = np.repeat(np.eye(len(records)), [r.e.size for r in records], axis=1).astype(complex)
     for (bank, plain, beside), group in itertools.groupby(
         drives, lambda d: (d.bank, d.kind != "input", d.beside)
@@ -285,7 +287,7 @@ def _trials(
             w = low
             while w < high:
                 filters.append((damping, w))
-                # No finer than lines lie.
+                # No finer than the lines.
                 w *= np.exp(max(step, 0.25 * low / w))
         yield _Trial(_responses(np.array(filters), back), np.array(filters), those, columns)
 
@@ -293,10 +295,10 @@ def _trials(
 def _responses(
     filters: Float[np.ndarray, "f 2"], back: Complex[np.ndarray, " K"]
 ) -> Complex[np.ndarray, "f K"]:
-    """The answer of each filter at each line, of one without a filter 1.
+    """Return the response of each filter at each line; 1 without a filter.
 
     Args:
-        back: what a delay of one sample multiplies a line by.
+        back: factor of a delay of one sample at each line.
     """
     damping, w = filters.T
     none = ~np.isfinite(damping)
@@ -307,7 +309,7 @@ def _responses(
 
 
 def _lowest(records: Sequence[Lines]) -> list[Lines]:
-    """The records without the lines that are too many, of each the highest."""
+    """Return the records without the highest lines beyond the limit on their number."""
     most = _LINES // len(records)
     return [
         Lines(r.e[:most], r.J[:most], r.drives[:most], r.angles[:most], r.size) for r in records
@@ -315,11 +317,12 @@ def _lowest(records: Sequence[Lines]) -> list[Lines]:
 
 
 def pulled_away(records: Sequence[Lines], k: int) -> float:
-    """The probability that chance makes the residual follow the sensitivities of the parameters as
-    it does. At estimates that the answer to the inputs bears out it does so by chance alone.
+    """Return the probability that the residual follows the parameters' sensitivities by chance.
+
+    At estimates that agree with the response to the inputs it follows them only by chance.
 
     Args:
-        records: those of one output; of their drives nothing is asked.
+        records: those of one output; their drives are not used.
     """
     e, J = (np.concatenate([record[i] for record in _lowest(records)]) for i in range(2))
     nuisances = directions(_real(J[:, k:]), _SAME) if J.shape[1] > k else np.zeros((2 * e.size, 0))
@@ -332,29 +335,35 @@ def pulled_away(records: Sequence[Lines], k: int) -> float:
     power, whole = np.abs(_complex(white)[:, 0]) ** 2, float(np.sum(white**2))
 
     def by_phases(columns: np.ndarray) -> float:
-        """The mean over phases drawn anew of the residual's squares in the columns' span."""
+        """Return the mean power of residuals with random phases in the columns' span."""
         return 0.5 * float(power @ np.sum(np.abs(_complex(columns)) ** 2, axis=1))
 
     left = whole - by_phases(nuisances)
     gain, by_chance = float(np.sum((basis.T @ white) ** 2)), by_phases(basis)
     if not (by_chance > 0 and left > 0):
         return 1.0
-    # With other phases a part of the residual is the nuisances', which a fit takes up.
+    # A fit removes the part of a surrogate that the nuisances explain.
     by_chance *= whole / left
     rank = basis.shape[1]
     return float(scipy.special.chdtrc(rank, rank * gain / by_chance))
 
 
 def step_to_least(records: Sequence[Lines]) -> Float[np.ndarray, " q"]:
-    """The step of the unknowns to where the whitened residual is least."""
+    """Return the step of the unknowns to the smallest whitened residual."""
     e = _real(np.concatenate([record.e for record in records])[:, None])
     J = _real(np.concatenate([record.J for record in records]))
     return _steps(J, np.zeros((len(J), 2)), e)[1]
 
 
 def _inverse(left: np.ndarray, whole: np.ndarray) -> np.ndarray:
-    """Inverse of what is left (..., n, n) of the columns' products, without directions in which
-    next to nothing is left; whole: products of the columns themselves."""
+    """Return the pseudoinverse of the remaining products (..., n, n) of columns.
+
+    Directions in which almost nothing remains are left out.
+
+    Args:
+        left: products of the remaining parts of the columns.
+        whole: products of the columns themselves.
+    """
     sizes = np.sqrt(np.maximum(np.einsum("...ii->...i", whole), 1e-300))
     values, V = np.linalg.eigh(left / (sizes[..., :, None] * sizes[..., None, :]))
     kept = values > _SAME**2
@@ -364,8 +373,7 @@ def _inverse(left: np.ndarray, whole: np.ndarray) -> np.ndarray:
 
 
 def _by_chance(gain: float, others: Float[np.ndarray, " r"]) -> float:
-    """The probability that a gain is one of the others, which are maxima of about exponential
-    numbers."""
+    """Return the probability of a gain this large, from a Gumbel fit to the surrogates' maxima."""
     scale = float(np.std(others)) * np.sqrt(6.0) / np.pi
     if not scale > 0:
         return 1.0
@@ -376,8 +384,11 @@ def _by_chance(gain: float, others: Float[np.ndarray, " r"]) -> float:
 def _steps(
     J: Float[np.ndarray, "K2 q"], more: Float[np.ndarray, "K2 c"], e: Float[np.ndarray, "K2 1"]
 ) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"], float]:
-    """The step of the unknowns beside further columns less that without, that without, and the sum
-    of the steps along the last two columns: a drive and the drive one sample later."""
+    """Return the effect of further columns on the unknowns' step, the step, and a drive's amount.
+
+    The first is the step with the columns less that without; the second is the step without. The
+    amount is the sum of the last two coefficients: a drive, and the drive one sample later.
+    """
     columns = np.concatenate([J, more], axis=1)
     sizes = np.linalg.norm(columns, axis=0)
     columns = columns / np.where(sizes > 0, sizes, 1.0)
@@ -399,7 +410,7 @@ def _complex(v: Float[np.ndarray, "K2 c"]) -> Complex[np.ndarray, "K c"]:
 
 
 def _without(basis: np.ndarray, v: np.ndarray) -> np.ndarray:
-    # Twice: the first time leaves rounding of columns that nearly lie in the basis.
+    # Project twice: one pass leaves rounding of columns that nearly lie in the basis.
     for _ in range(2):
         v = v - basis @ (basis.T @ v)
     return v

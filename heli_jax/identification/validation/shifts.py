@@ -1,11 +1,11 @@
-"""Signals that act at another time than their log has them.
+"""Time shifts of signals: inputs and outputs that act at another time than the log has them.
 
-The likelihood of a fitted model with a signal at another time is computed where the unknowns follow
-to first order (a score test, Rao, 1948). An input or an output is moved by whole samples, an input
-also within a sample by the slope of the residual; the other hold of an input moves it by half a
-sample. Every candidate has the same statistic and the same limit. An input that follows the
-response knows the errors of later samples, but takes them back: used too early it predicts them
-with the wrong sign, so that the test holds in a closed loop too.
+The likelihood of a fitted model is computed with a signal shifted in time. The unknowns follow to
+first order (a score test, Rao, 1948). Inputs and outputs are shifted by whole samples; the slope of
+the residual gives an input's shift within a sample. The other hold shifts an input by half a
+sample. All candidates have the same statistic and limit. The test is also valid in a closed loop:
+an input that follows the response counteracts its errors, so an input shifted too early predicts
+them with the wrong sign.
 """
 
 from collections.abc import Collection
@@ -33,39 +33,41 @@ from heli_jax.identification.unknowns.layout import Data, Solution
 @dataclass(frozen=True)
 class _ShiftLimits:
     clear: float = 25.0
-    """gain of twice the log-likelihood, from which on a shift is significant: 5 sd"""
+    """Gain of twice the log-likelihood from which on a shift is significant: 5 sd."""
     farthest: float = 0.5
-    """[s] largest shift"""
+    """Largest shift [s]."""
     block: float = 1.0
-    """[s] over which rows may be correlated"""
+    """Longest time over which rows may be correlated [s]."""
 
 
 SHIFT = _ShiftLimits()
 
 
 class Shift(NamedTuple):
-    """Signals at another time."""
+    """Time shift of signals."""
 
     kind: str
-    """input, output: logged late; response: to an input, later than in the model; hold: inputs are
-    held that were taken as linear"""
+    """input, output: logged late; response: to an input, later than in the model; hold: inputs that
+    were taken as linear are held."""
     names: tuple[str, ...]
     seconds: float
-    """by which the first of them is late"""
+    """Delay of the first signal [s]."""
     gain: float
-    """of twice the log-likelihood"""
+    """Gain of twice the log-likelihood."""
     moved: dict[str, float]
-    """by parameter how far the right time would move its estimate [SI]"""
+    """Change of each parameter's estimate at the right time [SI]."""
 
 
 def shift_in_time(
     problem: Problem, at: Solution, e: Evaluation, outputs: Collection[str]
 ) -> Shift | None:
-    """Return the inputs, or the output, that the record places at another time; None if no shift is
-    clear, if inputs are shifted or delayed by an unknown, or if rows are no samples in time.
+    """Return the inputs, or the output, that fit better at another time.
+
+    None if no shift is significant, if a delay or time shift is estimated, or if the fit is not in
+    time.
 
     Args:
-        outputs: those that are moved too.
+        outputs: outputs that are tested too.
     """
     layout = at.layout
     in_time = not (is_kinematic(layout.model) or layout.shift or layout.noise_model == "spectrum")
@@ -73,7 +75,7 @@ def shift_in_time(
         return None
     inputs = naming.names(problem.model.Inputs)
     moving = [n for n in inputs if any(np.ptp(f.inputs[n]) > 0 for f in problem.training)]
-    # To first order in the sample time a held input is a linear one that is late by half a sample.
+    # To first order in the sample time, a held input is a linear one delayed by half a sample.
     guessed = [n for n in moving if all(_linear_by_guess(f, n) for f in problem.training)]
     signals = [*(("input", n) for n in moving), *(("output", n) for n in outputs)]
     found = {one: _best_place(at, e, *one) for one in [*signals, *(("hold", n) for n in guessed)]}
@@ -94,19 +96,21 @@ def shift_in_time(
 
 
 def _linear_by_guess(flight: Flight, name: str) -> bool:
-    """True if an input is taken as linear by a guess, and was not low-passed."""
+    """True if an input is only assumed to be linear, and was not low-passed."""
     linear = flight.hold[name] == "linear" and name in flight.hold_reason
     return linear and not is_low_passed(flight, name)
 
 
 def _best_place(at: Solution, e: Evaluation, kind: str, name: str) -> tuple[float, float]:
-    """Return by how many samples a signal has to come later to fit best (below zero: earlier), and
-    what twice the log-likelihood gains there."""
+    """Return the best delay of a signal [samples] and its gain of twice the log-likelihood.
+
+    A negative delay shifts the signal to earlier times.
+    """
     dt = float(at.data.flights[0].dt)
     left, gains = {0.0: _beside(e.J, e.r)}, {0.0: 0.0}
 
     def gained(k: float) -> float:
-        """Return the gain where the unknowns follow, and rows are as white as these."""
+        """Return the gain if the unknowns follow, for rows as white as the present ones."""
         if k not in gains:
             rows, J = _rows(at, _moved(at.data, kind, name, k * dt))
             gains[k] = -np.inf
@@ -118,9 +122,10 @@ def _best_place(at: Solution, e: Evaluation, kind: str, name: str) -> tuple[floa
     if kind == "hold":
         return 0.5, gained(0.5)
     farthest = max(1, round(SHIFT.farthest / dt))
-    # Innovations forget within a few samples: between now and the right time none need be likelier.
+    # Innovations are correlated over a few samples only, so the gain may stay flat until close to
+    # the right delay: start from several delays.
     begun = [2**k for k in range(farthest.bit_length())] if e.innovations else [1]
-    # No output is logged before it was measured.
+    # An output cannot be logged before it was measured.
     later = begun if kind == "input" else []
     place = max((0, *later, *(-k for k in begun)), key=gained)
     for step in (1, -1):
@@ -128,7 +133,7 @@ def _best_place(at: Solution, e: Evaluation, kind: str, name: str) -> tuple[floa
             place += step
     if kind == "output" or place > 0 or not {place - 1, place + 1} <= left.keys():
         return float(place), gains[place]
-    # A logger stamps a step at the sample after it: within a sample the slope tells by how much.
+    # A logger stamps a step at the next sample: the slope estimates the shift within a sample.
     slope, rest = 0.5 * (left[place + 1] - left[place - 1]), left[place]
     part = float(slope @ rest) / max(float(slope @ slope), 1e-300)
     gain = part**2 * float(slope @ slope) / _correlated(_block(dt), slope, rest)
@@ -144,30 +149,30 @@ def _rows(at: Solution, data: Data) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _beside(J: np.ndarray, v: np.ndarray) -> Float[np.ndarray, " n"]:
-    """Return the part of v (n,) that no step of the unknowns, of slopes J (n, q), takes up."""
+    """Return the part of v (n,) that no step of the unknowns, of slopes J (n, q), explains."""
     Q = directions(J)
     return v - Q @ (Q.T @ v)
 
 
 def _block(dt: float) -> int:
-    """Return the samples over which rows may be correlated."""
+    """Return the number of samples over which rows may be correlated."""
     return max(1, round(SHIFT.block / dt))
 
 
 def _gain(block: int, before: np.ndarray, after: np.ndarray) -> float:
-    """Return the gain of twice the log-likelihood between two residuals (n,), below zero a loss."""
-    # A sample that moves out of the record takes its square along, 1 on average; its row is zero.
+    """Return the gain of twice the log-likelihood between two residuals (n,)."""
+    # A sample that leaves the record has a zero row: this removes a square of 1 on average.
     lost = np.count_nonzero(before) - np.count_nonzero(after)
     gain = float(before @ before - after @ after) - lost
     return gain / _correlated(block, after - before, before) if gain > 0 else gain
 
 
 def _correlated(block: int, left: np.ndarray, r: np.ndarray) -> float:
-    """Return how many times the variance with white rows the sum of left times r has; 1 at least.
+    """Return the variance of the sum of left * r over that for white rows; at least 1.
 
     Args:
         block: rows that may be correlated.
-        left: (n,) what the rows are regressed on.
+        left: (n,) regressor of the rows.
         r: (n,) the rows.
     """
     power = max(float(left @ left), 1e-300)
@@ -177,8 +182,8 @@ def _correlated(block: int, left: np.ndarray, r: np.ndarray) -> float:
 
 
 def _change(at: Solution, e: Evaluation, r: np.ndarray, J: np.ndarray) -> dict[str, float]:
-    """Return by parameter how far rows r (n,) of slopes J (n, q) move its estimate [SI]."""
-    # From an optimum: the next step of Gauss and Newton, less that which the optimiser left.
+    """Return by parameter the change of its estimate for rows r (n,) of slopes J (n, q) [SI]."""
+    # One Gauss-Newton step from the optimum, less the step that the optimiser left.
     step = pseudoinverse(e.J) @ e.r - pseudoinverse(J) @ r
     change = step[: len(e.slopes)] * np.asarray(e.slopes)
     return {
@@ -189,16 +194,16 @@ def _change(at: Solution, e: Evaluation, r: np.ndarray, J: np.ndarray) -> dict[s
 
 
 def _moved(data: Data, kind: str, name: str, seconds: float) -> Data:
-    """Return an input or an output later by so much; an input between samples by its mean."""
+    """Return the data with an input or output delayed; inputs are interpolated, outputs rounded."""
     flights = []
     for flight in data.flights:
         inputs, outputs = naming.asdict(flight.inputs), dict(flight.outputs)
         of = outputs if kind == "output" else inputs
         if name in of:
-            # By NumPy: each step of it would be a program of JAX's to load.
+            # NumPy avoids loading a JAX program for each step.
             v = np.asarray(of[name])
             at = np.clip(np.arange(v.size) - seconds / float(flight.dt), 0, v.size - 1)
-            # A missing sample has no mean with another.
+            # Round for outputs, since a missing sample cannot be interpolated.
             whole = kind == "output"
             line = v[np.rint(at).astype(int)] if whole else np.interp(at, np.arange(v.size), v)
             of[name] = jax.device_put(line.astype(v.dtype))

@@ -1,8 +1,9 @@
 """Signs and units of signals: three tests that need no fit.
 
-An angle is the integral of its rate. Simulated outputs move with the measured ones if the start
-values have the right signs. The size of an angle or a rate suits radians or degrees: where all
-outputs are in degrees, they fit as well, with every estimate off by 57.
+- An angle must be the integral of its rate.
+- Outputs simulated at the start values must move with the measured ones, not against them.
+- The size of an angle or a rate must suit its unit. A record with all outputs in degrees fits as
+  well as one in radians, with every estimate off by 57.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,42 +21,40 @@ from heli_jax.vehicle import of_helicopter
 
 
 _PAIRS = (("p", "phi"), ("q", "theta"), ("r", "psi"), ("r", "yaw"), ("p", "roll"), ("q", "pitch"))
-"""rate and angle by the names that outputs have here, beside those of the model's axes"""
+"""Usual names of rates and their angles, in addition to the model's axes."""
 WITHIN = 0.5
-"""[s] over which an angle and the integral of its rate are compared"""
+"""Interval over which changes of an angle and its integrated rate are compared [s]."""
 PARTS = 10
-"""so many of these parts of a record at least"""
+"""Number of parts for the jackknife, and shortest record in these intervals."""
 _ALIKE = 0.8
-"""correlation of the two from which on their sizes are compared"""
+"""Correlation of the two from which on their sizes are compared."""
 _QUANTILE = 2.26
-"""of Student's t with as many degrees of freedom as parts but one, for 95 %"""
+"""Quantile of Student's t for 95 %, with PARTS - 1 degrees of freedom."""
 _GAP = 0.3
-"""[s] without a sample, over which nothing is put between"""
+"""Longest gap that is bridged [s]."""
 
 
 class AngleOverRate(NamedTuple):
-    """The change of an angle over that of its integrated rate.
+    """Change of an angle over that of its integrated rate.
 
-    Where both are noisy, the regressions of the one on the other and of the other on the one
-    enclose the factor (Frisch, 1934): it lies between `factor` times and over `|correlation|`.
+    With noise on both, the two regressions of one on the other enclose the factor (Frisch, 1934):
+    it lies between `factor * |correlation|` and `factor / |correlation|`.
     """
 
     factor: float
-    """negative where they go against one another"""
+    """Ratio of the changes; negative if they have opposite signs."""
     correlation: float
     scale: tuple[float, float]
-    """95 % interval of the rate's size over that of the angle's rate of change, noise of either
-    allowed for"""
+    """95 % interval of the rate over the angle's rate of change, with noise on both."""
 
     def off(self, by: float) -> bool:
-        """True if the size is off by a factor of `by` or more, whatever the noise."""
+        """True if the factor is wrong by `by` or more for any noise."""
         size, alike = abs(self.factor), abs(self.correlation)
         return size * alike > by or size / alike < 1.0 / by
 
 
 def rates_and_angles(model: Model) -> list[tuple[str, str]]:
-    """The outputs that are a rate and its angle, by the model's axes and by the names that they
-    have here."""
+    """Return the pairs of a rate and its angle, by the model's axes and by their usual names."""
     axes = [(a.rate, a.angle) for a in axes_of(model) if a.angle is not None]
     return list(dict.fromkeys([*axes, *_PAIRS]))
 
@@ -63,16 +62,19 @@ def rates_and_angles(model: Model) -> list[tuple[str, str]]:
 def angle_over_rate(
     angle: Float[np.ndarray, " N"], rate: Float[np.ndarray, " N"], dt: float
 ) -> AngleOverRate | None:
-    """Compare the motion of an angle [rad] with the integral of its rate [rad/s], both NaN where
-    missing; None if a gap is long, the record is short, or the two have little in common."""
+    """Compare the motion of an angle [rad] with the integral of its rate [rad/s].
+
+    Both are NaN where missing. None if a gap is long, the record is short, or the two are hardly
+    correlated.
+    """
     steps = max(1, round(WITHIN / dt))
     if min(np.isfinite(v).sum() for v in (angle, rate)) < 2 or angle.size < (PARTS + 1) * steps:
         return None
     (phi, known), (p, known_too) = (over_gaps(v, dt) for v in (angle, rate))
     if not (known & known_too).all():
         return None
-    # Headings jump by a turn where they pass south. Changes over half a second: a bias of the rate
-    # is in their mean alone, and noise of the angle is not divided by a sample time.
+    # Unwrap, since headings jump by a turn at south. Compare changes over half a second: a bias of
+    # the rate is then only in their mean, and noise of the angle is not divided by a sample time.
     both = [v[steps:] - v[:-steps] for v in (np.unwrap(phi), integral(p, dt))]
     both = [v - v.mean() for v in both]
     sds = [float(np.std(v)) for v in both]
@@ -85,26 +87,27 @@ def angle_over_rate(
 
 
 def _log_sd(first: np.ndarray, second: np.ndarray) -> float:
-    """Standard deviation of the logarithm of the ratio of two records' sizes (N,), by leaving out
-    one part after the other (the jackknife)."""
+    """Return the sd of the logarithm of the ratio of two records' (N,) sizes, by the jackknife."""
     squares = [[float(part @ part) for part in np.array_split(x, PARTS)] for x in (first, second)]
     left = [sum(of) - np.asarray(of) for of in squares]
     return float(np.sqrt((PARTS - 1) * np.var(0.5 * np.log(left[0] / left[1]))))
 
 
 def integral(rate: Float[np.ndarray, " N"], dt: float) -> Float[np.ndarray, " N"]:
-    """Integral of a signal without gaps, in straight lines between samples of dt [s], from zero."""
+    """Return the trapezoidal integral of a signal without gaps, from zero; dt in [s]."""
     return np.concatenate([np.zeros(1), np.cumsum(0.5 * dt * (rate[1:] + rate[:-1]))])
 
 
 def over_gaps(signal: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """A signal (N,), NaN where missing, with straight lines over its gaps, and which samples (N,)
-    are in no long one; two samples or more have to be known."""
+    """Return a signal (N,) with straight lines over its gaps, and True (N,) outside long gaps.
+
+    Missing samples are NaN; at least two must be known.
+    """
     seen = np.flatnonzero(np.isfinite(signal))
     rows = np.arange(signal.size)
     ends = np.r_[0, seen, signal.size - 1]
     after = np.searchsorted(ends, rows, side="left")
-    # Of the samples before and behind a row, or of the ends of the record.
+    # Distance between the samples before and after a row, or to the record's ends.
     gap = ends[np.minimum(after, ends.size - 1)] - ends[np.maximum(after - 1, 0)]
     known = np.isfinite(signal) | (gap * dt <= _GAP)
     return np.interp(rows, seen, signal[seen]), known
@@ -114,23 +117,24 @@ def over_gaps(signal: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 AGAINST = -0.3
-"""correlation below which a simulated output moves against the measured one"""
+"""Correlation below which a simulated output moves against the measured one."""
 _SURE = 3.0
-"""times what chance makes of it"""
+"""Least correlation in standard deviations of that by chance."""
 _LAG = 0.25
-"""[s] to either side: at longer lags an oscillation of the right sign looks inverted"""
+"""Longest lag to either side [s]; at longer lags an oscillation may look inverted."""
 _LARGER = 1.3
-"""by how much the correlation of the wrong sign exceeds any of the right one"""
+"""Least ratio of the correlation with the wrong sign to any with the right one."""
 
 
 def against_start(
     flights: Sequence[Flight], simulated: Sequence[Mapping[str, np.ndarray]]
 ) -> dict[str, float]:
-    """Return by output the correlation over all flights with the simulation at the start values,
-    where it surely is negative.
+    """Return the outputs that correlate negatively with the simulation at the start values.
+
+    The result is the correlation over all flights by output, if it is significantly negative.
 
     Args:
-        simulated: by flight and output (N,), SI.
+        simulated: by flight and output (N,) [SI].
     """
     against = {}
     for name in dict.fromkeys(n for f in flights for n in f.outputs):
@@ -139,7 +143,7 @@ def against_start(
             for f, run in zip(flights, simulated, strict=True)
             if name in f.outputs
         ]
-        # Each flight about its mean: flights have biases of their own.
+        # Remove each flight's mean, since flights have their own biases.
         measured, model = (
             np.concatenate([v - np.nanmean(v) for v in of]) for of in zip(*both, strict=True)
         )
@@ -150,15 +154,15 @@ def against_start(
 
 
 def _surely(measured: np.ndarray, simulated: np.ndarray, dt: float) -> float | None:
-    """Return the most negative correlation, or else the largest, where it is sure."""
+    """Return the most negative correlation, or else the largest; None if not significant."""
     seen = np.isfinite(measured)
     if not np.max(np.abs(simulated)) < 1e100 or np.std(simulated) == 0 or seen.mean() < 0.5:
         return None
     lags = max(1, min(round(_LAG / dt), measured.size // 4))
-    # Missing samples add nothing to the products and all of the simulation to their scale.
+    # Missing samples add nothing to the products, but the scale counts all of the simulation.
     c = cross_correlation(simulated, measured, lags) / np.sqrt(seen.mean())
     worst, best = float(np.min(c)), float(np.max(c))
-    # Of two independent signals, by their autocorrelations (Bartlett, 1935).
+    # Standard deviation for independent signals, from their autocorrelations (Bartlett, 1935).
     most = max(1, measured.size // 5)
     window = 1.0 - np.arange(most + 1) / (most + 1)
     both = window * autocorrelation(measured, most) * autocorrelation(simulated, most)
@@ -173,34 +177,36 @@ def _surely(measured: np.ndarray, simulated: np.ndarray, dt: float) -> float | N
 
 
 _ATTITUDE = {"p", "q", "r", "phi", "theta", "psi", "roll", "pitch", "yaw"}
-"""what the outputs of models without axes (kinematics) and of files are called then"""
+"""Usual names of attitudes and rates, for models without axes (kinematics) and for files."""
 _LARGEST, _LINEAR = {"rad": np.pi, "rad/s": 20.0}, {"rad": np.pi / 2, "rad/s": 8.0}
-"""what a small helicopter does not exceed, but for its heading, and up to what a linear model may
-mean something"""
+"""Largest values of a small helicopter (without heading), and largest values for a linear model."""
 _HEADING_TURNS = 20.0
-"""turns in one sense, of a heading without jumps"""
+"""Largest heading without jumps [turns]."""
 _FLOWN_TURNS = 5.0
-"""turns that rolls and loops may add up to in an angle without jumps"""
+"""Largest angle without jumps from rolls and loops [turns]."""
 _MOST = 99.0
-"""percentile of the size that is held against them: no single spike counts"""
+"""Percentile of the size that is compared with these limits, so that no single spike counts."""
 _FLOWN = 0.3
-"""by which an angle's changes may differ from those of its integrated rate where it was flown"""
+"""Largest difference from 1 of an angle over its integrated rate, for an angle that was flown."""
 
 
 def oversized(model: Model, flight: Flight) -> Iterator[tuple[str, float, float, bool, bool]]:
-    """Yield the angles and rates of a log that are too large for the unit that they are read in:
-    name, size and limit [SI], whether an angle is what its rate adds up to (it was flown, or both
-    are in degrees), and whether another unit is certain."""
+    """Yield the angles and rates of a log that are too large for their unit.
+
+    Each item is the name, the size and its limit [SI], and two flags. The first is True if an angle
+    is the integral of its rate: it was flown, or both are in degrees. The second is True if another
+    unit is certain.
+    """
     headings = {a.angle for a in axes_of(model) if a.rate == "r"} | {"psi", "yaw"}
     for name, signal in (flight.source.outputs if flight.source else {}).items():
         values = flight.outputs.get(name)
         if values is None or signal.unit not in ("rad", "rad/s") or signal.scale != 1.0:
             continue
         seen = np.abs(values[np.isfinite(values)])
-        # What the file says of it makes sure what its size alone does not.
+        # The unit in the file is certain evidence; the size alone is not.
         said = signal.contradicted == ("deg" if signal.unit == "rad" else "deg/s")
-        # The shaft of a motor turns as often as it likes, and a rotor faster than any fuselage; so
-        # may the angle of a nonlinear model of one's own, such as a pendulum.
+        # A motor's shaft makes any number of turns, and a rotor turns faster than any fuselage. So
+        # may the angle of a user's nonlinear model, such as a pendulum.
         free = signal.unit == "rad" and not (model.linear or of_helicopter(model.Params))
         if not seen.size or not ((_of_fuselage(model, name) and not free) or said):
             continue
@@ -215,14 +221,16 @@ def oversized(model: Model, flight: Flight) -> Iterator[tuple[str, float, float,
 
 
 def _of_fuselage(model: Model, name: str) -> bool:
-    """True if an output is an attitude or a rate of the vehicle, and no other angle of it."""
+    """True if an output is an attitude or a rate of the fuselage, and no other angle."""
     of_axes = {n for a in axes_of(model) for n in (a.rate, a.angle)}
     return name in of_axes | _ATTITUDE or of_helicopter(model.Params)
 
 
 def _flown(model: Model, flight: Flight, name: str, size: float) -> bool:
-    """True if an angle of some turns is what its rate, of a size that a helicopter has, adds up to:
-    so it is in aerobatics, and where both are in degrees."""
+    """True if an angle of several turns is the integral of a rate that a helicopter can reach.
+
+    This holds in aerobatics, and if both are in degrees.
+    """
     rate = next((a.rate for a in axes_of(model) if a.angle == name), None)
     p = flight.outputs.get(rate or "")
     if p is None or not np.nanmax(np.abs(p), initial=0.0) <= _LARGEST["rad/s"]:

@@ -1,14 +1,14 @@
 """Unmodelled dynamics in the residuals: a mode, a response that depends on amplitude, or one that
 changes over the record.
 
-Of every output the residual in time is tested against the inputs through a bank of filters, beyond
-what the sensitivities explain (`score_test`): the simulation and its residual are there by any
-method. Then against powers of inputs, of the simulated output, its rate and its integral, and the
-sign of the first two, beyond what the input through the same filter explains: a saturation, a rate
-limit, a deadband, friction, a spring that is not linear and a vehicle that is not alike to both
-sides do not answer in proportion. Then against the sensitivities times the time, and of single
-flights: a rotor that slows down, a mass that changes and a stick of another scale leave what no
-constant takes up.
+Each output's residual in time is regressed on the sensitivities and on candidate drives
+(`score_test`). This needs only a simulation, so it works for every estimation method. The drives:
+
+- the inputs through a bank of filters, for a missing mode or lag;
+- nonlinear functions of the inputs and of the simulated output, beyond the input through the same
+  filter. They detect saturation, rate limits, deadbands, friction, nonlinear springs and asymmetry;
+- the sensitivities times time, and those of single flights. They detect a rotor that slows down, a
+  mass that changes, or a stick of another scale.
 """
 
 from collections.abc import Mapping, Sequence
@@ -43,47 +43,45 @@ from heli_jax.identification.validation.score_test import (
     strongest,
 )
 
-# An output that is slower than the grid at its own samples, for what needs a row of them.
+# Slow outputs are tested at their own samples.
 
 
 _REGULAR = 0.98
-"""part of the steps between samples that are of one length, from which on they are a clock's"""
+"""Least share of sample intervals with the usual length, for a regular clock."""
 _MOST = 50
-"""grid steps between two samples at most"""
+"""Longest sample interval [grid steps]."""
 _JITTERS = 5
-"""grid steps between two samples from which on a clock falls on the grid one sooner or later"""
+"""Shortest sample interval at which rounding to the grid may add or drop one step [grid steps]."""
 
 
 class OwnSamples(NamedTuple):
-    """The places on the grid of an output that was sampled at even times."""
+    """Grid rows of an output that was sampled at a regular rate."""
 
     rows: np.ndarray
-    """(M,) their numbers"""
+    """Row numbers (M,)."""
     every: int
-    """grid steps from one to the next"""
+    """Sample interval [grid steps]."""
 
     @property
     def holes(self) -> tuple[int, ...]:
-        """Places in `rows` before which a sample is missing: a slow residual jumps there, and so
-        does an input."""
+        """Places in `rows` before which a sample is missing; slow signals jump there."""
         apart = np.diff(self.rows)
         return tuple((np.flatnonzero(apart > self.every + (self.every >= _JITTERS)) + 1).tolist())
 
     def of_input(self, u: Float[np.ndarray, " N"]) -> Float[np.ndarray, " M"]:
-        """An input's mean from one sample to the next, so that nothing between them is lost; the
-        first from where the flight begins.
+        """Return an input's mean over each sample interval; the first starts with the flight.
 
         Args:
             u: the input (N,), any unit.
         """
         summed = np.concatenate([[0.0], np.cumsum(u)])
-        # An input acts from its own sample on: that at the output's sample moves the next one.
+        # The input at an output's sample acts after that sample, and so moves the next one.
         first = np.maximum(self.rows + 1 - self.every, 0)
         return (summed[self.rows + 1] - summed[first]) / (self.rows + 1 - first)
 
 
 def own_samples(seen: Bool[np.ndarray, " N"]) -> OwnSamples | None:
-    """The places of an output's samples; None if too many of its own samples are missing."""
+    """Return the rows of an output's samples; None if too many samples are missing."""
     rows = np.flatnonzero(seen)
     if rows.size == seen.size:
         return OwnSamples(rows, 1)
@@ -91,30 +89,31 @@ def own_samples(seen: Bool[np.ndarray, " N"]) -> OwnSamples | None:
         return None
     steps = np.diff(rows)
     usual = int(np.median(steps))
-    # A clock that is no multiple of the grid's falls on its rows one sooner or later.
+    # The interval may be no multiple of the grid step: rounding then adds or drops one step.
     near = np.abs(steps - usual) <= (0 if usual < _JITTERS else 1)
     if usual > _MOST or np.mean(near) < _REGULAR:
         return None
     return OwnSamples(rows, usual)
 
 
-# What a simulation leaves of each output, which can be asked, and how the unknowns move it.
+# Residuals that can be tested, and their sensitivities.
 
 
 _FLIGHTS = 6
-"""that are looked at, the longest"""
+"""Largest number of flights that are tested; the longest are taken."""
 _DIVERGED = -10.0
-"""VAF of a simulation below which its residual says nothing"""
+"""VAF below which a simulation has diverged."""
 _ROUNDING = 1e-5
-"""part of an output's sd below which its residual is no noise"""
+"""Share of an output's sd below which its residual is rounding."""
 _STEP = 1e-4
-"""of an unknown's coordinate, for differences"""
+"""Step of an unknown's coordinate for finite differences."""
 
 
 def of_one_clock(at: Solution, e: Evaluation, name: str) -> list[tuple[int, OwnSamples]]:
-    """The flights whose residual of an output can be asked, and where it was sampled in each: it
-    moves, and a simulation follows it. The longest flights, of one sample time and one clock of the
-    output, since filters are of samples.
+    """Return the flights in which an output's residual can be tested, with the output's samples.
+
+    The output moves and the simulation follows it. Of these flights the longest are taken. All
+    share one sample time and one clock of the output, since filters count samples.
     """
     flights, asked = at.data.flights, list[tuple[int, OwnSamples]]()
     sizes = [next(iter(f.outputs.values())).shape[0] for f in flights]
@@ -133,7 +132,7 @@ def of_one_clock(at: Solution, e: Evaluation, name: str) -> list[tuple[int, OwnS
 
 
 def sensitivities(at: Solution, e: Evaluation) -> dict[tuple[int, str], np.ndarray]:
-    """By flight and output (N, q) the derivative of the residual by all unknowns."""
+    """Return by flight and output the derivative (N, q) of the residual by all unknowns."""
     layout, data, noise, z = at
     if layout.objective is OUTPUT_ERROR:
         rows, J = {}, np.asarray(e.J)
@@ -143,12 +142,12 @@ def sensitivities(at: Solution, e: Evaluation) -> dict[tuple[int, str], np.ndarr
             rows[i, n] = J[first : first + count] * float(noise.sd[i][n])
             first += count
         return rows
-    # By differences of the simulation, whose program is there: a Jacobian would compile another.
+    # Finite differences reuse the compiled simulation. A Jacobian would compile another program.
     z = np.asarray(z)
     blocks = [places.every for places in flight_places(layout)]
     common = [np.array([k]) for k in range(layout.first_nuisance)]
     most = max((b.size for b in blocks), default=0)
-    # Each flight's own unknowns move at once: none is felt by another flight.
+    # Flights share no own unknowns, so one simulation perturbs those of all flights.
     own = [np.array([b[k] for b in blocks if k < b.size]) for k in range(most)]
     before = simulated_outputs(layout, data, jnp.asarray(z))
     slopes = {(i, n): np.zeros((before[i][n].size, z.size)) for i, n in signals(layout)}
@@ -164,46 +163,48 @@ def sensitivities(at: Solution, e: Evaluation) -> dict[tuple[int, str], np.ndarr
     return slopes
 
 
-# What may drive what a model lacks.
-#
-# The inputs, what is not linear of them and of the response, and what parameters do that change.
+# Candidate drives: inputs, nonlinear functions of inputs and response, and changes of parameters.
 
 
 _PLAY = 0.1
-"""part of an input's range that a linkage's play is asked for with; other plays answer alike"""
+"""Play of a linkage as a share of the input's range; other sizes give similar results."""
 _DEAD = 0.02
-"""part of an input's range, to either side of zero, that a deadband is asked for with"""
+"""Half width of a deadband as a share of the input's range."""
 
 
 def moving_inputs(at: Solution) -> list[str]:
-    """The inputs that move in some flight."""
+    """Return the inputs that move in any flight."""
     flights = [naming.asdict(f.inputs) for f in at.data.flights]
     return [n for n in flights[0] if any(np.ptp(np.asarray(u[n])) > 0 for u in flights)]
 
 
 def nonlinear(y: np.ndarray, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Nonlinear functions of inputs and of the `motions` of a simulated output (each (N,)), and
-    what a linkage with play, or one that is dead about zero, keeps of the inputs."""
+    """Return nonlinear functions of inputs and of the `motions` of a simulated output (each (N,)).
+
+    They include the parts of the inputs that play and a deadband hold back.
+    """
     u = [_normal(v) for v in inputs]
     response = [_normal(v) for v in motions(y)]
     curved = [w for v in (*u, *response) for w in (np.abs(v) * v, v**2)]
-    # Friction has a sign and no size.
+    # Friction depends on the sign of the motion alone.
     curved += [np.sign(v) for v in response[:2]]
-    # Play depends on where the stick came from, not on where it is: no power does.
+    # Play depends on the stick's past, which no power of its position shows.
     curved += [v - _behind_play(v) for v in u]
     return curved + [np.clip(v, *_DEAD * np.array([-1, 1]) * np.ptp(v)) for v in inputs]
 
 
 def motions(y: np.ndarray) -> tuple[np.ndarray, ...]:
-    """A simulated output (N,), its rate and its integral: a spring that is not linear acts by the
-    angle, of which only the rate may be measured."""
+    """Return a simulated output (N,), its rate and its integral.
+
+    A nonlinear spring acts by the angle, of which only the rate may be measured.
+    """
     return y, np.gradient(y), np.cumsum(y - y.mean())
 
 
 def _behind_play(v: np.ndarray) -> np.ndarray:
-    """The position of what follows a signal (N,) with play."""
+    """Return the position that follows a signal (N,) with play."""
     half, at, out = 0.5 * _PLAY * float(np.ptp(v)), 0.0, []
-    # A stick that is held for many samples moves at a few of them.
+    # A held stick moves at a few samples only: the loop visits just these.
     begins = np.flatnonzero(np.diff(v, prepend=np.nan))
     for x in v[begins].tolist():
         at = min(max(at, x - half), x + half)
@@ -218,16 +219,17 @@ def _normal(v: np.ndarray) -> np.ndarray:
 
 
 LEVEL, IN_COLOUR = 0.01, 1e-3
-"""of all outputs and questions together; and where residuals in time are autocorrelated, as in
-strong gusts: what whitens them is then too short to leave nothing"""
+"""Significance level of all tests together, and the level if residuals in time are autocorrelated.
+
+In strong gusts the whitening filter is too short to remove all autocorrelation."""
 _ROUNDS = 6
-"""steps at most to where a whitened residual is least"""
+"""Largest number of steps towards the smallest whitened residual."""
 _VARIES = 0.1
-"""of the mean, by which an amplitude has to vary to tell what goes with it"""
+"""Least sd of an amplitude over its mean, to estimate an effect of the amplitude."""
 _WILD = 5.0
-"""robust sds of a whitened residual, at which it is bounded to see whether a finding holds"""
+"""Bound of the whitened residual in the robust repeat of a test [robust sds]."""
 _ENOUGH = 1.0
-"""of twice the log-likelihood, by which a further step says nothing else"""
+"""Gain of twice the log-likelihood below which a further step changes no conclusion."""
 
 
 class Unmodelled(NamedTuple):
@@ -236,30 +238,29 @@ class Unmodelled(NamedTuple):
     output: str
     drive: Drive
     gain: float
-    """of twice the log-likelihood"""
+    """Gain of twice the log-likelihood."""
     p_value: float
     frequency: float | None
-    """[rad/s] of a mode that is missing; None where the answer has none"""
+    """Frequency of the missing mode [rad/s]; None without a resonance."""
     shifts: dict[str, float]
-    """by unknown of interest how far this moves it [SI]"""
+    """Bias of each unknown of interest [SI]."""
     far: tuple[str, ...] = ()
-    """of amplitude: the unknowns that it moves by more than noise leaves of their intervals"""
+    """Unknowns that an effect of amplitude moves beyond their interval for noise alone."""
 
 
 def unmodelled(
     at: Solution, e: Evaluation, flights: Sequence[str], *, coloured: bool = False
 ) -> tuple[list[Unmodelled], tuple[float, dict[str, float]]]:
-    """Return the drives that the residuals follow beyond chance, at most one an output; and the
-    probability that the response to the inputs asks for other values by chance, with the step to
-    these [SI].
+    """Return the drives that the residuals follow beyond chance, at most one per output.
 
-    Output error takes slow drift for slow modes; filter error learns also from how its disturbance
-    goes through the vehicle, which misleads it where that acts elsewhere or has another spectrum.
+    The second result is the probability that the response to the inputs prefers other values by
+    chance, and the step to these values [SI]. Output error fits slow drift by slow modes. Filter
+    error also fits the vehicle's response to its disturbance, which biases it if the disturbance
+    acts elsewhere or has another spectrum.
 
-    An output that is slower than the grid is asked at its own samples. Of others with gaps, of a
-    simulation that left the record, of windows and of sensors compared with each other nothing is
-    asked. Whoever asks has seen to it that inputs do not follow the response: through a loop
-    disturbances are in the inputs, and any residual follows these.
+    Slow outputs are tested at their own samples. Outputs with gaps, diverged simulations, windows
+    and kinematic models are not tested. The inputs must not follow the response: in a closed loop
+    they contain disturbances, and every residual follows these.
     """
     layout, nothing = at.layout, ([], (1.0, {}))
     if is_kinematic(layout.model) or any(count > 1 for count, _ in layout.windows):
@@ -274,7 +275,7 @@ def unmodelled(
         if not drives:
             continue
         strong = _where_least(at, name, drives, records, level, flights)
-        # What rests on a few wild samples is chance: they have most of the power.
+        # A few outliers have most of the power: the result must hold without them.
         if strong.p_value < level and (
             strongest(_lines(at, e, name, J, flights, _WILD)[1], drives).p_value < level
         ):
@@ -296,10 +297,10 @@ def _where_least(
     level: float,
     called: Sequence[str],
 ) -> Strongest:
-    """The answer where the output's whitened residual is least, if it is significant before.
+    """Return the strongest drive; if it is significant, where the whitened residual is least.
 
-    With coloured residuals a fit ends elsewhere: its unknowns are off by more than sensitivities
-    are straight, and what these cannot take up would pass for something that the model lacks.
+    With coloured residuals a fit ends far from that point, where the sensitivities are not linear
+    enough. The part that they cannot explain would look like a missing mode.
     """
     part, strong = 1.0, strongest(records, drives)
     for _ in range(_ROUNDS):
@@ -319,8 +320,10 @@ def _where_least(
 
 
 def _deviance(records: Sequence[Lines]) -> float:
-    """Twice the negative log-likelihood of a whitened residual, but for a constant: two numbers a
-    line, each of the variance size**2."""
+    """Return twice the negative log-likelihood of a whitened residual, up to a constant.
+
+    Each line holds two numbers of variance size**2.
+    """
     return float(4.0 * sum(one.e.size * np.log(one.size) for one in records))
 
 
@@ -332,27 +335,28 @@ def _lines(
     called: Sequence[str],
     most: float = np.inf,
 ) -> tuple[list[Drive], list[Lines]]:
-    """The drives that the residual of an output may follow, none where nothing can be tested, and
-    its lines by flight.
+    """Return the candidate drives of an output's residual, and its lines by flight.
+
+    No drive is returned if nothing can be tested.
 
     Args:
         called: the flights' names.
-        most: robust sds at which the whitened residual is bounded.
+        most: bound of the whitened residual [robust sds].
     """
     moving, samples = moving_inputs(at), of_one_clock(at, e, name)
-    # A step may end where the simulation leaves the record.
+    # A step may end where the simulation diverges.
     if not samples:
         return [], []
     k, m = len(at.layout.of_interest), len(moving)
     steps, lines = [J[i, name].shape[0] for i, _ in samples], []
-    # A change of a parameter: a steady one over the flights in their order, and one halfway.
+    # A parameter changes steadily over the flights in their order, or jumps halfway.
     t = np.split(np.linspace(-1.0, 1.0, sum(steps)), np.cumsum(steps)[:-1])
     for place, ((i, own), shape) in enumerate(zip(samples, t, strict=True)):
         inputs = naming.asdict(at.data.flights[i].inputs)
         u, slopes = [np.asarray(inputs[n]) for n in moving], J[i, name][:, :k]
         known = np.stack([*u, *nonlinear(np.asarray(e.simulated[i][name]), u)], axis=1)
         X = [np.stack([own.of_input(v) for v in known.T], axis=1)]
-        # A change in one flight alone, before those over time: it is one halfway as well.
+        # One flight's changes come before those over time, since they may also look like a jump.
         X += [slopes[own.rows] * (other == place) for other in range(len(samples))]
         X += [(slopes * by[:, None])[own.rows] for by in (shape, np.sign(shape))]
         left = np.asarray(e.raw[i][name])[own.rows]
@@ -370,7 +374,7 @@ def _lines(
         names = [called[i] if i < len(called) else f"flight {i + 1}" for i, _ in samples]
         of = [names[place] for place, _ in lines]
         drives += [
-            # Of two nobody knows which is odd.
+            # With only two flights either may be the odd one.
             Drive(
                 first + place * k + c,
                 "flights",
@@ -396,12 +400,12 @@ def _told(
     shifts = strong.shift[:k] * slopes
     if drive.kind == "amplitude":
         shifts = _by_amplitude(at, e, name, J) * slopes
-        # The shift is a lower bound. It is held against the interval that noise alone leaves: one
-        # that allows for coloured residuals is wide by what was found here.
+        # The shift is a lower bound. It is compared with the interval for noise alone: this effect
+        # itself widens the interval that allows for coloured residuals.
         beyond = np.abs(shifts) > HALF_INTERVAL * deviations(e.J)[:k] * np.abs(slopes)
         far = tuple(n for n, one in zip(at.layout.of_interest, beyond, strict=True) if one)
     elif drive.unknown is not None:
-        # The drive is the sensitivity of one parameter, which is off by the change itself as well.
+        # The drive is the sensitivity of one parameter, so the change itself biases that one too.
         change = strong.amount * slopes[drive.unknown]
         there = shifts[drive.unknown] + change
         shifts[drive.unknown] = max((shifts[drive.unknown], there, -change), key=abs)
@@ -421,11 +425,11 @@ def _told(
 def _by_amplitude(
     at: Solution, e: Evaluation, name: str, J: Mapping[tuple[int, str], np.ndarray]
 ) -> np.ndarray:
-    """By unknown of interest (k,) its change from the record's mean amplitude to none, that of an
-    input or of the output's `motions`, whichever explains most.
+    """Return the change (k,) of each unknown of interest from the record's mean amplitude to zero.
 
-    The residual is regressed on the sensitivities, and on these times the amplitude. It is not
-    whitened: the answer that depends on amplitude is as slow as the response itself.
+    The amplitude is that of the input or of the output's `motions` which explains most. The
+    residual is regressed on the sensitivities, and on these times the amplitude. It is not
+    whitened: a response that depends on amplitude is as slow as the response itself.
     """
     k, samples = len(at.layout.of_interest), of_one_clock(at, e, name)
     left = np.concatenate([np.asarray(e.raw[i][name])[own.rows] for i, own in samples])
