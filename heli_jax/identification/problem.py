@@ -459,7 +459,7 @@ def _check_free(name: str, free: Free, model: Model) -> None:
             f".sign: keep: expected bounds of one sign, got {low:g} to {high:g}",
         ),
         (low >= high, f": lower must be below upper, got {low:g} and {high:g}"),
-        # A bound at zero has an infinite coordinate if the other bound has any other sign.
+        # If the bounds have different signs, a start at a bound has an infinite coordinate.
         (
             not low < start < high,
             f".start: expected a value inside {low:g} to {high:g}, got {start:g}",

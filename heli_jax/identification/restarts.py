@@ -84,7 +84,7 @@ def _diverges(at: SearchState) -> bool:
 
 
 def _by_windows(at: SearchState) -> list[StartPoint]:
-    """Return the estimate from short windows as a start point, without the windows' initial states."""
+    """Return the estimate from short windows as a start point, without their initial states."""
     problem, guess = at.search.problem, at.guess
     dt = max(f.dt for f in problem.training)
     shortest = min(f.n_samples * f.dt for f in problem.training)
