@@ -233,7 +233,7 @@ def _initial_states(layout: Layout, data: Data, problem: Problem, z: np.ndarray)
 
 # Params is Any because its class may be a user's.
 def own_start(model: Model, params: Any) -> dict[str, float]:
-    """Return the model's initial state; zeros of a full helicopter's state are replaced by hover."""
+    """Return the model's initial state; for a full helicopter hover replaces zeros."""
     start = {n: float(v) for n, v in naming.asdict(model.initial_state(params)).items()}
     if not is_full_nonlinear(model):
         return start

@@ -115,7 +115,7 @@ class FilterError(Objective):
     noise_model = "disturbance"
 
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
-        """Return the innovations over their sd, and the rows that make J'J the Fisher information."""
+        """Return the innovations over their sd, and rows that make J'J the Fisher information."""
         by_flight = filtered_flights(layout, data, noise, u)
         return Residuals(_likelihood_rows(layout, data, noise, u, by_flight), None, by_flight)
 
@@ -254,7 +254,7 @@ class FilterError(Objective):
         }
 
     def ill_conditioned(self, problem: Problem, e: Evaluation, sd: dict[str, float]) -> bool:
-        """True if the filter lost its precision: variances are negative or too large for float64."""
+        """True if the filter lost precision: variances are negative or too large for float64."""
         ratios = np.concatenate(
             [
                 np.asarray(s) / sd[f"{label}/{n}"] ** 2

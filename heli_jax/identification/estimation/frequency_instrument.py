@@ -32,7 +32,7 @@ least 90 % of all cases."""
 
 
 def instruments_of(problem: Problem) -> tuple[str, ...]:
-    """Return the inputs replaced by their instruments: the configured ones, or all that have one."""
+    """Return the inputs replaced by instruments: the configured ones, or all that have one."""
     if problem.instrument is not None:
         return tuple(problem.instrument)
     known = naming.names(problem.model.Inputs)

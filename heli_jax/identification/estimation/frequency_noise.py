@@ -389,7 +389,7 @@ def _powers(inputs: np.ndarray, size: float, order: int) -> list[np.ndarray]:
 
 
 def _left(S: np.ndarray, p: int) -> np.ndarray:
-    """Return the spectra (K, p, p) of the first p signals, less the part that the others explain."""
+    """Return the spectra (K, p, p) of the first p signals, less the part explained by the others."""
     size = np.sqrt(np.real(np.einsum("kii->ki", S)))
     R = S / (size[:, :, None] * size[:, None, :])
     others = R[:, p:, p:] + _ALONE * np.eye(S.shape[1] - p)

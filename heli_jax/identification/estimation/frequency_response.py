@@ -126,7 +126,7 @@ def effects_of_ends(m: Matrices, R: Complex[Array, "K n n"], samples: int) -> Ar
 
 
 def _lines(N: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return half of the lines z (K,), whose conjugates are the others, and exp(i pi t / N) (N,)."""
+    """Return half of the lines z (K,) (the rest are conjugates), and exp(i pi t / N) (N,)."""
     # With odd N the line at the Nyquist frequency is its own conjugate.
     k = np.arange((N + 1) // 2)
     return np.exp(1j * np.pi * (2 * k + 1) / N), np.exp(1j * np.pi * np.arange(N) / N)
