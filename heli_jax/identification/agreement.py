@@ -120,11 +120,11 @@ def signals_of(
 
 
 def pooled_metrics(signals: tuple[Signals, ...], *, one_step: bool = False) -> dict[str, Metrics]:
-    """Return metrics by output over all flights that have it; none of one-step predictions without
-    innovations.
+    """Return metrics by output, pooled over all flights that have it.
 
-    Samples are pooled instead of averaging over flights. Long flights so count for more, and
-    flights in which an output hardly moves have no meaningful R^2.
+    One-step predictions need innovations. Samples are pooled instead of averaging over flights.
+    Long flights then count for more, and flights in which an output hardly moves have no meaningful
+    R^2.
     """
     if one_step:
         signals = tuple(s for s in signals if s.innovations is not None)

@@ -48,11 +48,10 @@ _ROUNDING = 1e-8
 def offset_inputs(
     model: Model, params: Any, flight: Flight, free: tuple[str, ...]
 ) -> tuple[str, ...]:
-    """Return the sticks of a vehicle in free flight whose offset differs from an initial state or
-    bias.
+    """Return the sticks of a vehicle in free flight that have an offset.
 
-    They are in the order of the model. Throttle and collective have no centre. A free constant term
-    in the equations replaces all offsets.
+    The offset differs from an initial state or bias. The order is that of the model. Throttle and
+    collective have no centre. A free constant term in the equations replaces all offsets.
     """
     centreless = ("x_throttle", "x_collective", "Omega")
     sticks = [n for n in naming.names(model.Inputs) if n not in centreless]
@@ -69,8 +68,7 @@ def offset_inputs(
 
 
 def _taken_up(model: Model, params: Any, flight: Flight) -> set[str]:
-    """Return the inputs whose constant offset only moves the equilibrium, like a bias of the
-    outputs.
+    """Return the inputs whose constant offset only moves the equilibrium, like a bias.
 
     A vehicle in free flight has no such equilibrium, or one beyond the weak prior of a bias. A slow
     mode (an aeroplane's spiral) moves far in the end, but not within the record. The model is

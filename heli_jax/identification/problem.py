@@ -68,7 +68,7 @@ class Nuisance(NamedTuple):
     input_offset: bool | tuple[str, ...] | None = None
 
 
-# Below, `Any` stands for Params, which may be a user's class.
+# Below, `Any` is Params, which may be a user's class.
 
 _FEWEST = 4
 """Least samples of a window, because each window adds an initial state."""
@@ -112,8 +112,8 @@ class Problem:
     """Multiple shooting: length of the windows [s], each with its own initial state. In unstable
     flight the error of an initial state grows, so windows must be short."""
     continuity: float | None = None
-    """With windows: standard deviation of the jump of each state between windows, as a fraction of
-    its motion; None: unrestricted jumps."""
+    """Standard deviation of the jump of each state between windows, as a fraction of its motion;
+    None: unrestricted jumps."""
     instrument: tuple[str, ...] | None = None
     """In frequency: inputs that use their instrument (`Flight.instruments`); None: all inputs for
     which every flight has one; (): none."""

@@ -143,16 +143,15 @@ class Fit:
     reached: Solution
     """Optimum in the optimiser's coordinates, for profile, bootstrap and NUTS."""
     validation_free_run: dict[str, Metrics] = field(default_factory=dict)
-    """With windows: metrics of an uninterrupted simulation from the first window's initial state.
-    """
+    """Windows: metrics of an uninterrupted simulation from the first window's initial state."""
     held_out_frequency: HeldOutFrequency | None = None
     """Fit in frequency: agreement with the held-out flights in frequency."""
     adequacy: Adequacy = field(default_factory=Adequacy)
-    """How well the model explains the fitted outputs."""
+    """Share of the fitted outputs that the model explains."""
     coloured: bool = False
     """True if `sd` and intervals allow for autocorrelated (coloured) residuals."""
     responses: ResponseAgreement | None = None
-    """frequency-response: agreement of the model's responses with the measured ones."""
+    """Agreement of the model's frequency responses with the measured ones."""
     feedback: tuple[Feedback, ...] = ()
     """For each flight and input, whether the input follows the response (feedback)."""
     instruments: tuple[str, ...] = ()
@@ -238,8 +237,7 @@ class Fit:
 
     @property
     def overconfident(self) -> bool:
-        """True if intervals are too narrow, because they ignore the autocorrelation of the
-        residuals."""
+        """True if intervals are too narrow, because residuals are autocorrelated."""
         spectrum = objective_of(self.method).noise_model == "spectrum"
         return not self.white and not self.coloured and not spectrum
 

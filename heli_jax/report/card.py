@@ -1,7 +1,7 @@
 """Acceptance card: the usual limits of rotorcraft identification, each passed or failed.
 
-The first gates are the three statements of a fit, so a card never passes if a statement is `no`. A
-gate that cannot fail, or cannot pass, is left out.
+The first gates are the three statements of a fit, so a card never passes if a statement is `no`.
+Gates that cannot fail, or cannot pass, are omitted.
 """
 
 import math

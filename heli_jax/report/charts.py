@@ -91,8 +91,10 @@ def limits_of(series: Sequence[Series], margin: float = 0.05) -> tuple[float, fl
 
 
 def samples(label: str, x: np.ndarray, y: np.ndarray, color: str, width: float) -> Series:
-    """Return the series of a measurement, NaN if missing: a line, or dots if few samples have
-    neighbours."""
+    """Return the series of a measurement, NaN if missing.
+
+    It is a line, or dots if few samples have neighbours.
+    """
     seen = ~np.isnan(y)
     beside = np.convolve(seen, [1, 0, 1], "same")[seen] > 0
     if seen.any() and beside.mean() < 0.5:

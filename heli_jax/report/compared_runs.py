@@ -57,8 +57,11 @@ class ComparedRuns(NamedTuple):
         return Table(("parameter", *self.labels, *several, "unit"), rows)
 
     def _by_run(self) -> list[dict[str, Estimate]]:
-        """Return each run's estimates, combinations determined in any run, gains, time shift and
-        disturbance."""
+        """Return each run's estimates, combinations and shared nuisances.
+
+        Combinations are those determined in any run. Gains, the time shift and the disturbance
+        follow.
+        """
         by_run = []
         for run, combined in zip(self.runs, _combinations(self.runs), strict=True):
             # A nuisance of one flight is named FLIGHT/NAME.
@@ -68,8 +71,7 @@ class ComparedRuns(NamedTuple):
 
     @property
     def agreement(self) -> Table:
-        """VAF, NRMSE fit and Theil's coefficient by output and run, of fitted and held-out
-        flights."""
+        """VAF, NRMSE fit and Theil's coefficient by output and run, also of held-out flights."""
         rows = []
         for held_out in (False, True):
             of = [run.validation if held_out else run.metrics for run in self.runs]

@@ -133,8 +133,7 @@ def fitted_responses(
 
 # Params is Any because it may be a user's class.
 def at_record(model: Model, params: Any, fit: Fit) -> OperatingPoint:
-    """Return the operating point of a fit's first flight for linearisation, with the estimated
-    gains."""
+    """Return the operating point of a fit's first flight, with the estimated gains."""
     signals = fit.signals[0]
     # The vehicle receives gain times the logged input.
     gains = {n: fit.nuisance.get(f"gain {n}") for n in signals.inputs}

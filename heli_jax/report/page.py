@@ -55,8 +55,7 @@ def _asset(name: str) -> markupsafe.Markup:
 
 @functools.cache
 def _policy() -> str:
-    """Return the content security policy of a page: only this package's scripts, and nothing
-    loaded."""
+    """Return the content security policy of a page: only this package's scripts, no loading."""
     # Escaping already keeps text of a log from running; this is a second protection.
     digests = (hashlib.sha256(_asset(n).encode()).digest() for n in _SCRIPTS)
     hashes = " ".join(f"'sha256-{as_base64(d)}'" for d in digests)

@@ -257,10 +257,10 @@ def _with_margin(y: Column) -> tuple[float, float]:
 
 
 def _binned(x: Column, y: Column) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return medians of an axis (b,) in bins of equal count, or its grid values, and quantiles 5,
-    50 and 95 % of a result (3, b).
+    """Return medians (b,) of an axis in bins of equal count, and quantiles of a result (3, b).
 
-    The result is None for fewer than two bins.
+    A grid has its values as bins. The quantiles are 5, 50 and 95 %. The result is None for fewer
+    than two bins.
     """
     order = np.flatnonzero(x.used & y.used)
     order = order[np.argsort(x.values[order])]

@@ -63,7 +63,7 @@ def write_view(
             number, size = len(numbers.scenes), size_of(run, float(params.R))
             numbers.scenes.append(scene(run, params, numbers, name))
         shown.append(Shown(name, _pictures(run, model, numbers), number, size))
-    # The page states the number of flights not drawn, so that nobody overlooks them.
+    # The page states the number of flights not drawn, so that they are not overlooked.
     page = filled(
         "view.html.j2",
         title=title,
@@ -216,8 +216,7 @@ def _hub(p: Any) -> np.ndarray:
 
 
 def _outlines(p: Any) -> list[Points]:
-    """Return mast, tail boom with fin, tail rotor, rotor rim, skids and their legs, each as a
-    line."""
+    """Return mast, tail boom, fin, tail rotor, rotor rim, skids and their legs as lines."""
     R, tail, hub = float(p.R), float(p.L_T), _hub(p)
     a, b = _circle(float(p.R_T))
     wheel = np.stack([a - tail, np.zeros(_AROUND), b], axis=1)

@@ -1,7 +1,6 @@
-"""Flights for regression: smoothed signals, their derivatives, and the states that the outputs
-determine.
+"""Flights for regression: smoothed signals, their derivatives, and states from outputs.
 
-A signal x is smoothed by a short kernel of unit area, w(s) = c (1 - s^2)^4, and differentiated by
+A signal x is smoothed by a short kernel of unit area, w(s) = c (1 - s^2)^4. It is differentiated by
 parts, (w * x)' = w' * x (modulating functions: M. Shinbrot, NACA TN 3288, 1954). A linear equation
 x' = A x + B u holds exactly for the smoothed signals, for any width of the kernel.
 """
@@ -55,8 +54,7 @@ def margin(half: int) -> int:
 
 
 def shortest(half: int) -> int:
-    """Return the length of the shortest segment [samples]: three widths of the kernel between
-    margins."""
+    """Return the samples of the shortest segment: three widths of the kernel between margins."""
     return 2 * margin(half) + 6 * half
 
 
@@ -122,8 +120,7 @@ def _bridged(y: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
 
 
 def kernel_width(flights: Sequence[Flight]) -> int:
-    """Return the half width of the widest kernel that removes little but noise from every output
-    [samples]."""
+    """Return the half width of the widest kernel that removes little but noise [samples]."""
     signals = []
     for flight in flights:
         parts, bridged = segments(flight.outputs)
@@ -200,8 +197,8 @@ class Structure(NamedTuple):
 def structure(model: Model, both: Float[np.ndarray, "r c q"], outputs: Sequence[str]) -> Structure:
     """Return the measured states and the equations to regress.
 
-    A state is measured if outputs determine it with known coefficients, or if it is the derivative
-    of a measured state, like the rate of an angle.
+    A state is measured if outputs determine it with known coefficients. The derivative of a
+    measured state, like the rate of an angle, is measured too.
 
     Args:
         both: `coefficients` at `generic` values of the free parameters, with their derivatives.

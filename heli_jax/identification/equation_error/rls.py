@@ -188,8 +188,10 @@ def rls_regression(
 
 
 def transfer_function(theta: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Return num and den (n + 1,) of Hd(z), highest power first, from Theta (2n + 1,), eqs 24 and
-    26."""
+    """Return num and den (n + 1,) of Hd(z) from Theta (2n + 1,), eqs 24 and 26.
+
+    The highest power comes first.
+    """
     theta = np.asarray(theta)
     n = theta.size // 2
     # Theta holds -a (eq. 25).

@@ -160,8 +160,12 @@ all other states."""
 
 
 def _samples_near(simulated: dict[str, np.ndarray], measured: dict[str, np.ndarray]) -> int:
-    """Return the number of samples for which the outputs (N,) of an unstable model stay near the
-    record."""
+    """Return the number of samples before a growing simulation leaves the record.
+
+    Args:
+        simulated: outputs (N,) of an unstable model.
+        measured: the measured outputs.
+    """
     near = [len(next(iter(simulated.values())))]
     for n, y in measured.items():
         if runs_away(simulated[n], y):
@@ -188,7 +192,7 @@ def runs_away(simulated: np.ndarray, measured: np.ndarray) -> bool:
 def start_vector(layout: Layout, data: Data, problem: Problem) -> Float[Array, " q"]:
     """Return z at the start values: gains 1, no shift, the model's own initial state, no bias."""
     dtype = data.low.dtype
-    # All entries are fetched at once, because each would be a program of its own.
+    # All entries are fetched at once, because each would be a separate program.
     limits = zip(*jax.device_get((data.sign, data.low, data.high)), strict=True)
     z = [
         transforms.to_coordinate(kind, np.asarray(f.start, dtype), *of_one)
@@ -201,7 +205,7 @@ def start_vector(layout: Layout, data: Data, problem: Problem) -> Float[Array, "
     # Zero is the mean of the weak priors, and a noise factor of one.
     whole = np.zeros(layout.size, dtype)
     whole[: len(z)] = jax.device_get(z)
-    # Without a start of its own a linear model begins at zero, as z does.
+    # A linear model without start values begins at zero, as z does.
     if layout.initial_state and not (layout.model.linear and layout.model.start is None):
         _initial_states(layout, data, problem, whole)
     return jnp.asarray(whole)

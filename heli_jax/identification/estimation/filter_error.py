@@ -158,8 +158,10 @@ class FilterError(Objective):
     def relax(
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
     ) -> tuple[Float[Array, " q"], Noise]:
-        """Scale all noise, including the disturbance in z, by one factor; the optimum stays the
-        same."""
+        """Scale all noise, including the disturbance in z, by one factor.
+
+        The optimum stays the same.
+        """
         n, e = measured_count(data), evaluate(layout, data, noise, z)
         freedom = n / max(n - layout.determined, 1)
         squares, logs = innovation_sums(e, noise)
@@ -183,8 +185,8 @@ class FilterError(Objective):
     def noise_matters(self, problem: Problem, layout: Layout, before: Noise, after: Noise) -> bool:
         """True if the change of the noise affects the optimum.
 
-        This is so if priors are weighed against a concentrated scale, if that scale changed much,
-        if the noise fell below the floor of the likelihood's row, or if a correction changed.
+        This has three causes. Priors are weighed against a concentrated scale, or that scale
+        changed much. The noise fell below the floor of the likelihood's row. A correction changed.
         """
         if layout.concentrated:
             return any(f.prior for f in problem.free.values()) or _is_far(before, after)

@@ -102,7 +102,7 @@ class FrequencyError(Objective):
         return Residuals(rows_of_lines(layout, data, noise, u), None)
 
     def refusal(self, problem: Problem) -> str | None:
-        """Return the reason if flights have different outputs, no part with all outputs, or no
+        """Return why the flights cannot be used: different outputs, no complete part, or no
         trim."""
         flights = problem.training
         refused = other_outputs(flights) or without_parts(flights) or absent_instrument(problem)
@@ -171,8 +171,7 @@ class FrequencyError(Objective):
     def finish(
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
     ) -> Float[Array, " q"]:
-        """Estimate biases and initial states by a simulation in time, because no row determines
-        them."""
+        """Estimate biases and initial states, which no row determines, by a simulation in time."""
         return in_time(layout, data, noise, z) if layout.model.linear else z
 
     def log_likelihood(self, layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
@@ -292,8 +291,11 @@ precision."""
 
 
 class Products(NamedTuple):
-    """Products of columns: whitened errors e without the effects of the records' ends, derivatives
-    J of the response by the unknowns, instruments Z, and effects of the ends Q."""
+    """Products of columns e, J, Z and Q.
+
+    e are the whitened errors without the effects of the records' ends, J the derivatives of the
+    response by the unknowns, Z instruments, and Q effects of the ends.
+    """
 
     ee: Float[Array, ""]
     Ze: Float[Array, " q"]
@@ -468,8 +470,10 @@ def _slopes(
 
 
 def differentiated[T](make: Callable[[Array], T], v: Float[Array, " q"]) -> tuple[T, T]:
-    """Return arrays in tuples and their derivatives by v in a last axis; None replaces zero
-    derivatives."""
+    """Return arrays in tuples and their derivatives by v in a last axis.
+
+    None replaces zero derivatives.
+    """
     moving: list[bool] = []
 
     # It runs together with `make` and records which derivatives are zero. A separate trace of the

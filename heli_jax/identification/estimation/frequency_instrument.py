@@ -1,7 +1,7 @@
 r"""Instruments: logged excitations added to inputs, which feedback does not affect.
 
 The part of an input that follows them, $\hat U = S_{ur} S_{rr}^{-1} R$, is independent of gusts and
-noise, even if a pilot or autopilot feeds both back into the input.
+noise. This holds even if a pilot or autopilot feeds both back into the input.
 
 Sources: Söderström and Stoica (1983); Pintelon and Schoukens (2012), chapter 9; Stock and Yogo
 (2005) for weak instruments.
@@ -83,7 +83,7 @@ def instrumented_inputs(
 def following(
     flights: Sequence[Flight], names: Sequence[str], signals: Sequence[Float[np.ndarray, "N r"]]
 ) -> tuple[dict[str, np.ndarray], ...]:
-    """Return the inputs by flight; named inputs are replaced by their part (N,) that follows the
+    """Return the inputs by flight; named ones are reduced to the part (N,) that follows the
     signals."""
     made = _parts([np.stack([f.inputs[n] for n in names], axis=1) for f in flights], signals)
     return tuple(
@@ -124,8 +124,7 @@ def _filled(y: Any) -> Float[np.ndarray, " N"]:
 def _parts(
     of: Sequence[Float[np.ndarray, "N u"]], signals: Sequence[Float[np.ndarray, "N r"]]
 ) -> list[Float[np.ndarray, "N u"]]:
-    """Return, by flight, the part of the columns that follows the signals, around the columns'
-    means."""
+    """Return, by flight, the part of the columns that follows the signals, around their means."""
     U, R = ([lines_of(v) for v in one] for one in (of, signals))
     u = U[0].shape[1]
 

@@ -95,8 +95,7 @@ def in_time_of(lines: Complex[np.ndarray, "K c"], samples: int) -> Float[np.ndar
 
 
 def parts_of(flight: Flight) -> tuple[tuple[int, int], ...]:
-    """Return first sample, and the one after the last, of each sufficiently long part with all
-    outputs."""
+    """Return first sample, and the one after the last, of each long part with all outputs."""
     seen = spans(flight.outputs.values())
     if seen == [(0, flight.n_samples)]:
         return tuple(seen)

@@ -37,8 +37,7 @@ _KNOTS = 4.0
 def smoothed(
     lines: Sequence[Complex[np.ndarray, "K p"]], part: float = PART, *, least: float = LEAST
 ) -> list[Complex[np.ndarray, "K p p"]]:
-    """Return the spectrum E e e^H (K, p, p) of all records for each record, smoothed over
-    frequency.
+    """Return for each record the spectrum E e e^H (K, p, p) of all, smoothed over frequency.
 
     Args:
         lines: by record at its own frequencies; N samples give K = (N - 1) // 2.
@@ -108,8 +107,11 @@ def whitening_alone(
 def knots_of(
     K: int, part: float = PART, least: float = LEAST
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Return the knots (lines from 0) at which a spectrum of K lines is computed, and for each line
-    the knot below and the weight of the next one."""
+    """Return the knots for K lines, and their weights for interpolation.
+
+    A spectrum is computed at the knots (lines from 0). Each line gets the knot below and the weight
+    of the next one.
+    """
     knots = [0]
     while knots[-1] < K - 1:
         width = max(least, part * (knots[-1] + 1))
@@ -131,8 +133,7 @@ def _between_knots(at_knots: np.ndarray, K: int, part: float, least: float) -> n
 def _kernel(
     K: int, other: int, part: float, least: float
 ) -> tuple[Float[np.ndarray, "knots other"], Float[np.ndarray, " knots"]]:
-    """Return the weights of a record of `other` lines at the knots of one of K lines, and their
-    sums."""
+    """Return the weights of a record of `other` lines at the knots of K lines, and their sums."""
     # Frequencies are relative to the sampling rate, which all records share.
     f, first = (knots_of(K, part, least)[0] + 1) / (2 * K + 1), 1 / (2 * other + 1)
     g = first * np.arange(1, other + 1)
@@ -323,7 +324,7 @@ def _powers_of_gusts(
         S = ((shapes.T @ powers)[:, None, :] @ ways).view(complex).reshape(c, p, p)
         matrices[:, 1] = np.linalg.inv(S)
         matrices[:, 0] = matrices[:, 1] @ power @ matrices[:, 1]
-        # By shape and effect: power in the errors, and expected power. The square root that
+        # Power in the errors and expected power, by shape and effect. The square root that
         # guarantees an increase in each step is omitted, which halves the number of steps.
         told = (matrices.view(float).reshape(c, 2, -1) @ by_way).reshape(c, -1)
         shown, due = np.moveaxis((by_shape @ told).reshape(-1, 2, n + p), 1, 0)
@@ -389,7 +390,7 @@ def _powers(inputs: np.ndarray, size: float, order: int) -> list[np.ndarray]:
 
 
 def _left(S: np.ndarray, p: int) -> np.ndarray:
-    """Return the spectra (K, p, p) of the first p signals, less the part explained by the others."""
+    """Return the spectra (K, p, p) of the first p signals, less the part due to the others."""
     size = np.sqrt(np.real(np.einsum("kii->ki", S)))
     R = S / (size[:, :, None] * size[:, None, :])
     others = R[:, p:, p:] + _ALONE * np.eye(S.shape[1] - p)

@@ -61,7 +61,7 @@ class Filter(NamedTuple):
 #
 # Local linearisation takes a matrix exponential in every step. It is stable for any mode, but keeps
 # the equations of the step's start: a second-order error if inputs change. The classical
-# Runge-Kutta method integrates the same moments to fourth order at a twentieth of the cost, but
+# Runge-Kutta method integrates the same moments to fourth order at a twentieth of the cost. It
 # diverges if a mode is fast relative to the step.
 
 
@@ -191,8 +191,10 @@ _ONLY_SIMULATE = (
 
 
 class Innovations(NamedTuple):
-    """One-step predictions against measurements, by output; arrays (N,), NaN without
-    measurement."""
+    """One-step predictions against measurements, by output.
+
+    Arrays are (N,), NaN without measurement.
+    """
 
     error: dict[str, Float[Array, " N"] | np.ndarray]
     """Measured less predicted from all earlier samples, SI."""
@@ -308,10 +310,9 @@ def filter_of(drive: Drive) -> Filter:
 def corrected(
     filter_: Filter, estimate: Estimate, R: Array, y: Array, now: Any
 ) -> tuple[Estimate, tuple[Array, Array]]:
-    """Return the estimate after one sample's outputs (p,), and errors and variances (p,) of their
-    innovations.
+    """Return the estimate after one sample's outputs (p,), and their innovations.
 
-    The outputs are processed one after another.
+    The outputs are processed one after another. Errors and variances of the innovations are (p,).
     """
 
     def correct(carry: Estimate, measured: tuple[Array, ...]) -> tuple[Any, Any]:

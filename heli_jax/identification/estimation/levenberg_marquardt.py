@@ -160,7 +160,7 @@ def optimise(
 def _bounds(layout: Layout, data: Data) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and highest coordinates (q,); infinite without a bound."""
     bounds = np.tile([-np.inf, np.inf], (layout.size, 1))
-    # All entries are fetched at once, because each would be a program of its own.
+    # All entries are fetched at once, because each would be a separate program.
     limits = zip(layout.kinds, *map(np.asarray, (data.sign, data.low, data.high)), strict=True)
     for i, of_one in enumerate(limits):
         bounds[i] = transforms.coordinate_limits(*of_one)

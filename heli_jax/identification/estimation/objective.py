@@ -71,8 +71,10 @@ class Objective(abc.ABC):
     def instrumented(
         self, problem: Problem, flights: Sequence[Flight]
     ) -> tuple[dict[str, np.ndarray], ...] | None:
-        """Return, by flight and input, the part that follows the instruments (N,), SI; None without
-        instruments."""
+        """Return, by flight and input, the part (N,) that follows the instruments, SI.
+
+        The result is None without instruments.
+        """
         return None
 
     def scaled_outputs(self, problem: Problem) -> tuple[tuple[str, ...], bool]:
@@ -102,8 +104,11 @@ class Objective(abc.ABC):
         return RowTags(tags[0], tags[1], tags[2], np.arange(count) < numbers.size)
 
     def first_noise(self, problem: Problem, noise: Noise, flights: Sequence[Flight]) -> Noise:
-        """Return the first guess of the noise in the method's form, from sds by flight and
-        output."""
+        """Return the first guess of the noise in the method's form.
+
+        Args:
+            noise: sds by flight and output.
+        """
         return noise
 
     def noise_at_start(self, layout: Layout, data: Data, e: Evaluation, noise: Noise) -> Noise:
@@ -115,8 +120,10 @@ class Objective(abc.ABC):
         return data
 
     def noise_of_check(self, layout: Layout, data: Data, noise: Noise) -> Noise:
-        """Return the noise of a check at the start values; the same object unless the fit ends with
-        another."""
+        """Return the noise of a check at the start values.
+
+        It is the same object unless the fit ends with another.
+        """
         return noise
 
     def relax(
@@ -149,8 +156,10 @@ class Objective(abc.ABC):
         return z
 
     def log_likelihood(self, layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
-        """Return the log-likelihood in SI units of the outputs, at the most likely noise if that is
-        estimated."""
+        """Return the log-likelihood in SI units of the outputs.
+
+        An estimated noise has its most likely value.
+        """
         total = 0.0
         for v in errors_of(layout, e):
             sd = self.scale(v)
@@ -203,8 +212,7 @@ class Objective(abc.ABC):
     def response_agreement(
         self, layout: Layout, data: Data, noise: Noise, z: Array
     ) -> ResponseAgreement | None:
-        """Return the agreement of modelled and measured frequency responses, if these are
-        fitted."""
+        """Return the agreement of modelled and measured frequency responses, if fitted."""
         return None
 
     def findings(

@@ -123,10 +123,9 @@ def _correlations(g: np.ndarray, d: int, step: int) -> dict[int, np.ndarray]:
 def _spread(
     w: Windowed, first: np.ndarray, second: np.ndarray, c: dict[int, np.ndarray]
 ) -> np.ndarray:
-    """Return the covariance (k - d, m, m) of two means of conj(Z) E, with white noise E of density
-    1.
+    """Return the covariance (k - d, m, m) of two means of conj(Z) E.
 
-    The second mean is at the d-th line after the first.
+    E is white noise of density 1. The second mean is at the d-th line after the first.
     """
     k = len(c[0])
     a = first[:, None, None] * w.Z[:, :k]
@@ -176,8 +175,7 @@ def response_of(
 def noise_density(
     w: Windowed, at: Averages, E: Complex[np.ndarray, "W k p"]
 ) -> Complex[np.ndarray, "k p p"]:
-    """Return the spectral matrix of the errors' part that no response explains, smoothed over
-    frequency.
+    """Return the smoothed spectral matrix of the errors' part that no response explains.
 
     Args:
         E: errors (W, k, p); zero in windows that an output does not have.
@@ -209,8 +207,7 @@ def noise_density(
 def _unexplained(
     w: Windowed, E: Complex[np.ndarray, "W k p"], seen: Float[np.ndarray, "W p"]
 ) -> Complex[np.ndarray, "W k p"]:
-    """Return the errors' part that no response to the instruments explains, in the measured
-    windows."""
+    """Return the errors' part that no response to the instruments explains, in measured windows."""
     # The regression is on the instruments, because the response is unbounded without excitation.
     P = np.stack([_inverse_power(w, mask) for mask in seen.T])
     S_ze = np.einsum("wp,wkz,wkp->kpz", seen, np.conj(w.Z), E, optimize=True)
@@ -345,8 +342,9 @@ class ResponseWeights(NamedTuple):
 
 
 def first_weights(problem: Problem, flights: Sequence[Flight]) -> ResponseWeights:
-    """Return the weights of the measured signals; the noise is the outputs' part that no response
-    explains.
+    """Return the weights of the measured signals.
+
+    The noise is the outputs' part that no response explains.
 
     Raises:
         ValueError: windows, band or pairs do not fit the flights, or too few data remain.

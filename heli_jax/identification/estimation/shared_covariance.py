@@ -217,8 +217,7 @@ def _riccati_jvp(primals: Any, tangents: Any) -> Any:
 
 @jax.custom_jvp
 def recurrence(F: Array, forcing: Array, x0: Array) -> tuple[Array, Array]:
-    """Return x after the last of K samples, and x (K, m, n) at all: x[k+1] = F x[k] +
-    forcing[k]."""
+    """Return the last x, and all x (K, m, n), of the recurrence x[k+1] = F x[k] + forcing[k]."""
     return jax.lax.scan(lambda x, f: (x @ F.T + f, x), x0, forcing)
 
 

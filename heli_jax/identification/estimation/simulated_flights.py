@@ -60,7 +60,8 @@ class Run(NamedTuple):
     outputs: Float[Array, "p N"]
     """Measured outputs in the order of `Layout.outputs`, without bias."""
     ends: Any
-    """With windows: the State at the end of each (the first sample of the next), (windows,)."""
+    """State at the end of each window (the first sample of the next), (windows,), with windows
+    only."""
 
 
 def predict(layout: Layout, data: Data, u: Unknowns) -> tuple[Run, ...]:

@@ -48,8 +48,9 @@ def noise_guess_at(
 def _best_on_grid(
     layout: Layout, data: Data, noise: Noise, z0: Array, names: tuple[str, ...], width: float
 ) -> Array:
-    """Return z0 with the named parameters moved by a common factor of all sigmas and one of all
-    taus.
+    """Return z0 with the named parameters moved to the best point of a grid.
+
+    All sigmas move by a common factor, and so do all taus.
 
     Args:
         width: scale of the decades.
@@ -72,7 +73,7 @@ def _costs_at(
     layout: Layout, data: Data, noise: Noise, points: Float[Array, "s q"]
 ) -> Float[Array, " s"]:
     """Return the mean of the squared rows at each point."""
-    # Points are evaluated in sequence, because a batch needs the memory of as many filters.
+    # Points are evaluated in sequence, because a batch would need one filter's memory for each.
     return jax.lax.map(lambda z: jnp.mean(jnp.square(rows_of(layout, data, noise, z))), points)
 
 
@@ -195,8 +196,7 @@ def _between(low: float, high: float, step: float) -> np.ndarray:
 
 
 def _step(layout: Layout, data: Data, J: np.ndarray, i: int) -> float:
-    """Return the step between values of a delay [s], from how fast its effect on the rows
-    changes."""
+    """Return the step between values of a delay [s], from how fast the rows change with it."""
     dt = min(float(f.dt) for f in data.flights)
     if layout.noise_model != "white":
         return dt

@@ -139,8 +139,7 @@ class Layout(eqx.Module):
 
     @property
     def noises(self) -> tuple[str, ...]:
-        """Parameters of process noise: those of the disturbance, then the sds of noise before
-        filters."""
+        """Parameters of process noise: disturbance parameters, then sds of noise before filters."""
         return (*self.disturbance, *map(sensor_noise, self.filtered))
 
     @property
@@ -328,8 +327,10 @@ def _holds(model: Model, flight: Flight) -> tuple[str, ...]:
 
 
 def _one_covariance(problem: Problem, flights: tuple[Flight, ...]) -> tuple[tuple[int, ...], ...]:
-    """Return groups of a linear model's flights without missing samples that share one
-    covariance."""
+    """Return groups of flights that share one covariance.
+
+    They are flights of a linear model without missing samples.
+    """
     if not (problem.model.linear and problem.noise_model == "disturbance"):
         return ()
     groups: dict[Any, list[int]] = {}

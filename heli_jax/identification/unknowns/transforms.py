@@ -32,8 +32,7 @@ def kind(free: Free) -> str:
 
 
 def limits(free: Free) -> tuple[float, float]:
-    """Return lower and upper bound; a missing one is zero or infinity, depending on the start's
-    sign.
+    """Return lower and upper bound; the start's sign sets a missing one to zero or infinity.
 
     A positive mass with upper bound 2 kg lies between 0 and 2. If any sign is allowed, missing
     bounds are infinite.
@@ -116,7 +115,7 @@ def to_value(transform: str, z: Real, sign: Real, low: Real, high: Real) -> Real
 
 def to_coordinate(transform: str, x: Real, sign: Real, low: Real, high: Real) -> Real:
     """Return the coordinate of a value inside the bounds: the inverse of `to_value`, not traced."""
-    # With JAX each operation would load a program of its own, so NumPy is used.
+    # JAX would load a separate program for each operation, so NumPy is used.
     x, sign, low, high = (np.asarray(v) for v in (x, sign, low, high))
     # A value on a bound of a logit has an infinite coordinate.
     with np.errstate(all="ignore"):

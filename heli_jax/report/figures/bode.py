@@ -59,8 +59,7 @@ def phase(H: np.ndarray) -> np.ndarray:
 
 
 def baseline_response(baseline: Baseline, omega: np.ndarray) -> np.ndarray:
-    """Return Hd(e^{i omega dt}) (k,) of the recursive least squares, without the hold of its
-    input."""
+    """Return Hd(e^{i omega dt}) (k,) of the recursive least squares, without its input's hold."""
     # The unit circle is used because the continuous form may be an approximation.
     turns = omega * baseline.dt
     z, hold = np.exp(1j * turns), np.sinc(turns / (2.0 * np.pi)) * np.exp(-0.5j * turns)

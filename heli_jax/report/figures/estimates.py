@@ -35,8 +35,10 @@ def posterior_pairs(posterior: Posterior, fit: Fit) -> "Figure":
 
 
 def bootstrap_pairs(booted: Bootstrap, fit: Fit) -> "Figure | None":
-    """Draw estimates from simulated records by pairs of parameters; None for fewer than two fitted
-    parameters."""
+    """Draw estimates from simulated records by pairs of parameters.
+
+    Return None for fewer than two fitted parameters.
+    """
     if len(next(iter(booted.values.values()), ())) < 2:
         return None
     return _pairs(booted.values, fit, "Estimates of the bootstrap", style.GREEN, None)

@@ -104,9 +104,9 @@ def rls_history(baseline: Baseline, *, log_start: float | None = None) -> Chart:
 
 def _coefficients(words: str, t: np.ndarray, values: np.ndarray, names: list[str]) -> Panel:
     """Draw columns of values (N, k) over t (N,), by their names."""
-    # The second half of the record sets the range, with as much margin in total. A constant gives no
-    # range, so a fraction of its value is used. The first samples, with P(0) = 1e12 I, spread over
-    # many powers of ten; values are clipped to keep huge numbers out of paths.
+    # The second half of the record sets the range, with a margin. A constant gives no range, so a
+    # fraction of its value is used. The first samples, with P(0) = 1e12 I, spread over many powers
+    # of ten; values are clipped to keep huge numbers out of paths.
     later = values[values.shape[0] // 2 :]
     later = later[np.isfinite(later)]
     low, high = (float(later.min()), float(later.max())) if later.size else (0.0, 0.0)
