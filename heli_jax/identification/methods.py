@@ -35,7 +35,7 @@ METHODS = {
 def objective_of(method: str) -> Any:
     """Return the Objective of a method.
 
-    The type is Any because its class imports this module.
+    The type is Any because the module of its class imports this one.
 
     Args:
         method: its name in `METHODS`.

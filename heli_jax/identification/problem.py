@@ -117,7 +117,7 @@ class Problem:
     instrument: tuple[str, ...] | None = None
     """In frequency: inputs that use their instrument (`Flight.instruments`); None: all inputs for
     which every flight has one; (): none."""
-    # Any: an EquationErrorStart, whose class imports this module.
+    # Any: an EquationErrorStart, whose module imports this one.
     first_guess: Any = None
     """Origin of the starts, for the report; None if they are stated."""
     frequency: ResponseOptions = field(default_factory=ResponseOptions)

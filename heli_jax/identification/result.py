@@ -147,7 +147,7 @@ class Fit:
     held_out_frequency: HeldOutFrequency | None = None
     """Fit in frequency: agreement with the held-out flights in frequency."""
     adequacy: Adequacy = field(default_factory=Adequacy)
-    """Share of the fitted outputs that the model explains."""
+    """Adequacy of the model for the fitted outputs."""
     coloured: bool = False
     """True if `sd` and intervals allow for autocorrelated (coloured) residuals."""
     responses: ResponseAgreement | None = None

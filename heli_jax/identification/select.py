@@ -195,7 +195,7 @@ def choose(
         ValueError: a candidate is estimated by instrument.
     """
     for name, problem in problems.items():
-        # Responses by instrument have a likelihood of response errors, which is not comparable.
+        # Fits of responses by instrument do have a likelihood, that of the response errors.
         responses = objective_of(problem.method).fits_responses
         if problem.noise_model == "spectrum" and not responses and instruments_of(problem):
             raise ValueError(

@@ -102,8 +102,7 @@ class FrequencyError(Objective):
         return Residuals(rows_of_lines(layout, data, noise, u), None)
 
     def refusal(self, problem: Problem) -> str | None:
-        """Return why the flights cannot be used: different outputs, no complete part, or no
-        trim."""
+        """Return why flights are unusable: different outputs, no complete part, or no trim."""
         flights = problem.training
         refused = other_outputs(flights) or without_parts(flights) or absent_instrument(problem)
         return refused or cannot_linearise(problem)

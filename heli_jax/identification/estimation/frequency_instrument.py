@@ -83,8 +83,7 @@ def instrumented_inputs(
 def following(
     flights: Sequence[Flight], names: Sequence[str], signals: Sequence[Float[np.ndarray, "N r"]]
 ) -> tuple[dict[str, np.ndarray], ...]:
-    """Return the inputs by flight; named ones are reduced to the part (N,) that follows the
-    signals."""
+    """Return the inputs by flight, with named ones reduced to the part that follows the signals."""
     made = _parts([np.stack([f.inputs[n] for n in names], axis=1) for f in flights], signals)
     return tuple(
         {**f.inputs, **dict(zip(names, columns.T, strict=True))}

@@ -195,8 +195,8 @@ def log_determinants(W: Complex[np.ndarray, "K p p"]) -> Float[np.ndarray, " K"]
 GUST_LEAST, GUST_PART = 12.0, 0.12
 """Least sd of the Gaussian that smooths the rest, in lines and as a fraction of the frequency."""
 _CELLS = 0.16, 6.0
-"""Width of the spectral cells, as a fraction of frequency and in lines. Up to the fiftieth line
-cells are single lines, because slow modes are narrow; above they span 4 % of the frequency."""
+"""`part` and `least` of the spectral cells, see `knots_of`. Up to the fiftieth line cells are
+single lines, because slow modes are narrow; above they span 4 % of the frequency."""
 _OCTAVES = 2
 """Octaves between the corners of the gusts' spectra."""
 _STEPS = 24

@@ -36,7 +36,7 @@ def noise_guess_at(
     """
     each = [(d.sigma, d.tau) for d in disturbances_of(layout.model)]
     each = [names for names in each if set(names) & set(layout.disturbance)]
-    # A grid over all at once would have 18 to the power of their number points.
+    # A grid over all n disturbances at once would have 18^n points.
     coarse = [layout.disturbance, *(each if len(each) > 1 else [])]
     for names in coarse:
         z = _best_on_grid(layout, data, noise, z, names, 1.0)

@@ -93,7 +93,7 @@ class Layout(eqx.Module):
     scaled: tuple[str, ...] = eqx.field(static=True)
     """Filter error: outputs with their own unknown noise factor."""
     objective: Any = eqx.field(static=True)
-    """The method's `Objective`, whose class imports this module."""
+    """The method's `Objective`, whose module imports this one."""
     concentrated: bool = eqx.field(static=True)
     """Filter error: True if a common factor of all noise is concentrated out of the likelihood."""
     solver: str | None = eqx.field(static=True)
