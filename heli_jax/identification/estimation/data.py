@@ -93,7 +93,7 @@ def _flight_data(
         inputs=model.Inputs(**inputs),
         outputs=outputs,
         known={n: np.asarray(v, dtype) for n, v in flight.known.items()},
-        # `_with_state_scales` replaces these ones.
+        # These are placeholders for `_with_state_scales`.
         state_scale={n: np.ones((), dtype) for n in naming.names(model.State)},
         # A prior of ten times the signal is weak: it only stops unknowns without effect from
         # drifting.
