@@ -85,7 +85,7 @@ def _good(run: Trajectory) -> np.ndarray:
 
 
 def _finite(run: Trajectory) -> Trajectory:
-    """Return the run up to its last finite sample, with at least two samples."""
+    """Return the run before its first non-finite sample, with at least two samples."""
     good = _good(run)
     return run if good.all() else run.first(max(2, int(np.argmin(good))))
 
