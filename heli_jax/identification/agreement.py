@@ -1,4 +1,4 @@
-"""Measured and simulated signals of a fit, and how well they agree."""
+"""Measured and simulated signals of a fit, and their agreement."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -22,34 +22,34 @@ from heli_jax.identification.validation.metrics import (
 )
 
 _SURELY_CORRELATED = 4.5
-"""standard deviations from zero at which two residuals are taken for correlated"""
+"""Correlation of two residuals that is significant [standard deviations]."""
 _WORTH_IT = 0.1
-"""correlation below which intervals do not change enough to speak of: a long record shows less"""
+"""Correlation below which intervals hardly change, even if a long record shows it."""
 _FEWEST = 8
-"""pairs of samples from which a correlation is told"""
+"""Fewest pairs of samples for a correlation."""
 
 
 def correlated_residuals(signals: tuple[Signals, ...]) -> dict[str, float]:
-    """By 'output and output, flight' the correlation of residuals that are not independent.
+    """Return the correlation of dependent residuals by 'output and output, flight'.
 
-    White residuals of two outputs that go together count one piece of news twice.
+    The intervals are too narrow then, because two correlated residuals count as independent.
     """
     correlated = {}
     for s in signals:
         names = list(s.measured)
         for b, a in ((b, a) for i, a in enumerate(names) for b in names[:i]):
-            # By flight: over several joined flights a bias of each would pass for correlation.
+            # Flights are kept apart, because biases of joined flights would look like correlation.
             x, y = s.residual(a), s.residual(b)
-            # Only samples at which both were measured: sensors of different rates share few.
+            # Sensors of different rates share few samples; only those count.
             seen = np.isfinite(x) & np.isfinite(y)
             n = int(seen.sum())
             if n < _FEWEST or not (np.std(x[seen]) > 0 and np.std(y[seen]) > 0):
                 continue
-            # Two errors that grow go together whatever the noise does.
+            # Two diverging simulations have correlated errors, whatever the noise.
             if any(diverges(metrics(s.measured[m], s.simulated[m])) for m in (a, b)):
                 continue
             rho = float(np.corrcoef(x[seen], y[seen])[0, 1])
-            # Of independent white residuals rho has the standard deviation 1 / sqrt(n).
+            # For independent white residuals the standard deviation of rho is 1 / sqrt(n).
             if abs(rho) > max(_SURELY_CORRELATED / n**0.5, _WORTH_IT):
                 correlated[f"{b} and {a}, {s.flight}"] = rho
     return correlated
@@ -58,14 +58,16 @@ def correlated_residuals(signals: tuple[Signals, ...]) -> dict[str, float]:
 def whiteness_of(
     signals: tuple[Signals, ...], e: Evaluation, flights: tuple[Flight, ...], layout: Layout
 ) -> dict[str, Whiteness]:
-    """Whiteness by 'flight/output' of the innovations where there are some, else of the residuals,
-    whose colour intervals allow for; innovations of an output that was logged at a higher rate may
-    have its low-pass's."""
+    """Return the whiteness by 'flight/output' of innovations if there are any, else of residuals.
+
+    Intervals allow for autocorrelated residuals. Innovations of a decimated output may keep the
+    autocorrelation of its low-pass filter.
+    """
     fitted: dict[str, np.ndarray] = {}
     if e.innovations:
-        # Their variance falls while the filter learns the initial state: only over it are they one
-        # sequence of equal variance.
-        # A filter that is ill-conditioned may have variances below zero: NaN there, and said by it.
+        # The variance of innovations falls while the filter learns the initial state, so they are
+        # normalised. An ill-conditioned filter may have negative variances: these give NaN, and the
+        # filter reports them.
         with np.errstate(invalid="ignore", divide="ignore"):
             errors = {
                 f"{s.flight}/{n}": np.asarray(error) / np.sqrt(np.asarray(innovations.variance[n]))
@@ -86,7 +88,7 @@ def whiteness_of(
         for n in s.measured
         if e.innovations and is_decimated(f, n)
     }
-    # Of many signals one looks coloured by chance: the level is shared by all.
+    # Among many signals one looks autocorrelated by chance, so all share the significance level.
     return {
         name: whiteness_in_band(error, len(errors))
         if name in low_passed
@@ -100,7 +102,7 @@ def signals_of(
     simulated: Sequence[Mapping[str, Any]],
     innovations: Sequence[Innovations] = (),
 ) -> tuple[Signals, ...]:
-    """Measured and simulated signals; what is simulated carries the bias."""
+    """Return measured and simulated signals; simulations include the bias."""
     each = zip(labels(flights), flights, simulated, strict=True)
     return tuple(
         Signals(
@@ -118,11 +120,11 @@ def signals_of(
 
 
 def pooled_metrics(signals: tuple[Signals, ...], *, one_step: bool = False) -> dict[str, Metrics]:
-    """Metrics by output over all the flights that have it; of one-step predictions none without
-    innovations.
+    """Return metrics by output, pooled over all flights that have it.
 
-    Over their samples together and not averaged over flights: a long one counts for more, and a
-    flight in which an output hardly moves has no R^2 of its own worth having.
+    One-step predictions need innovations. Samples are pooled instead of averaging over flights.
+    Long flights then count for more, and flights in which an output hardly moves have no meaningful
+    R^2.
     """
     if one_step:
         signals = tuple(s for s in signals if s.innovations is not None)
@@ -132,7 +134,7 @@ def pooled_metrics(signals: tuple[Signals, ...], *, one_step: bool = False) -> d
         have = [s for s in signals if n in s.measured]
         measured = np.concatenate([s.measured[n] for s in have])
         model = np.concatenate([s.predicted(n) if one_step else s.simulated[n] for s in have])
-        # A simulation that diverges has no metrics: one number of it would outweigh all others.
+        # A diverging simulation has no metrics, because one such number would outweigh all others.
         finite = bool(np.isfinite(model[~np.isnan(measured)]).all())
         pooled[n] = metrics(measured, model) if finite else NO_METRICS
     return pooled

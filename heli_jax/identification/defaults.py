@@ -1,4 +1,4 @@
-"""Defaults that depend on the records: noise behind filters, offsets of sticks."""
+"""Defaults that depend on the records: filtered noise and offsets of sticks."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,44 +17,45 @@ from heli_jax.numerics.white_noise import rises_when_slower, wanders
 from heli_jax.vehicle import of_helicopter
 
 _WHITE_TO = 3.0
-"""times its cut-off, up to which rate noise behind a low-pass is nearly white: by simulation, see
-docs/onboard.md"""
+"""Sampling rate up to which low-passed noise is nearly white, as a multiple of the cut-off (by
+simulation, see docs/onboard.md)."""
 
 
 def filtered_noise(low_passes: Sequence[LowPass], flights: Sequence[Flight]) -> tuple[LowPass, ...]:
-    """Return the low-passes which the noise of the flights shows."""
+    """Return the low-passes that are visible in the noise of the flights."""
     return tuple(p for p in low_passes if any(_shows(p, f) for f in flights))
 
 
 def _shows(low_pass: LowPass, flight: Flight) -> bool:
-    """Return True if the noise of an output falls off as behind the low-pass."""
+    """True if the noise of an output falls off as behind the low-pass."""
     above = 1.0 / (flight.dt * _WHITE_TO * low_pass.hz)
     if low_pass.output not in flight.outputs or not above > 1.0:
         return False
     signal = flight.outputs[low_pass.output]
-    # Noise behind the filter, or a coarse log, hides this near the Nyquist frequency.
+    # Noise added behind the filter, or coarse resolution, hides the fall near the Nyquist
+    # frequency.
     return wanders(signal) or rises_when_slower(signal, max(2, int(above)))
 
 
-# Params, states and inputs are Any: records of a model.
+# Params, states and inputs are Any, because each model has its own records.
 
 _ALLOWED = 10.0
-"""times what was measured: the sd of the weak prior of a bias or an initial state"""
+"""Standard deviation of the weak prior of a bias or initial state, as a multiple of the measured
+size."""
 _ROUNDING = 1e-8
 
 
 def offset_inputs(
     model: Model, params: Any, flight: Flight, free: tuple[str, ...]
 ) -> tuple[str, ...]:
-    """Return the sticks of a vehicle in free flight, in the order of the model: inputs whose
-    constant offset is no initial state and no bias.
+    """Return the sticks of a vehicle in free flight that have an offset.
 
-    Throttle and collective have no centre. A free parameter that is a constant term of the
-    equations replaces all offsets.
+    The offset differs from an initial state or bias. The order is that of the model. Throttle and
+    collective have no centre. A free constant term in the equations replaces all offsets.
     """
     centreless = ("x_throttle", "x_collective", "Omega")
     sticks = [n for n in naming.names(model.Inputs) if n not in centreless]
-    # The nonlinear model is the whole helicopter, which flies free.
+    # The nonlinear model is the complete helicopter, which flies freely.
     if of_helicopter(model.Params) and not model.linear:
         return tuple(sticks)
     if flight.known:
@@ -67,11 +68,11 @@ def offset_inputs(
 
 
 def _taken_up(model: Model, params: Any, flight: Flight) -> set[str]:
-    """Return the inputs whose constant offset only moves the equilibrium, as a bias of the outputs.
+    """Return the inputs whose constant offset only moves the equilibrium, like a bias.
 
-    A vehicle in free flight has no such equilibrium, or one farther off than the weak prior of a
-    bias: a slow mode (the spiral of an aeroplane) goes far in the end, though not in the record.
-    The model is linearised at the flight's mean inputs.
+    A vehicle in free flight has no such equilibrium, or one beyond the weak prior of a bias. A slow
+    mode (an aeroplane's spiral) moves far in the end, but not within the record. The model is
+    linearised at the flight's mean inputs.
     """
     dtype = jnp.result_type(float)
     means = {n: np.asarray(np.mean(u), dtype) for n, u in flight.inputs.items()}
@@ -83,7 +84,7 @@ def _taken_up(model: Model, params: Any, flight: Flight) -> set[str]:
     C = C[[outputs.index(n) for n in flight.outputs]]
     A, (scale, _) = scipy.linalg.matrix_balance(A, permute=False, separate=True)
     B, C = B / scale[:, None], C * scale
-    # Only the observable part has to come to rest: the span of C', A'C', ...
+    # Only the observable part must come to rest: the span of C', A'C', ...
     V, further = np.zeros((len(A), 0)), C.T
     while further.size:
         sizes = np.max(np.abs(further), axis=0)
@@ -96,11 +97,11 @@ def _taken_up(model: Model, params: Any, flight: Flight) -> set[str]:
     x = np.linalg.lstsq(rates, -drive, rcond=_ROUNDING)[0]
     largest = np.array([np.ptp(flight.inputs[n]) / 2.0 for n in inputs])
     rms = np.array([np.sqrt(np.nanmean(np.square(y))) for y in flight.outputs.values()])
-    # Start values may be so large that their squares overflow.
+    # Squares of large start values may overflow.
     with np.errstate(all="ignore"):
         rests = np.linalg.norm(rates @ x + drive, axis=0) <= 1e-6 * np.linalg.norm(drive, axis=0)
-        # With another initial state it is there from the first sample on, unless an unstable mode
-        # leaves the record.
+        # With another initial state the offset is in equilibrium from the first sample on, unless
+        # an unstable mode diverges within the record.
         end = C @ V @ scipy.linalg.expm(rates * flight.duration) @ x
         moved = np.stack([C @ V @ x, end])
         near = np.all(np.abs(moved) * largest <= _ALLOWED * rms[:, None], axis=(0, 1))
@@ -108,7 +109,7 @@ def _taken_up(model: Model, params: Any, flight: Flight) -> set[str]:
 
 
 def _has_constant_term(model: Model, params: Any, free: tuple[str, ...]) -> bool:
-    """Return True if a free parameter is a constant term of the rates."""
+    """True if a free parameter is a constant term of the rates."""
     rng = np.random.default_rng(11)
     dtype = jnp.result_type(float)
 
@@ -121,7 +122,7 @@ def _has_constant_term(model: Model, params: Any, free: tuple[str, ...]) -> bool
 
     values = {n: jnp.asarray(getattr(params, n), dtype) for n in free}
     slopes_at_points = []
-    # A constant term has the same derivative everywhere: at three random points.
+    # A constant term has the same derivative everywhere; three random points suffice.
     for _ in range(3):
         slopes = jax.jacfwd(rates)(values, draw(model.State), draw(model.Inputs))
         by_state = naming.asdict(slopes)

@@ -1,4 +1,4 @@
-"""fit and check: parameters with intervals and a verdict, from a Problem."""
+"""Fit a Problem, or check it before the fit: estimates, intervals and identifiability."""
 
 import dataclasses
 import time
@@ -52,7 +52,7 @@ __all__ = [
 
 
 def _with_likely_gusts(problem: Problem) -> FirstGuess:
-    """Return the first guess, with the most likely gusts where nobody stated their size."""
+    """Return the first guess, with the most likely gusts unless their size is stated."""
     guess = first_guess(problem)
     if not (unstated_gusts(problem) and guess.layout.disturbance):
         return guess
@@ -66,7 +66,7 @@ def _require_problem(problem: Any) -> None:
             f"problem: expected a heli_jax.Problem, got {type(problem).__name__}; of a "
             "configuration heli_jax.config.problem(heli_jax.load_config(path)) makes it"
         )
-    # In single precision the rank of a Jacobian is rounding.
+    # In single precision rounding decides the rank of a Jacobian.
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise ValueError(
             "fit and check need double precision: call jax.config.update('jax_enable_x64', True) "
@@ -75,7 +75,7 @@ def _require_problem(problem: Any) -> None:
 
 
 def check(problem: Problem) -> Check:
-    """Judge at the start values, before any fit, what the flights can determine.
+    """Analyse before the fit, at the start values, which parameters the flights can determine.
 
     The noise is as stated, or guessed from the third differences of the measured signals.
     """
@@ -86,7 +86,8 @@ def check(problem: Problem) -> Check:
         guess = guess._replace(noise=noise, e=evaluate(guess.layout, guess.data, noise, guess.z))
     c = context_of(problem, guess)
     findings, verdict = diagnose(c), c.verdict
-    # Sensitivities are those of the model, even if the outputs do not follow its inputs.
+    # The sensitivities come from the model alone, so they mean nothing if the outputs ignore the
+    # inputs.
     if any(f.code == NOTHING_FOLLOWS and f.severity == "refuse" for f in findings):
         words = sentence("verdict.nothing-follows", names=verdict.names)
         verdict = verdict.nothing(words)
@@ -100,10 +101,10 @@ def context_of(problem: Problem, guess: FirstGuess | None = None) -> Context:
     """Return the Context of a problem at its start values.
 
     Args:
-        guess: of `first_guess`, where it is at hand already.
+        guess: the result of `first_guess`, if it is already computed.
     """
     guess = guess or first_guess(problem)
-    # Far from the optimum other parameters may be determined; the fit analyses its optimum again.
+    # Other parameters may be identifiable far from the optimum. The fit repeats the analysis there.
     at = Solution(*guess[:4])
     second = second_solutions(problem, at, guess.e, optimum=False)
     around = Around(second=second, valley=Valley(problem, at, guess.e))
@@ -120,21 +121,22 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
     """Rank windows of the flights by their information on the free parameters at the start values.
 
     Args:
-        length: of a window [s]; unless given a twelfth of the longest flight, between 2 and 20 s.
+        length: length of a window [s]; default: a twelfth of the longest flight, between 2 and 20
+            s.
 
     Raises:
-        ValueError: the length fits no flight, no window may be used, or the simulation is not
-            finite at the start values.
+        ValueError: the length fits no flight, no window is usable, or the simulation is not finite
+            at the start values.
     """
     if problem.noise_model == "spectrum":
-        # Windows are ranked by the simulation, whatever the fit uses.
+        # The ranking needs a simulation, also if the fit works in frequency.
         problem = dataclasses.replace(problem, method="output-error", instrument=None)
     guess = _with_likely_gusts(problem)
     at = Solution(*guess[:4])
     ranking = rank_windows(problem, at, guess.e, length)
     c = Context(problem, at, guess.e, guess.e, verdict_of(problem, guess.layout, guess.e))
     notes = tuple(gusts_guessed(c))
-    # A record that mostly rests may still have a good window.
+    # A record that is mostly at rest may still have a good window.
     asked = (rates_enough, nothing_follows, inputs_together)
     record = tuple(
         f._replace(severity="doubt") if f.code == NOTHING_FOLLOWS else f
@@ -153,22 +155,22 @@ def fit(
     max_steps: int = 200,
     progress: starting.Progress | None = None,
 ) -> Fit:
-    """Estimate the free parameters by the problem's method: one of `methods.METHODS`.
+    """Estimate the free parameters by the problem's method (`methods.METHODS`).
 
     Args:
-        problem: model, vehicle, flights and what is free.
-        starts: how many points to start from; the first is the given one, the others are drawn
-            within the bounds, or about a factor of three around the start. None: one, where a
-            delay is free in the deepest valley of the misfit over the delay; others only as
-            `restarts.RESTARTS` has them.
-        seed: of that draw.
-        max_steps: of the optimiser, in each of its runs.
-        progress: called with a line of text before each longer part of the work.
+        problem: model, vehicle, flights and free parameters.
+        starts: number of start points. The first is the stated one. The others are drawn within the
+            bounds, or within a factor of about three around the start. None: one start point. If a
+            delay is free, it starts at the deepest minimum of the misfit over the delay.
+            `restarts.RESTARTS` may add others.
+        seed: seed of the draw.
+        max_steps: limit for each run of the optimiser.
+        progress: called with a line of text before each longer computation.
 
     Returns:
-        A Fit whose `status` says whether it converged and whether the data determine what was
-        asked. Cramér-Rao intervals; those of output error allow for residuals that are not white
-        (`coloured`), and `overconfident` says where nothing does.
+        The Fit. Its `status` states whether it converged and whether the parameters are
+        identifiable. Intervals are Cramér-Rao. Those of output error allow for autocorrelated
+        residuals (`coloured`); `overconfident` marks intervals without that correction.
 
     Raises:
         ValueError: the simulation is not finite at the start values.
@@ -181,7 +183,7 @@ def fit(
     before = verdict_of(problem, guess.layout, guess.e)
     words = f"fitting {', '.join(guess.layout.of_interest)}"
     report(words)
-    # Simulations of an unstable model overflow, which the search handles.
+    # Simulations of an unstable model may overflow. The search handles that.
     with stage(words), np.errstate(over="ignore", invalid="ignore"):
         ended = search(problem, guess, starts, seed, max_steps, report)
     timing = {"fit": time.perf_counter() - began}
@@ -203,18 +205,18 @@ def _where_ended(
 
     c = context()
     if c.rounding:
-        # No diagnostic may use a likelihood that is rounding.
+        # Diagnostics must not use a likelihood that consists of rounding errors.
         optimum = optimum._replace(best=optimum.best._replace(converged=False))
         c = context()
     return c
 
 
 def _result(c: Context, starts: tuple[StartRow, ...], seed: int, timing: dict[str, float]) -> Fit:
-    """Put the Fit together."""
+    """Assemble the Fit."""
     layout, data, noise, _ = c.at
     assert c.optimum is not None
-    # AIC and BIC count no disturbance that vanished: with sigma_w = 0 the correlation time has no
-    # effect either.
+    # A vanished disturbance (sigma_w = 0) counts in neither AIC nor BIC: its correlation time has
+    # no effect either.
     unknowns = layout.determined + noise_unknowns(layout) - len(c.absent)
     findings = diagnose(c)
     estimates = {n: c.estimates[n] for n in layout.free}

@@ -1,7 +1,7 @@
-"""Start values for a fit in time by a fit with frequency error.
+"""Start values for a fit in time from a fit by frequency error.
 
-Far from its optimum the cost in time has local minima and plateaus, and the simulation of an
-unstable vehicle overflows. The cost in frequency needs no simulation.
+Far from its optimum the cost in time has local minima and plateaus, and simulations of an unstable
+vehicle overflow. The cost in frequency needs no simulation.
 """
 
 import dataclasses
@@ -16,15 +16,15 @@ from heli_jax.identification.result import Status
 
 
 class FrequencyErrorStart(NamedTuple):
-    """Start values, and the fit that they come from."""
+    """Start values, and the fit they come from."""
 
     values: dict[str, StartValue]
     status: Status
-    """of the fit in frequency"""
+    """Status of the fit in frequency."""
     seconds: float
-    """processing time [s]"""
+    """Processing time [s]."""
     notes: tuple[str, ...]
-    """of the fit in frequency"""
+    """Notes of the fit in frequency."""
 
     @property
     def findings(self) -> list[Finding]:
@@ -39,17 +39,17 @@ class FrequencyErrorStart(NamedTuple):
 
 
 def frequency_error_start(problem: Problem, *, max_steps: int = 200) -> FrequencyErrorStart:
-    """Return start values of the free parameters, by a fit of the same flights in frequency.
+    """Return start values of the free parameters from a fit of the same flights in frequency.
 
     Args:
-        problem: of frequency error, without a disturbance.
+        problem: a problem for frequency error, without a disturbance.
 
     Raises:
-        ValueError: frequency error cannot solve it; the sentence says why.
+        ValueError: frequency error cannot solve it, with the reason.
     """
     began = time.perf_counter()
     first = fit(dataclasses.replace(problem, flights=problem.training), max_steps=max_steps)
-    # Any of several solutions is as good a start as the only one would be.
+    # If there are several solutions, each is a good start.
     of_several = {n for other in first.verdict.second for n in other.changed}
     values = {}
     for name, e in first.estimates.items():
@@ -67,7 +67,7 @@ def frequency_error_start(problem: Problem, *, max_steps: int = 200) -> Frequenc
 
 
 def started(problem: Problem, guess: FrequencyErrorStart) -> Problem:
-    """Return the problem with the guess for its starts."""
+    """Return the problem with the guess as its start values."""
     free = dict(problem.free)
     free |= {n: free[n]._replace(start=v.value) for n, v in guess.values.items() if n in free}
     return dataclasses.replace(problem, free=free, first_guess=guess)

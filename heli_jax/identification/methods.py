@@ -1,7 +1,7 @@
-"""The methods of estimation by name: the one place where a new one is entered.
+"""Registry of the estimation methods.
 
-A method is an `Objective` (`estimation/objective.py`) in a file of its own. Entries name it by
-module and object, so that a problem can be stated before anything that solves it is imported.
+Each method is an `Objective` (`estimation/objective.py`) in its own file. Entries name module and
+object, so that a problem can be stated before estimators are imported.
 """
 
 import importlib
@@ -11,15 +11,15 @@ from heli_jax.errors import nearest
 
 
 class Method(NamedTuple):
-    """One way to estimate."""
+    """One estimation method."""
 
     home: str
-    """`module:object` of its Objective"""
+    """Place of its Objective, `module:object`."""
     label: str
-    """as reports call it"""
+    """Name in reports."""
 
 
-# By name: estimators import the problem, and a problem asks here which methods there are.
+# Names instead of imports: estimators import the problem, which in turn needs this table.
 _ESTIMATION = "heli_jax.identification.estimation"
 
 METHODS = {
@@ -33,18 +33,18 @@ METHODS = {
 
 
 def objective_of(method: str) -> Any:
-    """The Objective of a method.
+    """Return the Objective of a method.
 
-    Typed Any since its class stands above this module in the order of imports.
+    The type is Any because the module of its class imports this one.
 
     Args:
         method: its name in `METHODS`.
 
     Raises:
-        ValueError: there is no such method.
+        ValueError: unknown method.
     """
     if method not in METHODS:
-        # Cut: a configuration may hold anything in this place.
+        # The value is cut because a configuration may hold anything here.
         raise ValueError(
             f"method: expected one of {', '.join(METHODS)}, got {method!r:.60}"
             f"{nearest(str(method)[:60], METHODS)}"

@@ -1,4 +1,4 @@
-"""Problem: model, flights and free parameters, and the checks that they fit together."""
+"""Problem: model, flights and free parameters, and checks of their consistency."""
 
 import functools
 import math
@@ -33,16 +33,16 @@ Sign = Literal["keep", "any"]
 
 
 class Free(NamedTuple):
-    """A parameter to be estimated: where to start, between what bounds, with what prior.
+    """Parameter to estimate: start, bounds and prior.
 
-    `sign` says whether the estimate may have another sign than the start: `keep` (searched in its
-    logarithm) or `any` (searched in units of its start, which may then be zero). Unless given, a
-    Helicopter's parameters keep theirs, and so do those that `Model.positive` names; others of a
-    model of one's own may have any. Bounds that lie on one side of zero keep it in either case.
+    `sign` is `keep` (the estimate has the sign of the start; searched in its logarithm) or `any`
+    (searched in units of its start, which may be zero). By default parameters of a Helicopter and
+    those in `Model.positive` keep their sign; parameters of user models may have any. Bounds on one
+    side of zero keep the sign in either case.
     """
 
     start: float = math.nan
-    """the initial guess; NaN to find one before a Problem is made (`equation_error_start`)"""
+    """Initial guess; NaN: `equation_error_start` finds it before the Problem is made."""
     lower: float | None = None
     upper: float | None = None
     prior: Prior | None = None
@@ -50,15 +50,15 @@ class Free(NamedTuple):
 
 
 class Nuisance(NamedTuple):
-    """Unknowns of the experiment, estimated beside the parameters.
+    """Unknowns of the experiment, estimated together with the parameters.
 
-    `initial_state`, `bias` and `input_offset` belong to each flight; `input_gain` (one factor an
-    input) and `time_shift` [s] (the stick acted this much later, or earlier where negative, than
-    logged) are shared by all flights.
+    `initial_state`, `bias` and `input_offset` belong to each flight. `input_gain` (one factor for
+    each input) and `time_shift` [s] are shared by all flights. A positive time shift means that the
+    stick acted later than logged.
 
-    `input_offset` is a constant that is added to the logged input, since no stick is centred: True
-    for all inputs, or their names; None leaves it to the vehicle: on for the sticks of one in free
-    flight, where an offset is integrated (`heli_jax.identification.defaults`).
+    `input_offset` is a constant added to the logged input, because sticks are not centred exactly.
+    True: all inputs; or their names. None: the sticks of a vehicle in free flight, where an offset
+    is integrated (`heli_jax.identification.defaults`).
     """
 
     initial_state: bool = True
@@ -68,28 +68,28 @@ class Nuisance(NamedTuple):
     input_offset: bool | tuple[str, ...] | None = None
 
 
-# `Any` stands for Params, a class of the user's, here and below.
+# Below, `Any` is Params, which may be a user's class.
 
 _FEWEST = 4
-"""samples of a window at least: each window brings an initial state of its own"""
+"""Least samples of a window, because each window adds an initial state."""
 FEWEST_SEEN = 8
-"""measured samples of an output at least"""
+"""Least measured samples of an output."""
 _PER_PARAMETER = 3
-"""samples of a flight for each free parameter, at least"""
+"""Least samples of a flight for each free parameter."""
 
 MAX_TIME_SHIFT = 0.5
-"""Bound on an estimated time shift to either side [s]."""
+"""Bound on an estimated time shift, to either side [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A model, a vehicle, flights, and free parameters.
+    """Model, vehicle, flights and free parameters.
 
     Flights with `hold_out` are predicted, never fitted. A flight's `known` parameters replace the
     vehicle's for that flight.
 
     Raises:
-        ValueError: parts that do not fit together, with their place.
+        ValueError: inconsistent parts, with their place.
         TypeError: `model` is no Model.
     """
 
@@ -101,30 +101,30 @@ class Problem:
     solver: str | None = None
     substeps: int = 4
     gain_units: Mapping[str, str] = field(default_factory=dict)
-    """the unit that an input's gain carries, where the log's unit is a plain number"""
+    """Unit of an input's gain, if the log holds plain numbers."""
     method: str = "output-error"
-    """output-error compares with a simulation; filter-error with one-step predictions of a
-    Kalman filter, for models with a disturbance (`with_disturbance`)"""
+    """`output-error` compares with a simulation. `filter-error` compares with one-step predictions
+    of a Kalman filter, for models with a disturbance (`with_disturbance`)."""
     fixed_noise: tuple[str, ...] = ()
-    """noise that filter error does not estimate: `sigma_w` and `tau_w` (of several disturbances
-    `sigma_w_p`, ...) of `vehicle`, `sigma_y` (the measurement noise) by the flights' `sd`"""
+    """Noise that filter error does not estimate. `sigma_w` and `tau_w` (with several disturbances
+    `sigma_w_p`, ...) come from `vehicle`, `sigma_y` (measurement noise) from the flights' `sd`."""
     window: float | None = None
-    """multiple shooting: flights are simulated in windows of this length [s], each from an initial
-    state of its own, since the error of an initial state grows in unstable flight"""
+    """Multiple shooting: length of the windows [s], each with its own initial state. In unstable
+    flight the error of an initial state grows, so windows must be short."""
     continuity: float | None = None
-    """with windows: standard deviation of the jump of each state from one window to the next, as a
-    part of its motion; None: free jumps"""
+    """Standard deviation of the jump of each state between windows, as a fraction of its motion;
+    None: unrestricted jumps."""
     instrument: tuple[str, ...] | None = None
-    """in frequency: inputs that are taken by their instrument (`Flight.instruments`); None: all
-    that every flight holds one of; (): none"""
-    # Any: an EquationErrorStart, whose class stands above this module in the order of imports.
+    """In frequency: inputs that use their instrument (`Flight.instruments`); None: all inputs for
+    which every flight has one; (): none."""
+    # Any: an EquationErrorStart, whose module imports this one.
     first_guess: Any = None
-    """the origin of the starts, for the report; None where they are given"""
+    """Origin of the starts, for the report; None if they are stated."""
     frequency: ResponseOptions = field(default_factory=ResponseOptions)
-    """frequency-response: band, windows, and the responses that are fitted"""
+    """For frequency-response: band, windows and fitted responses."""
 
     def __post_init__(self) -> None:
-        # The model first: other checks take its names and units.
+        # The model comes first because the other checks need its names and units.
         check_model(self.model)
         _check_arguments(self.model.Params, self.vehicle, self.flights, self.free)
         if not isinstance(self.nuisance, Nuisance):
@@ -135,7 +135,7 @@ class Problem:
         if self.instrument is not None:
             names = (self.instrument,) if isinstance(self.instrument, str) else self.instrument
             object.__setattr__(self, "instrument", tuple(names))
-        # All constants of a helicopter keep their sign; derivatives of an aircraft, say, do not.
+        # All constants of a helicopter keep their sign, unlike the derivatives of an aircraft.
         positive = set(self.model.positive)
         if of_helicopter(self.model.Params):
             positive |= set(naming.names(Helicopter))
@@ -164,19 +164,19 @@ class Problem:
 
     @property
     def noise_model(self) -> str:
-        """The noise model of the method (`Objective.noise_model`)."""
+        """Noise model of the method (`Objective.noise_model`)."""
         return objective_of(self.method).noise_model
 
     @property
     def noise(self) -> dict[str, Free]:
-        """The parameters of the disturbances that filter error estimates, with their starts."""
+        """Disturbance parameters that filter error estimates, with their starts."""
         if self.noise_model != "disturbance":
             return {}
-        # The size of the motion, and a second: the start of a coarse search.
+        # The size of the motion and one second start a coarse search.
         sizes = {d.sigma: self.motion for d in disturbances_of(self.model)}
         free = {n: Free(sizes.get(n, 1.0)) for n in self.noise_names}
         for name in free:
-            # A stated value counts. Zero is the default of a sigma.
+            # A stated value counts. Zero is the default of a sigma and means 'not stated'.
             value = float(getattr(self.vehicle, name))
             if math.isfinite(value) and value > 0:
                 free[name] = Free(value)
@@ -184,7 +184,7 @@ class Problem:
 
     @property
     def noise_names(self) -> tuple[str, ...]:
-        """The parameters of the disturbances that filter error estimates."""
+        """Names of the disturbance parameters that filter error estimates."""
         if self.noise_model != "disturbance":
             return ()
         names = [n for d in disturbances_of(self.model) for n in (d.sigma, d.tau)]
@@ -192,11 +192,11 @@ class Problem:
 
     @functools.cached_property
     def filtered_noise(self) -> dict[str, Free]:
-        """By output the start of the sd of its sensor's noise before on-board low-passes, if the
-        samples show them; filter error estimates it."""
+        """Sensor noise before on-board low-passes, which filter error estimates: start of its sd by
+        output, if the samples show the low-pass."""
         if self.noise_model != "disturbance" or self.noise_is_fixed:
             return {}
-        # A model may have its own noise of that sensor.
+        # A model may define its own noise of that sensor.
         own = naming.names(self.model.Params)
         coloured = [p.output for p in filtered_noise(self.model.low_passes, self.training)]
         return {
@@ -208,16 +208,16 @@ class Problem:
 
     @property
     def noise_is_fixed(self) -> bool:
-        """True if the measurement noise is taken as stated."""
+        """True if the measurement noise is fixed at its stated value."""
         return self.noise_model == "disturbance" and "sigma_y" in self.fixed_noise
 
     @functools.cached_property
     def offset_inputs(self) -> tuple[str, ...]:
-        """The inputs whose offset is estimated, in the order of the model: those of
+        """Inputs with an estimated offset, in the order of the model: those of
         `nuisance.input_offset`, or the sticks of a vehicle in free flight."""
         inputs, requested = naming.names(self.model.Inputs), self.nuisance.input_offset
         if requested is None:
-            # The first flight alone: all are of one vehicle.
+            # One flight is enough, because all are of one vehicle.
             first = self.training[0]
             return offset_inputs(self.model, self.start_params(), first, tuple(self.free))
         if isinstance(requested, bool):
@@ -226,24 +226,24 @@ class Problem:
 
     @property
     def motion(self) -> float:
-        """The largest standard deviation of a measured output; 1 where nothing moves."""
+        """Largest standard deviation of a measured output; 1 if nothing moves."""
         return max(float(np.nanstd(y)) for f in self.training for y in f.outputs.values()) or 1.0
 
     @property
     def training(self) -> tuple[Flight, ...]:
-        """The flights that are fitted."""
+        """Fitted flights."""
         return tuple(f for f in self.flights if not f.hold_out)
 
     def start_params(self, known: Mapping[str, Any] | None = None) -> Any:
-        """The vehicle with the free parameters at their starts.
+        """Return the vehicle with the free parameters at their starts.
 
         Args:
-            known: other values by name, SI, such as those known of a flight.
+            known: other values by name, SI, such as a flight's known parameters.
         """
         return self.params_with({n: f.start for n, f in self.free.items()} | dict(known or {}))
 
     def params_with(self, values: Mapping[str, Any]) -> Any:
-        """The vehicle with other values of parameters that are free, or known of a flight.
+        """Return the vehicle with other values of free parameters, or of a flight's known ones.
 
         Args:
             values: by name, SI.
@@ -252,7 +252,7 @@ class Problem:
 
     @functools.cached_property
     def _varied(self) -> naming.Varied:
-        # `_check_flight` refuses other names.
+        # `_check_flight` rejects other names.
         own = set(naming.names(type(self.vehicle)))
         known = (n for f in self.flights for n in f.known if n in own)
         return naming.Varied(self.vehicle, dict.fromkeys((*self.free, *known)))
@@ -316,7 +316,7 @@ def _check_windows(problem: Problem) -> None:
             raise ValueError(f"{key} must be above zero, got {value:g}")
     if window is None:
         return
-    # A filter corrects its state at every sample.
+    # A filter corrects its state at every sample, so it needs no windows.
     if problem.noise_model != "white":
         raise ValueError(f"window is for method output-error: {problem.method} needs none")
     if not problem.nuisance.initial_state:
@@ -345,7 +345,7 @@ def _check_possible(problem: Problem) -> None:
         wrong = impossible(stated)
         if wrong:
             raise ValueError(f"free: the {key} of {wrong}")
-    # Constants that are possible one by one may contradict each other, such as R1 and R2.
+    # Constants that are valid alone may contradict each other, such as R1 and R2.
     concrete = {n: float(np.asarray(v)) for n, v in naming.asdict(problem.start_params()).items()}
     wrong = impossible({n: v for n, v in concrete.items() if not math.isnan(v)})
     if wrong:
@@ -357,7 +357,7 @@ def _check_flight(flight: Flight, problem: Problem) -> None:
     missing = [n for n in naming.names(model.Inputs) if n not in flight.inputs]
     if missing:
         raise ValueError(f"{where} has no input {missing[0]!r}, which model {model.name} needs")
-    # An output of the model need not be measured.
+    # A model may have outputs that are not measured.
     unknown = [n for n in flight.outputs if n not in naming.names(model.Outputs)]
     if unknown:
         raise ValueError(
@@ -367,7 +367,7 @@ def _check_flight(flight: Flight, problem: Problem) -> None:
     if not flight.outputs:
         raise ValueError(f"{where} has no output: nothing can be compared with the model")
     for name, y in flight.outputs.items():
-        # Most may be missing, as of a slow sensor; but a handful of samples has no noise.
+        # Most samples may be missing, as with a slow sensor, but the noise needs more than a few.
         if (seen := int(np.isfinite(y).sum())) < FEWEST_SEEN:
             raise ValueError(
                 f"{where}, output {name!r}: expected at least {FEWEST_SEEN} measured samples, got "
@@ -378,7 +378,7 @@ def _check_flight(flight: Flight, problem: Problem) -> None:
                 f"{where}, output {name!r}: expected the sd of its noise, which is fixed "
                 "(sigma_y), got none"
             )
-    # A parameter is known of a flight or estimated over all.
+    # A parameter is either known for a flight or estimated over all flights.
     for name, value in flight.known.items():
         if name not in naming.names(model.Params):
             raise ValueError(
@@ -393,7 +393,7 @@ def _check_flight(flight: Flight, problem: Problem) -> None:
         if wrong:
             raise ValueError(f"{where}, known: {wrong}")
     count, least = len(problem.free), _PER_PARAMETER * len(problem.free)
-    # By the output with the most measured samples.
+    # The output with the most measured samples counts.
     measured = max(int(np.isfinite(y).sum()) for y in flight.outputs.values())
     if not flight.hold_out and measured < least:
         raise ValueError(
@@ -405,10 +405,10 @@ def _check_flight(flight: Flight, problem: Problem) -> None:
 def _check_model(problem: Problem) -> None:
     params, model = problem.start_params(), problem.model
     for flight in problem.flights:
-        # The known parameters of a flight may complete a vehicle.
+        # A flight's known parameters may complete the vehicle.
         own = naming.replace(params, **flight.known)
         require_constants(model, own)
-        # First rates depend on the flight's first inputs.
+        # The first rates depend on the flight's first inputs.
         if not model.linear and not of_helicopter(model.Params):
             first = {n: float(u[0]) for n, u in flight.inputs.items()}
             if wrong := cannot_start(model, own, first):
@@ -417,13 +417,13 @@ def _check_model(problem: Problem) -> None:
 
 
 def _check_free(name: str, free: Free, model: Model) -> None:
-    """Refuse a free parameter that the model does not have, or whose numbers contradict.
+    """Reject a free parameter that the model lacks, or whose numbers contradict each other.
 
     Args:
         free: its start, bounds, prior and sign; the sign is filled in.
 
     Raises:
-        ValueError: naming the key, what was expected and what was got.
+        ValueError: naming the key, the expectation and the value.
     """
     known, start = naming.names(model.Params), free.start
     if name not in known:
@@ -459,7 +459,7 @@ def _check_free(name: str, free: Free, model: Model) -> None:
             f".sign: keep: expected bounds of one sign, got {low:g} to {high:g}",
         ),
         (low >= high, f": lower must be below upper, got {low:g} and {high:g}"),
-        # Between two bounds of different sign a bound has an infinite coordinate.
+        # If the bounds have different signs, a start at a bound has an infinite coordinate.
         (
             not low < start < high,
             f".start: expected a value inside {low:g} to {high:g}, got {start:g}",
@@ -477,7 +477,7 @@ def _check_free(name: str, free: Free, model: Model) -> None:
 
 
 def _numbers(free: Free) -> dict[str, Any]:
-    """Return the stated numbers, by key."""
+    """Return the stated numbers by key."""
     prior = free.prior
     numbers = {"start": free.start, "lower": free.lower, "upper": free.upper}
     if prior is not None:
@@ -486,20 +486,21 @@ def _numbers(free: Free) -> dict[str, Any]:
 
 
 _HEADINGS = {"psi", "yaw"}
-"""angles that may exceed a turn"""
+"""Angles that may exceed a turn."""
 _FURTHEST = 6 * math.pi
-"""rad: linear models of an axis roll over in long records, with no pilot to hold them"""
+"""Largest plausible angle [rad]; without a pilot, linear models of one axis roll over in long
+records."""
 _HALF_TURN = 1.1 * math.pi
-"""rad: only an unwrapped roll or loop goes beyond"""
+"""Largest angle without unwrapping [rad]; only unwrapped rolls or loops exceed it."""
 _FASTEST, _OVER = 15.0, 0.1
-"""rad/s, 860 deg/s: no helicopter turns as fast for that many seconds"""
+"""Rate [rad/s] (860 deg/s) that no helicopter sustains, and its duration [s]."""
 
 
 def _check_arguments(params: type, vehicle: Any, flights: Any, free: Any) -> None:
-    """Refuse arguments of another type.
+    """Reject arguments of a wrong type.
 
     Raises:
-        TypeError: naming the argument, what was expected and what was found.
+        TypeError: naming the argument, the expected type and the actual one.
     """
     check_params(params, vehicle)
     several = isinstance(flights, Sequence) and not isinstance(flights, str)
@@ -521,18 +522,18 @@ def _check_arguments(params: type, vehicle: Any, flights: Any, free: Any) -> Non
             kind = type(each.prior).__name__
             raise TypeError(f"free.{name}.prior: expected Prior(mean, sd), got {kind}")
         for key, value in _numbers(each).items():
-            # Numbers of Python, NumPy or JAX; not True.
+            # Numbers of Python, NumPy or JAX are accepted, booleans are not.
             kind = getattr(value, "dtype", np.dtype(type(value))).kind
             if getattr(value, "shape", ()) != () or kind not in "iuf":
                 raise TypeError(f"free.{name}.{key}: expected a number, got {value!r:.60}")
 
 
 def _warn_of_degrees(outputs: type, flights: Sequence[Flight]) -> None:
-    """Warn of angles that turn further or faster than a helicopter does, as degrees would.
+    """Warn of angles that turn further or faster than a helicopter can, as degrees would.
 
     Args:
         outputs: the model's class, which has the units.
-        flights: those made in Python; of a log its unit is stated and checked.
+        flights: flights made in Python; logs state their units, which are checked.
     """
     angles = {n for n in naming.names(outputs) if naming.unit(outputs, n) == "rad"} - _HEADINGS
     signals = [(f, n) for f in flights if f.source is None for n in f.outputs if n in angles]
@@ -540,7 +541,7 @@ def _warn_of_degrees(outputs: type, flights: Sequence[Flight]) -> None:
         y, steps = np.asarray(flight.outputs[name], float), max(1, round(_OVER / flight.dt))
         turned = np.abs(y[steps:] - y[:-steps])
         turned = turned[np.isfinite(turned)]
-        # Without single wild samples.
+        # The quantile ignores single outliers.
         fastest = float(np.quantile(turned, 0.98)) / (steps * flight.dt) if turned.size else 0.0
         largest = float(np.nanmax(np.abs(y), initial=0.0))
         if largest > _FURTHEST or (largest > _HALF_TURN and fastest > _FASTEST):

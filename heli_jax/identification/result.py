@@ -31,35 +31,35 @@ class Estimate(NamedTuple):
     upper95: float | None
     unit: str
     start: float
-    """the initial guess"""
+    """Initial guess."""
     prior_share: float
-    """share of the posterior variance that the priors explain, 0 to 1"""
+    """Share of the prior in the posterior precision, 0 to 1."""
     at_bound: bool
     sd_white: float | None = None
-    """Cramér-Rao sd for white residuals"""
+    """Cramér-Rao sd for white residuals."""
     sd_alone: float | None = None
-    """Cramér-Rao sd if all other unknowns were known: Tischler's insensitivity"""
+    """Cramér-Rao sd if all other unknowns were known: Tischler's insensitivity."""
 
     def without_interval(self) -> "Estimate":
-        """Return the value without sd and interval."""
+        """Return the estimate without sd and interval."""
         return self._replace(sd=None, lower95=None, upper95=None, sd_white=None, sd_alone=None)
 
 
 class Signals(NamedTuple):
-    """One flight as measured and as simulated; arrays (N,), SI."""
+    """Measured and simulated signals of one flight; arrays (N,), SI."""
 
     flight: str
     hold_out: bool
     times: np.ndarray
-    """[s]"""
+    """Time [s]."""
     inputs: dict[str, np.ndarray]
     measured: dict[str, np.ndarray]
     simulated: dict[str, np.ndarray]
-    """with the estimated bias"""
+    """Simulation including the estimated bias."""
     innovations: dict[str, np.ndarray] | None = None
-    """filter error: measured - predicted from all samples before, SI"""
+    """Filter error: measurement less its prediction from all earlier samples, SI."""
     log_start: float | None = None
-    """time of the first sample [s] from the log's beginning; None without a log"""
+    """Time of the first sample from the log's beginning [s]; None without a log."""
 
     @property
     def log_times(self) -> np.ndarray:
@@ -86,28 +86,28 @@ class Check:
 
     verdict: Verdict
     noise: dict[str, float]
-    """sd assumed for each flight and output"""
+    """Assumed sd by flight and output."""
     guessed: tuple[str, ...] = ()
-    """flights and outputs whose noise nobody stated"""
+    """Flights and outputs without stated noise."""
     findings: tuple[Finding, ...] = ()
-    """the most severe first"""
+    """Findings, the most severe first."""
     at_zero: dict[str, tuple[float, str]] = field(default_factory=dict)
-    """by parameter that starts at zero, the size [SI] that its expected sd is relative to, and its
-    unit"""
+    """For each parameter that starts at zero: the size [SI] that scales its expected sd, and its
+    unit."""
     log_notes: tuple[Finding, ...] = ()
-    """notes of the readers of the logs"""
+    """Notes from reading the logs."""
 
     def __repr__(self) -> str:
         doubts = sentences(f for f in self.findings if f.bad)
         return "\n".join([self.verdict.text, *(f"! {doubt}" for doubt in doubts)])
 
 
-# Compared by identity (eq=False): a field-wise == of records of arrays has no single truth value.
+# Compared by identity (eq=False), because == of array fields has no single truth value.
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The result of a fit: plain data."""
+    """Result of a fit, as plain data."""
 
     model: str
     method: str
@@ -115,72 +115,72 @@ class Fit:
     n_samples: int
     estimates: dict[str, Estimate]
     nuisance: dict[str, Estimate]
-    params: Any  # of the model's Params, a class of the user's
-    """the vehicle with the estimates in place"""
+    params: Any  # Params, possibly a user's class
+    """Vehicle with the estimates."""
     verdict_before: Verdict
     verdict: Verdict
     noise: dict[str, float]
-    """residual sd for each flight and output: 'flight/output'"""
+    """Residual sd by 'flight/output'."""
     log_likelihood: float
-    """Gaussian, of the measured outputs in SI"""
+    """Gaussian log-likelihood of the measured outputs in SI."""
     unknowns: int
-    """all that was estimated: parameters, disturbance, noise, initial states, biases"""
+    """Number of all estimated unknowns: parameters, disturbance, noise, initial states, biases."""
     signals: tuple[Signals, ...]
     metrics: dict[str, Metrics]
-    """of the simulation, over the fitted flights, by output"""
+    """Metrics of the simulation by output, over the fitted flights."""
     validation: dict[str, Metrics]
-    """of the simulation, over the flights held out, by output"""
+    """Metrics of the simulation by output, over the held-out flights."""
     one_step: dict[str, Metrics]
-    """filter error: of the prediction one sample ahead, over the fitted flights, by output"""
+    """Filter error: metrics of one-step predictions by output, over the fitted flights."""
     one_step_validation: dict[str, Metrics]
-    """the same over the flights held out"""
+    """Filter error: metrics of one-step predictions by output, over the held-out flights."""
     whiteness: dict[str, Whiteness]
     starts: tuple[StartRow, ...]
     steps: int
     trace: tuple[tuple[int, float], ...]
-    """(steps, cost) of every round of the optimiser"""
+    """Steps and cost of each round of the optimiser."""
     findings: tuple[Finding, ...]
     reached: Solution
-    """the optimum in the optimiser's coordinates, for profile, bootstrap and NUTS"""
+    """Optimum in the optimiser's coordinates, for profile, bootstrap and NUTS."""
     validation_free_run: dict[str, Metrics] = field(default_factory=dict)
-    """with windows: the same simulated in one piece, from the initial state of the first window"""
+    """Windows: metrics of an uninterrupted simulation from the first window's initial state."""
     held_out_frequency: HeldOutFrequency | None = None
-    """of a fit in frequency: what the flights held out say in frequency"""
+    """Fit in frequency: agreement with the held-out flights in frequency."""
     adequacy: Adequacy = field(default_factory=Adequacy)
-    """how well the fitted outputs are explained"""
+    """Adequacy of the model for the fitted outputs."""
     coloured: bool = False
-    """whether `sd` and the intervals allow for autocorrelated (coloured) residuals"""
+    """True if `sd` and intervals allow for autocorrelated (coloured) residuals."""
     responses: ResponseAgreement | None = None
-    """frequency-response: how the model's responses agree with the measured ones"""
+    """Agreement of the model's frequency responses with the measured ones."""
     feedback: tuple[Feedback, ...] = ()
-    """by flight and input, whether it follows the response"""
+    """For each flight and input, whether the input follows the response (feedback)."""
     instruments: tuple[str, ...] = ()
-    """the inputs that were taken by their instrument"""
+    """Inputs replaced by their instruments."""
     seed: int = 0
     timing: dict[str, float] = field(default_factory=dict)
 
     @property
     def method_label(self) -> str:
-        """The method as reports call it."""
+        """Name of the method in reports."""
         label = METHODS[self.method].label
         by = ", ".join(self.instruments)
         return f"{label} by instrument ({by})" if by else label
 
     @property
     def distrusts(self) -> dict[str, Distrust]:
-        """By parameter why its interval may not be used; none where no optimum was reached."""
+        """Reason to distrust a parameter's interval, by parameter; empty without an optimum."""
         if self.status == "not-converged":
             return {}
         return distrusted(self.findings, self.estimates)
 
     @property
     def untrusted(self) -> tuple[str, ...]:
-        """The parameters whose intervals may not be used."""
+        """Parameters with untrustworthy intervals."""
         return tuple(self.distrusts)
 
     @property
     def distrust(self) -> str:
-        """A sentence for each reason to distrust intervals; empty if all are trusted."""
+        """One sentence for each reason to distrust intervals; empty if all are trusted."""
         by_reason: dict[str, list[str]] = {}
         for name, d in self.distrusts.items():
             size = "" if d.shift is None else f" (off by about {abs(d.shift):.2g})"
@@ -192,27 +192,27 @@ class Fit:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """The sentences of the findings, but of those that only say that all is well."""
+        """Sentences of the findings, except those that only confirm that all is well."""
         return tuple(sentences(f for f in self.findings if f.severity != "ok"))
 
     @property
     def exit_code(self) -> int:
-        """0, 3 or 4, as the command line returns it."""
+        """Exit code of the command line: 0, 3 or 4."""
         return exit_code(self.status, self.adequate, self.distrusts)
 
     @property
     def not_identifiable(self) -> tuple[str, ...]:
-        """The free parameters that the data do not determine."""
+        """Free parameters that are not identifiable."""
         return tuple(n for n, e in self.estimates.items() if e.sd is None)
 
     @property
     def adequate(self) -> bool:
-        """True if no finding shows that the model does not explain the record."""
+        """True if no finding shows that the model fails to explain the record."""
         return not any(f.denies for f in self.findings)
 
     @property
     def adequate_in_words(self) -> str:
-        """`yes`, `not judged` (no optimum was reached), or `no (VAF of p is 20.0 %)`."""
+        """`yes`, `not judged` (no optimum), or `no (VAF of p is 20.0 %)`."""
         if self.status == "not-converged":
             return "not judged"
         return f"no ({'; '.join(self.denials)})" if self.denials else "yes"
@@ -222,8 +222,8 @@ class Fit:
         """Reasons why the model is not adequate, each in a few words."""
         return tuple(dict.fromkeys(f.brief for f in self.findings if f.denies))
 
-    # `unknowns` counts noise, disturbance and initial states too: models that differ in these are
-    # compared by differences of the criteria, in which the constants of the likelihood cancel.
+    # `unknowns` also counts noise, disturbance and initial states. Models are compared by
+    # differences of the criteria, in which the constants of the likelihood cancel.
 
     @property
     def aic(self) -> float:
@@ -237,8 +237,7 @@ class Fit:
 
     @property
     def overconfident(self) -> bool:
-        """True if the intervals are too narrow: residuals are coloured and nothing allows for
-        it."""
+        """True if intervals are too narrow, because residuals are autocorrelated."""
         spectrum = objective_of(self.method).noise_model == "spectrum"
         return not self.white and not self.coloured and not spectrum
 
@@ -247,7 +246,7 @@ class Fit:
         """Name of the intervals."""
         if self.status != "not-converged" and self.coloured:
             return "95 % (autocorrelated residuals)"
-        # Where no optimum was reached there are none.
+        # Without an optimum there are no intervals.
         narrow = self.overconfident and self.status != "not-converged"
         return "95 % (too narrow)" if narrow else "95 % interval"
 
@@ -256,7 +255,7 @@ class Fit:
         """True if all residuals look white."""
         return all(w.white for w in self.whiteness.values())
 
-    # What prints and exports stands above this module in the order of imports, hence inside.
+    # The modules that print and export import this one, so they are imported inside.
 
     def __repr__(self) -> str:
         from heli_jax.summaries import as_text, of_fit
@@ -269,11 +268,13 @@ class Fit:
         return as_html(of_fit(self))
 
     def to_dataframe(self, *, nuisance: bool = False) -> "pd.DataFrame":
-        """The estimates as a pandas data frame: a row each, with value, sd, lower95, upper95, unit
-        and prior_share; NaN where the data do not determine a parameter.
+        """Return the estimates as a pandas data frame, one row each.
+
+        The columns are value, sd, lower95, upper95, unit and prior_share. Values are NaN if a
+        parameter is not identifiable.
 
         Args:
-            nuisance: whether initial states, biases, gains and offsets follow the parameters.
+            nuisance: append initial states, biases, gains and offsets.
         """
         from heli_jax.exports import estimates_frame
 

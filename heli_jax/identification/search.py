@@ -32,7 +32,7 @@ from heli_jax.identification.unknowns.layout import layout_of
 from heli_jax.messages import messages
 
 _FIRST_STEPS = 40
-"""of filter error, before the search knows that there is a disturbance"""
+"""Steps of filter error before the disturbance is confirmed."""
 
 
 def first_guess(problem: Problem) -> FirstGuess:
@@ -43,12 +43,12 @@ def first_guess(problem: Problem) -> FirstGuess:
     begun = layout.objective.data_at_start(data)
     z = start_vector(layout, data, problem)
     z = noise_guess_at(layout, begun, noise, z) if layout.disturbance else z
-    # From rest at zero no parameter would have any effect on a record without input.
+    # Started at rest at zero, a record without input is insensitive to every parameter.
     if not any(np.ptp(u) > 0 for f in problem.training for u in f.inputs.values()):
         z = in_time(layout, data, noise, z)
     e = evaluate(layout, data, noise, z)
     level = layout.objective.noise_at_start(layout, data, e, noise)
-    # The same object if the method keeps the noise: then nothing is evaluated twice.
+    # If the method keeps the noise, it returns the same object and nothing is evaluated twice.
     if level is not noise:
         noise = level
         e = evaluate(layout, data, noise, z)
@@ -56,13 +56,13 @@ def first_guess(problem: Problem) -> FirstGuess:
 
 
 class SearchResult(NamedTuple):
-    """The end of a search, and its runs."""
+    """Optimum of a search, and its runs."""
 
     search: Search
-    """with its layout and data"""
+    """The search with its layout and data."""
     optimum: RelaxedOptimum
     runs: tuple[StartRow, ...]
-    """every run from a start, the chosen one first"""
+    """All runs, the chosen one first."""
 
 
 def search(
@@ -76,9 +76,9 @@ def search(
     """Search for the optimum of a problem from its first guess, then by each restart that applies.
 
     Args:
-        guess: of `first_guess`.
-        starts: how many points to start from, as `fit` takes it.
-        report: called with a line of text before each longer part of the work.
+        guess: the result of `first_guess`.
+        starts: number of start points, as in `fit`.
+        report: called with a line of text before each longer computation.
     """
     layout, data = guess.layout, guess.data
 
@@ -87,11 +87,11 @@ def search(
     else:
         points = draw(layout, problem, guess.z, starts, seed)
 
-    # Without a disturbance in the record filter error does not converge: the first run is short,
-    # and is continued only if there is a disturbance.
+    # Filter error does not converge if the record has no disturbance. So the first run is short and
+    # continues only if there is one.
     first_steps = min(max_steps, _FIRST_STEPS) if layout.sigmas else max_steps
     over = Search(problem, layout, data, first_steps)
-    # Residuals at the first start are those of the first guess.
+    # The first guess already holds the residuals at the first start.
     same = guess.begun is data and bool(np.array_equal(points[0], guess.z))
     known: Any = (guess.e.r, guess.e.J) if same else None
     first = Search(problem, layout, guess.begun, first_steps)
@@ -126,14 +126,14 @@ def search(
 
 
 _BETTER = 0.1
-"""gain in log-posterior from which on an optimum is better"""
+"""Gain in log-posterior above which an optimum is better."""
 
 
 def is_better(over: Search, optimum: RelaxedOptimum, other: RelaxedOptimum) -> bool:
-    """True if an optimum is to be chosen instead of another.
+    """True if `optimum` is preferred to `other`.
 
-    One that converged wins, then one that is stable if the start was, then the higher
-    log-posterior. `other` stays if there is no difference.
+    A converged optimum wins, then a stable one if the start was stable, then the higher
+    log-posterior. In a tie `other` stays.
     """
 
     def passes(o: RelaxedOptimum) -> tuple[bool, bool]:
@@ -146,8 +146,8 @@ def is_better(over: Search, optimum: RelaxedOptimum, other: RelaxedOptimum) -> b
 
 
 def log_posterior(over: Search, optimum: RelaxedOptimum) -> float:
-    """Return log-likelihood plus log-prior of the free parameters, without its constant; -inf if it
-    is not finite."""
+    """Return log-likelihood plus log-prior of the free parameters without its constant, or -inf if
+    it is not finite."""
     values = named_values(over.layout, over.data, optimum.best.z)
     priors = {n: f.prior for n, f in over.problem.free.items() if f.prior is not None}
     against = sum(((values[n] - prior.mean) / prior.sd) ** 2 for n, prior in priors.items())

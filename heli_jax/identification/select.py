@@ -1,4 +1,4 @@
-"""Model selection: likelihood, information criteria and nested tests of candidates in a table."""
+"""Model selection: likelihood, information criteria and nested tests of candidate models."""
 
 import math
 import time
@@ -31,22 +31,22 @@ class Candidate(NamedTuple):
     aic: float
     bic: float
     white: bool
-    """True if its residuals or innovations are white"""
+    """True if its residuals or innovations are white."""
     estimates: dict[str, float]
 
 
 class Nested(NamedTuple):
-    """A likelihood-ratio test of a model within another."""
+    """Likelihood-ratio test of nested models."""
 
     small: str
     large: str
     ratio: float
-    """twice the log-likelihood gained"""
+    """Twice the gain in log-likelihood."""
     degrees: int
-    """unknowns added"""
+    """Number of added unknowns."""
     p_value: float
-    """of the smaller model; too large, so cautious, where that is at a bound (sigma_w, kappa >=
-    0)"""
+    """p-value of the smaller model; too large (conservative) if an unknown is at a bound (sigma_w,
+    kappa >= 0)."""
 
 
 class Choice(NamedTuple):
@@ -58,7 +58,7 @@ class Choice(NamedTuple):
 
 
 class Alternatives(NamedTuple):
-    """Problems by name, and pairs of nested ones: (small, large)."""
+    """Problems by name, and pairs of nested ones (small, large)."""
 
     problems: dict[str, Problem]
     nested: tuple[tuple[str, str], ...]
@@ -68,7 +68,7 @@ class _Form(NamedTuple):
     """Assumptions of a candidate."""
 
     axes: tuple[str, ...]
-    """disturbed axes or states"""
+    """Disturbed axes or states."""
     poles: int
     stand: bool
 
@@ -81,19 +81,19 @@ def alternatives(
     stated: Sequence[str] = (),
     without_stand: Model | None = None,
 ) -> Alternatives:
-    """List candidates by filter error: no disturbance, one and two poles on the named axes, and of
-    several axes also each one left out.
+    """List candidates for filter error: no disturbance, one and two poles on the named axes, and
+    with several axes each one left out.
 
     Args:
-        problem: what it says of disturbances (starts, what is fixed) holds for the candidates that
+        problem: its settings of disturbances (starts, fixed values) apply to all candidates that
             have them.
         model: the model without disturbance.
         names: axes or states that may be disturbed.
-        stated: those of a configuration, which are a candidate of their own.
-        without_stand: the same vehicle without its stand, where that is in question too.
+        stated: the disturbances of a configuration, which form a candidate of their own.
+        without_stand: the same vehicle without its stand, to compare the two.
 
     Raises:
-        ValueError: one of them cannot be disturbed.
+        ValueError: one of the names cannot be disturbed.
     """
     names = tuple(names)
     one, two = "one pole", "two poles"
@@ -127,28 +127,30 @@ def alternatives(
 
 
 def _is_nested(small: _Form, large: _Form, stand_may_vanish: bool) -> bool:
-    """Return True if one form is a special case of another by one assumption."""
+    """True if one form is a special case of another by one assumption."""
     if small.stand != large.stand:
-        # Free flight is the stand without stiffness and damping, where these may go to zero.
+        # Free flight equals a stand whose stiffness and damping are zero, if these may reach zero.
         return stand_may_vanish and large.stand and small[:2] == large[:2]
-    # One pole is no special case of two: both have the same time constant.
+    # One pole is not nested in two, because both poles have the same time constant.
     return set(small.axes) < set(large.axes) and (not small.axes or small.poles == large.poles)
 
 
 def _by_filter_error(problem: Problem, model: Model, on: Sequence[str], poles: int = 1) -> Problem:
-    """Return the problem by filter error with disturbances; without poles the one disturbance is
-    fixed at all but nothing, so that its likelihood can be compared with those of the others."""
+    """Return the problem for filter error with disturbances.
+
+    Without poles one disturbance is fixed at almost zero, so that likelihoods are comparable.
+    """
     model = with_disturbance(model, on, max(poles, 1))
     vehicle = naming.asdict(problem.vehicle)
     own = {n for d in disturbances_of(model) for n in (d.sigma, d.tau)}
     known = {n: vehicle[n] for n in naming.names(model.Params) if n in vehicle and n not in own}
     if not poles:
         [d] = disturbances_of(model)
-        # A billionth of the motion: zero has no logarithm.
+        # A billionth of the motion replaces zero, which has no logarithm.
         known |= {d.sigma: jnp.asarray(1e-9 * problem.motion), d.tau: jnp.asarray(1.0)}
         fixed = (d.sigma, d.tau)
     else:
-        # A stated start of a disturbance holds in every candidate that has it.
+        # The stated start of a disturbance applies in every candidate that has it.
         same = same_parameters(model, problem.model)
         known |= {n: vehicle[m] for n, m in same.items()}
         fixed = tuple(n for n, m in same.items() if m in problem.fixed_noise)
@@ -163,7 +165,7 @@ def _by_filter_error(problem: Problem, model: Model, on: Sequence[str], poles: i
 
 
 def _stand_may_vanish(problem: Problem) -> bool:
-    """True if stiffness and damping of the stand are each free to reach zero, or zero already."""
+    """True if stiffness and damping of the stand can each reach zero or are zero."""
     values = naming.asdict(problem.vehicle)
     return all(
         (problem.free[name].lower or 0.0) <= 0
@@ -178,22 +180,22 @@ def choose(
     nested: Sequence[tuple[str, str]] = (),
     *,
     progress: Callable[[str], None] | None = None,
-    **fit_options: Any,  # the keywords of `fit`, whose types stand there
+    **fit_options: Any,  # keywords of `fit`
 ) -> Choice:
-    """Fit every problem and compare.
+    """Fit all problems and compare them.
 
-    A model that ends below one nested in it is fitted again from there, and a sentence says so.
+    A model with a lower likelihood than a nested one is fitted again from there, with a note.
 
     Args:
-        nested: names (small, large) of those to compare by a likelihood ratio.
+        nested: pairs of names (small, large) for likelihood-ratio tests.
         progress: called with a line of text before each fit.
-        fit_options: go to `fit`.
+        fit_options: passed to `fit`.
 
     Raises:
         ValueError: a candidate is estimated by instrument.
     """
     for name, problem in problems.items():
-        # Responses by instrument have the likelihood of their errors.
+        # Fits of responses by instrument do have a likelihood, that of the response errors.
         responses = objective_of(problem.method).fits_responses
         if problem.noise_model == "spectrum" and not responses and instruments_of(problem):
             raise ValueError(
@@ -213,7 +215,7 @@ def choose(
         criteria = f.log_likelihood, f.unknowns, f.aic, f.bic
         candidates[name] = Candidate(name, f.status, *criteria, f.white, values)
     compared = [_test(candidates[a], candidates[b]) for a, b in pairs]
-    # Rounded: with a disturbance that vanishes two models are the same, and the first counts.
+    # AIC is rounded because a vanished disturbance makes two models equal. The first then counts.
     ranked = tuple(
         sorted(candidates.values(), key=lambda c: (c.status == "not-converged", round(c.aic, 1)))
     )
@@ -222,7 +224,7 @@ def choose(
 
 
 _BELOW = 0.05
-"""log-likelihood by which a model may end below one that is nested in it, by convergence"""
+"""Log-likelihood by which a model may fall below a nested one, due to convergence."""
 
 
 def _none_below_its_part(
@@ -232,8 +234,10 @@ def _none_below_its_part(
     report: Callable[[str], None],
     fit_options: dict[str, Any],
 ) -> list[str]:
-    """Fit models again that ended below one nested in them, from its optimum; change `fits`, and
-    return sentences."""
+    """Fit models again that ended below a nested model, from the nested optimum.
+
+    Changes `fits` and returns notes.
+    """
     sentences = []
     for a, b in nested:
         before, least = fits[b].log_likelihood, fits[a].log_likelihood - _BELOW
@@ -242,7 +246,7 @@ def _none_below_its_part(
         report(f"comparing models: {b} again, from {a}")
         try:
             again = fit(begun_from(problems[b], problems[a], fits[a]), **fit_options)
-        except ValueError:  # it may be unstable at parameters that suit the other one
+        except ValueError:  # it may be unstable at parameters of the nested model
             again = fits[b]
         if again.log_likelihood > before + _BELOW:
             fits[b] = again
@@ -261,12 +265,15 @@ def _none_below_its_part(
 
 
 _ALL_BUT_NOTHING = 1e-3
-"""part of the start at which a parameter begins that the nested model lacks"""
+"""Start of a parameter that the nested model lacks, as a fraction of its stated start."""
 
 
 def begun_from(problem: Problem, nested: Problem, optimum: Fit) -> Problem:
-    """Return the problem with its starts where the fit of `nested` ended, the disturbance's too; a
-    parameter that is fixed there begins at its value, one that is unknown there all but at zero."""
+    """Return the problem started at the optimum of `nested`, its disturbance included.
+
+    A parameter fixed in `nested` starts at that value. A parameter that `nested` lacks starts near
+    zero.
+    """
     free = {}
     for name, parameter in problem.free.items():
         value = _ALL_BUT_NOTHING * parameter.start
@@ -275,7 +282,7 @@ def begun_from(problem: Problem, nested: Problem, optimum: Fit) -> Problem:
         elif nested.model.name == problem.model.name and getattr(nested.vehicle, name) != 0:
             value = float(getattr(nested.vehicle, name))
         free[name] = parameter._replace(start=_inside(parameter, value))
-    # A disturbance that vanished has no value to begin with.
+    # A vanished disturbance has no value to start from.
     noise = {
         n: jnp.asarray(optimum.nuisance[m].value)
         for n, m in same_parameters(problem.model, nested.model).items()
@@ -285,15 +292,17 @@ def begun_from(problem: Problem, nested: Problem, optimum: Fit) -> Problem:
 
 
 def same_parameters(model: Model, other: Model) -> dict[str, str]:
-    """Return by the name of a disturbance's parameter that of the same one in another model: a
-    disturbance alone has sigma_w, one of several sigma_w_p."""
+    """Return the names of the same disturbance parameters in another model.
+
+    A single disturbance has sigma_w; one of several has sigma_w_p.
+    """
     by_state = {d.state: d for d in disturbances_of(other)}
     pairs = [(d, by_state[d.state]) for d in disturbances_of(model) if d.state in by_state]
     return {n: m for d, o in pairs for n, m in ((d.sigma, o.sigma), (d.tau, o.tau))}
 
 
 def _inside(free: Free, value: float) -> float:
-    """Return the value, or the nearest that is well inside the bounds."""
+    """Return the value, or the nearest value clearly inside the bounds."""
     # An optimum may be at a bound.
     low = -math.inf if free.lower is None else free.lower
     high = math.inf if free.upper is None else free.upper
@@ -302,7 +311,7 @@ def _inside(free: Free, value: float) -> float:
 
 
 def _test(small: Candidate, large: Candidate) -> Nested:
-    """Test by Wilks' theorem; without a further unknown there is no p-value."""
+    """Test by Wilks' theorem; without added unknowns there is no p-value."""
     ratio = 2.0 * (large.log_likelihood - small.log_likelihood)
     degrees = large.unknowns - small.unknowns
     p = float(scipy.special.chdtrc(degrees, max(ratio, 0.0))) if degrees > 0 else float("nan")
@@ -317,7 +326,7 @@ def _sentences(ranked: tuple[Candidate, ...], compared: list[Nested]) -> list[st
         both = f"AIC and BIC prefer: {first.name}."
         apart = f"AIC prefers: {first.name}; BIC, which asks more of it: {by_bic.name}."
         sentences.append(both if first.name == by_bic.name else apart)
-        # Burnham and Anderson (2002): within 2 of the best there is substantial support.
+        # Burnham and Anderson (2002): models within 2 of the best have substantial support.
         if close := [c.name for c in converged[1:] if c.aic - first.aic < 2.0]:
             sentences.append(f"Hardly worse (AIC within 2): {', '.join(close)}.")
         if not first.white:
@@ -347,7 +356,7 @@ def undisturbed_too(model: Model, names: Sequence[str]) -> tuple[str, ...]:
 
 
 APART = 2.0
-"""joint standard deviations above which two estimates differ"""
+"""Joint standard deviations above which two estimates differ."""
 
 
 class MethodResult(NamedTuple):
@@ -355,19 +364,19 @@ class MethodResult(NamedTuple):
 
     method: str
     fit: Fit | None
-    """None where the method refuses the problem"""
+    """None if the method refuses the problem."""
     reason: str
-    """why there is no result; empty if there is one"""
+    """Reason for a missing result, else empty."""
     seconds: float
 
     @property
     def label(self) -> str:
-        """The method as reports call it."""
+        """Name of the method in reports."""
         return METHODS[self.method].label
 
     @property
     def word(self) -> str:
-        """Verdicts in a few words."""
+        """Verdict in a few words."""
         fit = self.fit
         if fit is None:
             return "refused"
@@ -383,14 +392,13 @@ class MethodResult(NamedTuple):
 
 
 class MethodComparison(NamedTuple):
-    """Methods side by side; the first is the fit's own."""
+    """Estimates of several methods; the first is the fit's own."""
 
     results: tuple[MethodResult, ...]
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names compared: the free parameters, and the delay and the gains of inputs that were free
-        beside them."""
+        """Names compared: free parameters, and free delays and input gains."""
         main = self.results[0].fit
         if main is None:
             return ()
@@ -398,7 +406,7 @@ class MethodComparison(NamedTuple):
         return (*main.estimates, *beside)
 
     def estimate(self, result: MethodResult, name: str) -> Estimate | None:
-        """Return a method's estimate of a parameter, delay or gain; None where it has none."""
+        """Return a method's estimate of a parameter, delay or gain; None without one."""
         if result.fit is None or result.reason:
             return None
         return {**result.fit.nuisance, **result.fit.estimates}.get(name)
@@ -406,7 +414,7 @@ class MethodComparison(NamedTuple):
     def difference(self, other: MethodResult, name: str) -> float | None:
         """Return an estimate less the main method's, in their joint standard deviations.
 
-        The two are taken as independent; from the same records they differ by less.
+        They are treated as independent; estimates from the same records differ by less.
         """
         a, b = self.estimate(self.results[0], name), self.estimate(other, name)
         if a is None or b is None:
@@ -449,9 +457,9 @@ def compare_methods(
     """Fit a problem by further methods.
 
     Args:
-        others: by method the problem, or why the method refuses it.
+        others: by method the problem, or the reason why the method refuses it.
         progress: called with a line of text before each fit.
-        fit_options: go to `fit`.
+        fit_options: passed to `fit`.
     """
     results = [MethodResult(main.method, main, _why_none(main), main.timing.get("fit", 0.0))]
     for method, problem in others.items():
@@ -463,7 +471,7 @@ def compare_methods(
         try:
             estimate = fit(problem, **fit_options)
             result = MethodResult(method, estimate, _why_none(estimate), 0.0)
-        except ValueError as e:  # one that fails must not cost the others
+        except ValueError as e:  # a failed method must not stop the others
             result = MethodResult(method, None, str(e), 0.0)
         results.append(result._replace(seconds=time.perf_counter() - began))
     return MethodComparison(tuple(results))

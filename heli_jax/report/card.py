@@ -1,7 +1,7 @@
 """Acceptance card: the usual limits of rotorcraft identification, each passed or failed.
 
-The first gates are the three statements of a fit, so that no card is passed beside a `no`. A gate
-that cannot fail, or cannot pass, is left out.
+The first gates are the three statements of a fit, so a card never passes if a statement is `no`.
+Gates that cannot fail, or cannot pass, are omitted.
 """
 
 import math
@@ -19,15 +19,15 @@ from heli_jax.numbers import number, p_value, percent, vaf_percent
 from heli_jax.report.fitted_responses import FittedResponses
 
 CRAMER_RAO, INSENSITIVITY, COHERENCE = 20.0, 10.0, COHERENT
-"""Tischler and Remple, Aircraft and Rotorcraft System Identification (2012)"""
+"""Limits of Tischler and Remple, Aircraft and Rotorcraft System Identification (2012)."""
 CORRELATION = 0.9
-"""Klein and Morelli, Aircraft System Identification (2006)"""
+"""Limit of Klein and Morelli, Aircraft System Identification (2006)."""
 THEIL, THEIL_PART = 0.3, 0.1
-"""Jategaonkar, Flight Vehicle System Identification (2006)"""
+"""Limits of Jategaonkar, Flight Vehicle System Identification (2006)."""
 VAF, NRMSE_FIT, ILL_CONDITIONED = 0.9, 70.0, 1e4
-"""limits of this program"""
+"""Limits of this program."""
 _RESTS = 0.5
-"""share of a variance that priors explain, from which on the card names the parameter"""
+"""Share of a variance explained by priors above which the card names the parameter."""
 _VAF = "VAF"
 _CORRELATED = "largest correlation"
 
@@ -37,15 +37,15 @@ class Gate(NamedTuple):
 
     what: str
     of: str
-    """the parameter, output or flight"""
+    """Parameter, output or flight."""
     value: float
-    """NaN where there is none"""
+    """NaN without a value."""
     unit: str
     gate: str
-    """the limit in words"""
+    """Limit in words."""
     passed: bool
     words: str = ""
-    """text in place of a number"""
+    """Text that replaces a number."""
 
 
 def card(fit: Fit, responses: FittedResponses | None = None) -> tuple[Gate, ...]:
@@ -56,8 +56,8 @@ def card(fit: Fit, responses: FittedResponses | None = None) -> tuple[Gate, ...]
     for name, estimate in fit.estimates.items():
         gates += _of_parameter(name, estimate)
     gates += _of_relations(fit)
-    # With process noise, a simulation departs from the record even with the true parameters: the
-    # gates apply to the prediction one step ahead. A method in frequency simulates nothing.
+    # With process noise a simulation departs from the record even at the true parameters. The gates
+    # then apply to one-step predictions. A method in frequency simulates nothing.
     noise_model = objective_of(fit.method).noise_model
     sources = [
         (fit.one_step, "one step ahead"),
@@ -75,19 +75,23 @@ def card(fit: Fit, responses: FittedResponses | None = None) -> tuple[Gate, ...]
         for name, w in fit.whiteness.items():
             what = f"whiteness of {errors}, p-value"
             gates.append(Gate(what, name, w.p_value, "", "at least 0.01", w.white))
-    # The most coherent input of each output, in the fitted flights together.
+    # Each output counts with its most coherent input, over all fitted flights together.
     for output, (input, value) in ({} if responses is None else responses.coherence).items():
         gates.append(_least("coherence", f"{input} to {output}", value, "", COHERENCE))
     return tuple(gates)
 
 
 def failed(gates: tuple[Gate, ...]) -> tuple[Gate, ...]:
-    """Return the gates that are not passed."""
+    """Return the failed gates."""
     return tuple(gate for gate in gates if not gate.passed)
 
 
 def summary(gates: tuple[Gate, ...], most: int | None = None) -> str:
-    """Return `13 of 15 gates passed; failed: Cramér-Rao of If (34 %)`, with `most` named."""
+    """Return a summary such as `13 of 15 gates passed; failed: Cramér-Rao of If (34 %)`.
+
+    Args:
+        most: largest number of failed gates that are named.
+    """
     if not gates:
         return "none, since the optimiser stopped before an optimum"
     missed = failed(gates)
@@ -111,7 +115,7 @@ def shown(gate: Gate) -> str:
         return vaf_percent(gate.value)
     text = number(gate.value, 3)
     if gate.what == _CORRELATED:
-        # Two digits of the difference from one.
+        # Show two digits of the difference from one.
         missing = max(1.0 - abs(gate.value), 2e-5)
         text = f"{gate.value:+.{max(3, math.ceil(1.0 - math.log10(missing)))}f}"
         text = text.replace("-", "−")
@@ -148,7 +152,7 @@ def _of_verdicts(fit: Fit) -> list[Gate]:
 
 def _of_parameter(name: str, estimate: Estimate) -> list[Gate]:
     def share(sd: float | None) -> float:
-        # Without an sd, and for an estimate of exactly zero, the gate fails.
+        # The gate fails without an sd, and for an estimate of exactly zero.
         if sd is None or estimate.sd is None or not estimate.value:
             return math.nan
         return 100.0 * abs(sd / estimate.value)
@@ -185,14 +189,14 @@ def _of_agreement(of: str, m: Metrics, *, fitted_mean: bool) -> list[Gate]:
 
 
 def _mean_is_fitted(fit: Fit) -> bool:
-    """True if a bias or an input offset makes the mean of every output the measured one."""
+    """True if a bias or an input offset fits the mean of every output."""
     layout = fit.reached.layout
     outputs = max((len(names) for names in layout.outputs), default=0)
     return bool(layout.bias) or 0 < outputs <= len(layout.offsets)
 
 
 def _of_held_out(fit: Fit) -> list[Gate]:
-    """Gates of held-out flights in frequency, which need no simulation."""
+    """Return gates of held-out flights in frequency, which need no simulation."""
     gates, held = [], fit.held_out_frequency
     for f in held.flights if held is not None else ():
         of = f"{f.flight}, held out"
@@ -209,7 +213,7 @@ def _of_held_out(fit: Fit) -> list[Gate]:
 
 
 def _of_disturbance(fit: Fit) -> list[Gate]:
-    """Gates of the error's power over that which the estimated disturbance makes."""
+    """Return gates of the error's power relative to the estimated disturbance."""
     ahead = fit.adequacy.ahead
     kind = "simulated" if ahead is None else f"predicted up to {ahead:g} s ahead"
     what = "error power over expected"

@@ -1,6 +1,6 @@
 """Charts: data of a line figure, which the page draws by uPlot and Matplotlib as a file.
 
-A page holds each array once, in two or four bytes a number, as base64.
+A page stores each array once as base64, with two or four bytes for each number.
 """
 
 import base64
@@ -14,24 +14,24 @@ import numpy as np
 from heli_jax.numbers import number
 
 PIXELS = 88.0
-"""pixels of the page for an inch of a figure"""
+"""Pixels of the page for one inch of a figure."""
 
 
 class Series(NamedTuple):
     """A line, points, bars, or a band; arrays (n,)."""
 
     label: str
-    """empty if the axis has it"""
+    """Empty if the axis has the label."""
     x: np.ndarray
     y: np.ndarray
-    """NaN where something is missing; of a band its lower edge"""
+    """Values, NaN if missing; the lower edge of a band."""
     color: str
     kind: Literal["line", "step", "points", "bars", "band"] = "line"
     low: np.ndarray | None = None
-    """of bars and bands"""
+    """Lower edge of bars and bands."""
     high: np.ndarray | None = None
     width: float = 1.1
-    """of a line, or of a point"""
+    """Width of a line or size of a point."""
     dashed: bool = False
 
 
@@ -39,17 +39,17 @@ class Panel(NamedTuple):
     """One pair of axes."""
 
     label: str
-    """of the y axis"""
+    """Label of the y axis."""
     series: tuple[Series, ...]
     limits: tuple[float, float]
     height: float = 1.0
-    """[inch]"""
+    """Height [inch]."""
     levels: tuple[float, ...] = ()
-    """horizontal lines"""
+    """Horizontal lines."""
     marks: tuple[float, ...] = ()
-    """vertical lines"""
+    """Vertical lines."""
     shades: tuple[tuple[float, float], ...] = ()
-    """stretches of x that are shaded"""
+    """Shaded ranges of x."""
     logarithmic: bool = False
 
 
@@ -63,7 +63,7 @@ class Chart(NamedTuple):
     note: str = ""
     logarithmic: bool = False
     of: str = ""
-    """flight or other owner of its x axis; charts of one owner share cursor and zoom"""
+    """Flight or other owner of the x axis; charts of one owner share cursor and zoom."""
 
 
 def panel(
@@ -74,12 +74,12 @@ def panel(
     limits: tuple[float, float] | None = None,
     **more: Any,
 ) -> Panel:
-    """A panel; without `limits` they hold every series with a margin of 5 %."""
+    """Return a panel; by default its limits contain every series with a margin of 5 %."""
     return Panel(label, tuple(series), limits or limits_of(series), height, **more)
 
 
 def limits_of(series: Sequence[Series], margin: float = 0.05) -> tuple[float, float]:
-    """Limits that hold every series; from 0 to 1 where there is no number."""
+    """Return limits that contain every series; 0 to 1 without numbers."""
     parts = [v for s in series for v in (s.y, s.low, s.high) if v is not None and v.size]
     y = np.concatenate(parts) if parts else np.empty(0)
     y = y[np.isfinite(y)]
@@ -91,8 +91,10 @@ def limits_of(series: Sequence[Series], margin: float = 0.05) -> tuple[float, fl
 
 
 def samples(label: str, x: np.ndarray, y: np.ndarray, color: str, width: float) -> Series:
-    """Return the series of a measurement, NaN where it is missing: a line, or dots if few samples
-    have neighbours."""
+    """Return the series of a measurement, NaN if missing.
+
+    It is a line, or dots if few samples have neighbours.
+    """
     seen = ~np.isnan(y)
     beside = np.convolve(seen, [1, 0, 1], "same")[seen] > 0
     if seen.any() and beside.mean() < 0.5:
@@ -101,7 +103,11 @@ def samples(label: str, x: np.ndarray, y: np.ndarray, color: str, width: float) 
 
 
 def bars(label: str, x: np.ndarray, y: np.ndarray, reach: Any, color: str) -> Series:
-    """Dots with error bars; `reach`: of the bars down and up, (2, N), or of both, (N,)."""
+    """Return dots with error bars.
+
+    Args:
+        reach: lengths of the bars down and up, (2, N), or of both, (N,).
+    """
     down, up = np.broadcast_to(np.asarray(reach, float), (2, y.size))
     return Series(label, x, y, color, "bars", y - down, y + up, width=2.2)
 
@@ -117,17 +123,17 @@ def time_limits(t: np.ndarray) -> tuple[float, float]:
 
 
 def thinned(x: np.ndarray, y: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return at most `most` points of a line: ends, and the lowest and highest of each bin.
+    """Return at most `most` points of a line: the ends, and the lowest and highest of each bin.
 
     Args:
         x: (N,), ascending.
         y: (N,)
-        most: points to keep, 4 at least.
+        most: number of points to keep, at least 4.
     """
     n = y.size
     if n <= most:
         return x, y
-    bins = (most - 2) // 2  # two points each, and the two ends
+    bins = (most - 2) // 2  # two points for each bin, and the two ends
     edges = np.linspace(0, n, bins + 1).astype(int)
     # A missing sample is neither the lowest nor the highest.
     down, up = np.where(np.isnan(y), np.inf, y), np.where(np.isnan(y), -np.inf, y)
@@ -138,7 +144,7 @@ def thinned(x: np.ndarray, y: np.ndarray, most: int) -> tuple[np.ndarray, np.nda
 
 
 _TOLD = 6
-"""lines of a panel that the text alternative names"""
+"""Lines of a panel in the text alternative."""
 
 
 def described(chart: Chart) -> str:
@@ -163,12 +169,12 @@ def _panel_in_words(panel: Panel) -> str:
 
 
 _BYTES = 380_000
-"""bytes of all lines of a page, above which they are thinned"""
+"""Size of all lines of a page above which they are thinned [bytes]."""
 _LEAST = 2000
-"""fewest points of a thinned line"""
+"""Fewest points of a thinned line."""
 _MISSING = 65535
 _STEPS = 65534
-"""steps of an array's range"""
+"""Steps of an array's range."""
 
 
 class Numbers:
@@ -181,13 +187,13 @@ class Numbers:
         self._charts: list[Chart] = []
 
     def add_chart(self, chart: Chart) -> int:
-        """Keep a chart; its number on the page."""
+        """Store a chart and return its number on the page."""
         self._charts.append(chart)
         return len(self._charts) - 1
 
     def content(self) -> dict[str, Any]:
-        """All as plain data for JSON."""
-        # The points of a line depend on the number of different lines.
+        """Return everything as plain data for JSON."""
+        # The number of points of a line depends on the number of different lines.
         lines = {
             hashlib.sha256(np.ascontiguousarray(s.y).tobytes()).digest(): s.y.size
             for chart in self._charts
@@ -199,11 +205,11 @@ class Numbers:
         return {"arrays": self.arrays, "charts": charts, "scenes": self.scenes}
 
     def array(self, values: np.ndarray, *, exact: bool = False) -> int:
-        """Keep an array (n,); its number on the page.
+        """Store an array (n,) and return its number on the page.
 
         Args:
-            values: finite, or NaN where a number is missing.
-            exact: in single precision; else as parts of the array's range.
+            values: finite, or NaN for a missing number.
+            exact: store in single precision, else as fractions of the array's range.
         """
         values = np.ascontiguousarray(values, np.float64)
         key = hashlib.sha256(values.tobytes() + bytes([exact])).digest()
@@ -229,8 +235,9 @@ class Numbers:
 
 
 def _most(sizes: list[int]) -> int:
-    """Return the most points of a line, so that all lines are within the size."""
-    # Two bytes a number, four letters for three bytes; a thinned line has its own times.
+    """Return the most points of a line, so that all lines fit the size limit."""
+    # A number takes two bytes, and base64 four letters for three bytes. A thinned line has its own
+    # times.
     if sum(sizes) * 2 * 4 / 3 <= _BYTES:
         return max([_LEAST, *sizes])
     return max(_LEAST, int(_BYTES / (6 * 4 / 3) / len(sizes)))
@@ -260,5 +267,5 @@ def _coarse(values: np.ndarray) -> dict[str, Any]:
 
 
 def as_base64(data: bytes) -> str:
-    """Bytes as text of a page."""
+    """Return bytes as text of a page."""
     return base64.b64encode(data).decode("ascii")

@@ -1,4 +1,4 @@
-"""Several fits side by side: estimates and differences, agreement, verdicts; and their page."""
+"""Comparison of several fits: estimates and differences, agreement, verdicts; and its page."""
 
 import math
 import os
@@ -31,7 +31,7 @@ _METRICS: tuple[tuple[str, str, Callable[[float | None], str]], ...] = (
 
 
 class ComparedRuns(NamedTuple):
-    """Fits, each with a name that no other has."""
+    """Fits with unique names."""
 
     labels: tuple[str, ...]
     runs: tuple[SavedFit, ...]
@@ -39,7 +39,7 @@ class ComparedRuns(NamedTuple):
     @property
     def estimates(self) -> Table:
         """Estimate and sd by run of parameters, determined combinations and shared nuisances, with
-        the differences from the first run."""
+        differences from the first run."""
         first = self.labels[0]
         several = [f"{label} - {first} [sd]" for label in self.labels[1:]]
         rows, of_runs = [], self._by_run()
@@ -57,19 +57,21 @@ class ComparedRuns(NamedTuple):
         return Table(("parameter", *self.labels, *several, "unit"), rows)
 
     def _by_run(self) -> list[dict[str, Estimate]]:
-        """Return each run's estimates, the combinations that one of the runs determines, then
-        gains, the time shift and the disturbance."""
+        """Return each run's estimates, combinations and shared nuisances.
+
+        Combinations are those determined in any run. Gains, the time shift and the disturbance
+        follow.
+        """
         by_run = []
         for run, combined in zip(self.runs, _combinations(self.runs), strict=True):
-            # The name of a flight's own nuisance is FLIGHT/NAME.
+            # A nuisance of one flight is named FLIGHT/NAME.
             shared = {n: e for n, e in run.nuisance.items() if "/" not in n}
             by_run.append({**run.estimates, **combined, **shared})
         return by_run
 
     @property
     def agreement(self) -> Table:
-        """VAF, NRMSE fit and Theil's coefficient by output and run, of fitted and held-out
-        flights."""
+        """VAF, NRMSE fit and Theil's coefficient by output and run, also of held-out flights."""
         rows = []
         for held_out in (False, True):
             of = [run.validation if held_out else run.metrics for run in self.runs]
@@ -162,11 +164,11 @@ def compare_runs(runs: Sequence[str | Path | SavedFit]) -> ComparedRuns:
     """Compare fits.
 
     Args:
-        runs: run directories, or results of `load_fit`; two at least. Differences are from the
+        runs: run directories, or results of `load_fit`; at least two. Differences are from the
             first.
 
     Raises:
-        InputError: fewer than two, or a directory holds no fit.
+        InputError: fewer than two, or a directory contains no fit.
     """
     if len(runs) < 2:
         raise InputError(f"compare: expected two runs at least, got {len(runs)}")
@@ -181,14 +183,15 @@ def _labels(directories: Sequence[Path]) -> tuple[str, ...]:
         labels = ["/".join(p[-depth:]) for p in paths]
         if len(set(labels)) == len(labels):
             return tuple(labels)
-    # The same directory twice.
+    # The same directory may occur twice.
     return tuple(f"{p[-1]} ({i})" for i, p in enumerate(paths, 1))
 
 
 def _combinations(runs: Sequence[SavedFit]) -> list[dict[str, Estimate]]:
-    """Return for each run the combinations that any of them determines.
+    """Return for each run the combinations that any run determines.
 
-    A run that determines the parameters has them by its estimates, correlations and constants.
+    If a run determines the parameters, its estimates, correlations and constants give the
+    combinations.
     """
     stated = [_stated(run) for run in runs]
     every = {n: c for of in stated for n, c in of.items()}
@@ -210,7 +213,7 @@ def _combinations(runs: Sequence[SavedFit]) -> list[dict[str, Estimate]]:
 _NUMBERS = ("value", "sd", "lower95", "upper95")
 
 
-# Any: what fit.json holds.
+# Any: content of fit.json.
 def _stated(run: SavedFit) -> dict[str, dict[str, Any]]:
     """Return the determined combinations of a fit; none if it did not converge."""
     every = run.content.get("determined_combinations") or ()
@@ -224,7 +227,7 @@ def _in_order(mappings: Any) -> list[str]:
 
 
 def method_of(run: SavedFit) -> str:
-    """Return the method with the inputs that were taken by their instruments."""
+    """Return the method, with the inputs replaced by their instruments."""
     inputs = run.content.get("instruments") or ()
     return f"{run.method} by instrument ({', '.join(inputs)})" if inputs else run.method
 
@@ -278,7 +281,7 @@ def write_page(path: Path, compared: ComparedRuns) -> None:
             ("Agreement", compared.agreement),
         ],
         notes=sentences(compared.notes),
-        # Relative, so that page and runs can be moved together.
+        # Paths are relative, so that page and runs can be moved together.
         files=[
             (
                 label,

@@ -1,4 +1,4 @@
-"""fit.json: one table of its keys, by which it is written, checked and documented.
+"""fit.json: one table of its keys, used to write, check and document it.
 
 A section is a class whose fields are keys. The value of a key is the attribute of its name, unless
 `Annotated` states another attribute or a function. `model_of` makes the pydantic model of a
@@ -60,46 +60,47 @@ from heli_jax.report.card import Gate, card
 from heli_jax.versions import versions
 
 ABSENT = object()
-"""value of a source for a key that the file lacks"""
+"""Value of a source for a key that the file lacks."""
 
 
 class VerdictContent(TypedDict):
     """Identifiability: verdict, rank, singular values and correlations."""
 
     text: str
-    """in a sentence"""
+    """Verdict in one sentence."""
     identifiable: bool
-    """true if they determine every free parameter"""
+    """True if every free parameter is identifiable."""
     rank: int
-    """directions that are determined, priors included"""
+    """Number of determined directions, priors included."""
     rank_without_priors: int
     condition_number: Annotated[float, "condition"]
     singular_values: list[float]
-    """singular values of the whitened sensitivities in relative coordinates: one over the sd of a
-    direction"""
+    """Singular values of the whitened sensitivities in relative coordinates; each is 1 / sd of a
+    direction."""
     null_directions: list[dict[str, float]]
-    """by parameter, in relative coordinates, that the data do not determine"""
+    """Directions that the data do not determine, by parameter in relative coordinates."""
     determined_combinations: Annotated[list[Combination], "combinations"]
-    """combinations that the data determine, if not every parameter"""
+    """Combinations that the data determine, unless every parameter is identifiable."""
     strong_pairs: Annotated[list[Pair], "pairs"]
-    """strongly correlated parameters"""
+    """Strongly correlated parameters."""
     without_effect: list[str]
-    """parameters that no output shows"""
+    """Parameters without effect on any output."""
     resting_on_priors: Annotated[list[str], "resting"]
-    """parameters that the priors determine, and not the data"""
+    """Parameters determined by priors instead of data."""
     exchangeable_nuisances: Annotated[list[str], "exchangeable"]
-    """nuisances, as `flight 1/bias p`, that are exchangeable with parameters"""
+    """Nuisances, such as `flight 1/bias p`, that are exchangeable with parameters."""
     other_solutions: Annotated[list[dict[str, float]], lambda v: [s.values for s in v.second]]
-    """other values of the free parameters that fit as well [SI]"""
+    """Other values of the free parameters that fit as well [SI]."""
     names: list[str]
-    """the order of `correlation` and `covariance_log`"""
+    """Order of `correlation` and `covariance_log`."""
     correlation: list[list[float]]
     covariance_log: Annotated[list[list[float]], "covariance"]
-    """in relative coordinates (a logarithm, or the value over a scale), without null directions"""
+    """Covariance in relative coordinates (a logarithm, or the value over a scale), without null
+    directions."""
 
 
 class AdequacyAgainst(TypedDict):
-    """The limits of the version that wrote the file."""
+    """Limits of the version that wrote the file."""
 
     explained_at_least: Annotated[float, lambda _: EXPLAINED]
     or_other_than_white_noise_at_most: Annotated[float, lambda _: NEARLY_WHITE]
@@ -110,22 +111,22 @@ class AdequacyContent(TypedDict):
     """Adequacy of the model for the record."""
 
     summary: Annotated[str, "adequate_in_words"]
-    """the answer in a few words, as the statement on adequacy has it"""
+    """The statement on adequacy in a few words."""
     judged: Annotated[list[OutputAdequacy], "adequacy.judged"]
     by_chance: Annotated[bool, "adequacy.by_chance"]
-    """true if no output differs from noise, so that the optimum is arbitrary"""
+    """True if no output differs from noise, so that the optimum is arbitrary."""
     ahead: Annotated[float | None, "adequacy.ahead"]
-    """longest prediction [s], if predictions were judged in place of a simulation"""
+    """Longest prediction [s], if predictions were judged instead of a simulation."""
     against: Annotated[AdequacyAgainst, lambda fit: fit]
 
 
 class Fixed(TypedDict):
-    """Further keys beside the fields of the class."""
+    """Keys in addition to the fields of the class."""
 
     value: float | list[float] | None
-    """the estimate, null if it is not determined; a number for each flight if these state it"""
+    """Estimate, null if not identifiable; one number for each flight if flights state it."""
     fixed: Annotated[bool, lambda _: False]
-    """true if flights state it; then the other keys are missing"""
+    """True if flights state it; the other keys are then missing."""
 
 
 class Residuals(TypedDict):
@@ -133,69 +134,69 @@ class Residuals(TypedDict):
 
     white: bool
     overconfident: bool
-    """true if the intervals ignore that residuals are autocorrelated"""
+    """True if the intervals ignore the autocorrelation of the residuals."""
     note: Annotated[str, lambda fit: _whiteness_note(fit)]
-    """consequence if they are not white"""
+    """Consequence if they are not white."""
     by_output: Annotated[dict[str, Whiteness], "whiteness"]
-    """by `flight/output`; under filter error of the innovations"""
+    """Whiteness by `flight/output`; of the innovations with filter error."""
 
 
 class FeedbackToo(TypedDict):
-    """Beside the fields of the class."""
+    """Keys in addition to the fields of the class."""
 
     present: bool
-    """true if the input follows the response: the p value is below the level"""
+    """True if the input follows the response: the p-value is below the level."""
     level: Annotated[float, lambda _: LEVEL]
 
 
 class ResponsesToo(TypedDict):
-    """Beside the fields of the class."""
+    """Keys in addition to the fields of the class."""
 
     averages: Annotated[dict[str, float], lambda agreement: dict(agreement.averages)]
-    """independent ones by output"""
+    """Independent averages by output."""
     usual_J: Annotated[float, lambda _: USUAL_J]
-    """Tischler's limit of a good fit"""
+    """Tischler's limit of a good fit."""
 
 
 class CandidatesCompared(TypedDict):
-    """Models compared."""
+    """Compared models."""
 
     candidates: list[Candidate]
-    """best AIC first"""
+    """Candidates, best AIC first."""
     nested: list[Nested]
-    """likelihood-ratio tests"""
+    """Likelihood-ratio tests."""
     sentences: list[str]
 
 
 class MethodContent(TypedDict):
-    """The same problem by a method."""
+    """Result of the same problem by another method."""
 
     status: str
-    """as above, or refused"""
+    """As `status` of the fit, or refused."""
     verdict: str
     reason: str | None
-    """reason why it was refused, or is no result"""
+    """Reason why it was refused, or has no result."""
     seconds: float
     parameters: dict[str, Estimate]
     difference_joint_sd: dict[str, float]
-    """from the first method's estimate, in their joint standard deviation"""
+    """Difference from the first method's estimate, in joint standard deviations."""
     findings: list[Finding]
 
 
 class MethodsCompared(TypedDict):
-    """Methods side by side."""
+    """Results of several methods."""
 
     results: Annotated[dict[str, MethodContent], lambda compared: _methods(compared)]
     sentences: list[str]
 
 
 class Nuts(TypedDict):
-    """Convergence of the chains of NUTS."""
+    """Convergence of the NUTS chains."""
 
     rhat: float
-    """the largest"""
+    """Largest R-hat."""
     effective: float
-    """independent draws, the fewest"""
+    """Fewest independent draws."""
     divergent: int
     trusted: bool
     by_parameter: Annotated[dict[str, Convergence], "convergence"]
@@ -205,13 +206,13 @@ class IntervalsContent(TypedDict, total=False):
     """95 % intervals by several methods."""
 
     by_parameter: dict[str, dict[str, list[float]]]
-    """by parameter and method (gaussian, profile, bootstrap, nuts) both ends"""
+    """Both ends by parameter and method (gaussian, profile, bootstrap, nuts)."""
     profiles: dict[str, Profile]
     sentences: list[str]
     bootstrap_failures: Annotated[int, lambda i: i.bootstrap.failures if i.bootstrap else ABSENT]
-    """refits of the bootstrap that did not converge"""
+    """Bootstrap refits that did not converge."""
     nuts: Annotated[Nuts, lambda i: i.posterior or ABSENT]
-    """samples of NUTS"""
+    """NUTS samples."""
 
 
 class Compatibility(TypedDict):
@@ -221,22 +222,22 @@ class Compatibility(TypedDict):
     verdict: str
     doubts: list[Finding]
     shows: Annotated[dict[str, str], lambda s: {r[0]: r[s.head.index("shows")] for r in s.errors}]
-    """by sensor error: yes or no"""
+    """Presence of each sensor error: yes or no."""
 
 
 class Continuous(TypedDict):
-    """The transfer function of the recursive least squares."""
+    """Transfer function of the recursive least squares."""
 
     num: Annotated[list[float], "continuous_num"]
-    """coefficients, highest power of s first"""
+    """Coefficients, highest power of s first."""
     den: Annotated[list[float], "continuous_den"]
     exact: bool
-    """true if its zero-order hold equivalent is the discrete one"""
+    """True if its zero-order hold equivalent is the discrete one."""
     note: str
 
 
 class BaselineContent(TypedDict):
-    """The recursive least squares, from an input to an output of one flight."""
+    """Recursive least squares, from an input to an output of one flight."""
 
     flight: str
     input: str
@@ -244,20 +245,20 @@ class BaselineContent(TypedDict):
     order: int
     forgetting: float
     theta: list[float]
-    """coefficients of the difference equation"""
+    """Coefficients of the difference equation."""
     poles: Annotated[list[list[float]], lambda b: [[p.real, p.imag] for p in b.poles]]
-    """real and imaginary part of each"""
+    """Real and imaginary part of each pole."""
     continuous: Annotated[Continuous, lambda b: b]
     combinations: dict[str, float]
-    """ratios of the paper's equation 23"""
+    """Ratios of the paper's equation 23."""
     metrics: Annotated[dict[str, Metrics], lambda b: {b.output: b.metrics}]
-    """agreement of its simulation"""
+    """Agreement of its simulation."""
     trusted: bool
     sentences: list[str]
 
 
 class QualityToo(TypedDict):
-    """Beside the fields of the class."""
+    """Keys in addition to the fields of the class."""
 
     unit: str
 
@@ -266,35 +267,35 @@ class Qualities(TypedDict, total=False):
     """Handling qualities of a response, of the model or of the data."""
 
     numbers: dict[str, Number | None]
-    """by name; null is not determined"""
+    """Values by name; null if not determined."""
     sentences: list[str]
     sign: int
-    """-1 where the response was turned over"""
+    """-1 if the sign of the response was reversed."""
     band_rad_s: list[float]
-    """in which it is known"""
+    """Band in which the response is known."""
 
 
 class HandlingToo(TypedDict):
-    """Beside the fields of the class."""
+    """Keys in addition to the fields of the class."""
 
     model: Qualities | None
     data: Qualities | None
-    """null where no response was asked for"""
+    """Null if no response was requested."""
 
 
 class EquationErrorContent(TypedDict):
-    """First guesses by equation error."""
+    """Start values by equation error."""
 
     values: dict[str, StartValue]
     equations: list[Equation]
     smoothing_half_width_s: Annotated[float, "half_width"]
     not_measured: Annotated[list[str], "hidden"]
-    """states that no output determines"""
+    """States that no output determines."""
     sentences: Annotated[list[str], lambda start: sentences(start.findings)]
 
 
 class FrequencyErrorContent(TypedDict):
-    """First guesses by frequency error."""
+    """Start values by frequency error."""
 
     status: Status
     seconds: float
@@ -307,41 +308,41 @@ class SignalSource(TypedDict, total=False):
     """Source of a model's signal."""
 
     signal: str
-    """channel of the log; missing for a constant"""
+    """Channel of the log; missing for a constant."""
     constant: float
     unit: str
     scale: float
     offset: float
     invert: bool
     origin: str
-    """processing between log and signal, in words"""
+    """Processing between log and signal, in words."""
 
 
 class SignalSources(TypedDict):
-    """By name of the model's signal."""
+    """Sources by name of the model's signal."""
 
     inputs: dict[str, SignalSource]
     outputs: dict[str, SignalSource]
 
 
 class FlightSource(TypedDict, total=False):
-    """Source of a flight; one that was given in memory has no path and no signals."""
+    """Source of a flight; one given in memory has no path and no signals."""
 
     path: str | None
     sha256: str | None
-    """fingerprint of the whole file"""
+    """Fingerprint of the whole file."""
     flight: str
     hold_out: bool
-    """true if it served for validation alone"""
+    """True if it was used only for validation."""
     n_samples: int
     dt: float
-    """[s]"""
+    """Sample time [s]."""
     window: list[float]
-    """[s] from the log's beginning"""
+    """Start and end, from the log's beginning [s]."""
     log_first_time: float
-    """[s] in the log's own count"""
+    """First time in the log's own count [s]."""
     notes: list[Finding]
-    """assumptions and corrections of the reader"""
+    """Assumptions and corrections of the reader."""
     signals: SignalSources
 
 
@@ -366,97 +367,97 @@ _NOISE = ("white", "coloured residuals")
 
 
 VERSION = 1
-"""version of the format; it changes if a key is removed or changes its meaning"""
+"""Version of the format; it changes if a key is removed or changes its meaning."""
 
 
 class FitFile(TypedDict):
     """fit.json."""
 
     format: Annotated[int, lambda _: VERSION]
-    """version of this format; missing in files of earlier versions of the program"""
+    """Version of this format; missing in files of earlier versions of the program."""
     status: Annotated[Status, "fit.status"]
-    """convergence and identifiability"""
+    """Convergence and identifiability."""
     exit_code: Annotated[Literal[0, 3, 4], "fit.exit_code"]
-    """0: the intervals may be used; 3: not identifiable, or not trusted; 4: not converged, or not
-    adequate"""
+    """0: the intervals are usable; 3: not identifiable, or not trusted; 4: not converged, or not
+    adequate."""
     model: Annotated[str, "fit.model"]
     method: Annotated[str, "fit.method"]
     instruments: Annotated[list[str], "fit.instruments"]
-    """inputs that were taken by a logged excitation"""
+    """Inputs replaced by a logged excitation."""
     n_samples: Annotated[int, "fit.n_samples"]
-    """measured numbers that were fitted"""
+    """Number of measured values that were fitted."""
     identifiable: Annotated[bool, "fit.verdict.identifiable"]
-    """true if the data and the priors determine every free parameter"""
+    """True if data and priors determine every free parameter."""
     adequate: Annotated[bool | None, lambda a: _adequate(a.fit)]
-    """true if the model explains the record; null if that was not judged"""
+    """True if the model explains the record; null if not judged."""
     adequacy: Annotated[AdequacyContent, "fit"]
     null_directions: Annotated[list[dict[str, float]], "fit.verdict.null_directions"]
-    """as in `verdict`"""
+    """As in `verdict`."""
     determined_combinations: Annotated[list[Combination], "fit.verdict.combinations"]
-    """as in `verdict`"""
+    """As in `verdict`."""
     verdict: Annotated[VerdictContent, "fit.verdict"]
-    """at the estimates"""
+    """Identifiability at the estimates."""
     verdict_before: Annotated[VerdictContent, "fit.verdict_before"]
-    """at the start values"""
+    """Identifiability at the start values."""
     parameters: Annotated[dict[str, Estimate], lambda a: _parameters(a)]
-    """the free ones, and those that flights state [SI]"""
+    """Free parameters, and those that flights state [SI]."""
     constants: Annotated[dict[str, float], lambda a: _constants(a.fit, a.problem)]
-    """constants of the vehicle [SI]"""
+    """Constants of the vehicle [SI]."""
     nuisance: Annotated[dict[str, Estimate], lambda a: _shown(a.fit.nuisance, a.fit.status)]
-    """gains, delays, disturbances, initial states, biases; of one flight as `flight/name`"""
+    """Gains, delays, disturbances, initial states, biases; those of one flight as `flight/name`."""
     noise_sd: Annotated[dict[str, float], "fit.noise"]
-    """sd of the measurement noise by `flight/output` [SI]"""
+    """sd of the measurement noise by `flight/output` [SI]."""
     metrics: Annotated[dict[str, Metrics], "fit.metrics"]
-    """by output, of the flights that were fitted, simulated"""
+    """Metrics of the simulation by output, for fitted flights."""
     validation: Annotated[dict[str, Metrics], "fit.validation"]
-    """the same of flights held out"""
+    """Metrics of the simulation by output, for held-out flights."""
     validation_free_run: Annotated[dict[str, Metrics], "fit.validation_free_run"]
-    """the same in one piece, where windows were asked for"""
+    """Metrics of an uninterrupted simulation for held-out flights, if windows were used."""
     one_step: Annotated[dict[str, Metrics], "fit.one_step"]
-    """predicted one sample ahead, of the flights that were fitted"""
+    """Metrics of one-step predictions by output, for fitted flights."""
     one_step_validation: Annotated[dict[str, Metrics], "fit.one_step_validation"]
-    """the same of flights held out"""
+    """Metrics of one-step predictions by output, for held-out flights."""
     acceptance: Annotated[list[Gate], lambda a: card(a.fit, a.supplementary.responses)]
-    """the lines of the acceptance card"""
+    """Lines of the acceptance card."""
     models: Annotated[CandidatesCompared | None, "supplementary.choice"]
     methods: Annotated[MethodsCompared | None, "supplementary.methods"]
     intervals: Annotated[IntervalsContent | None, "supplementary.intervals"]
     compatibility: Annotated[Compatibility | None, "supplementary.sensors"]
     log_likelihood: Annotated[float, "fit.log_likelihood"]
     unknowns: Annotated[int, "fit.unknowns"]
-    """estimated numbers, those of the noise included"""
+    """Number of estimated values, those of the noise included."""
     aic: Annotated[float, "fit.aic"]
     bic: Annotated[float, "fit.bic"]
     covariance: Annotated[Literal["white", "coloured residuals"], lambda a: _NOISE[a.fit.coloured]]
-    """assumption of the intervals on the residuals"""
+    """Assumption of the intervals on the residuals."""
     residuals: Annotated[Residuals, "fit"]
     feedback: Annotated[list[Feedback], "fit.feedback"]
-    """by flight and input that moves freely"""
+    """Feedback by flight and freely moving input."""
     untrusted: Annotated[dict[str, Distrust], "fit.distrusts"]
-    """by parameter, the reason why its interval may not be used"""
+    """Reason why a parameter's interval is unusable, by parameter."""
     distrust: Annotated[str, "fit.distrust"]
-    """the same in a sentence; empty where all is trusted"""
+    """The same in sentences; empty if all intervals are trusted."""
     responses: Annotated[ResponseAgreement | None, "fit.responses"]
-    """result of a fit of frequency responses"""
+    """Result of a fit of frequency responses."""
     held_out_frequency: Annotated[HeldOutFrequency | None, "fit.held_out_frequency"]
-    """agreement of held-out flights with a fit in frequency"""
+    """Agreement of held-out flights with a fit in frequency."""
     baseline_rls: Annotated[BaselineContent | None, "baseline"]
     handling_qualities: Annotated[list[HandlingPair], lambda a: _handling(a)]
     equation_error_start: Annotated[EquationErrorContent | None, _start(EquationErrorStart)]
     frequency_error_start: Annotated[FrequencyErrorContent | None, _start(FrequencyErrorStart)]
     starts: Annotated[list[StartRow], lambda a: _starts(a.fit)]
-    """end of each start"""
+    """End of each start."""
     steps: Annotated[int, "fit.steps"]
-    """steps of the optimiser to the best optimum"""
+    """Steps of the optimiser to the best optimum."""
     findings: Annotated[list[Finding], "fit.findings"]
-    """about the record, the model and the fit, the most severe first"""
+    """Findings on the record, the model and the fit, the most severe first."""
     timing_s: Annotated[dict[str, float], "fit.timing"]
-    """time of each stage, and in all"""
+    """Time of each stage, and in total."""
     versions: Annotated[dict[str, str], lambda _: versions()]
-    """versions of Python and the libraries"""
+    """Versions of Python and the libraries."""
     data: Annotated[list[FlightSource], lambda a: map(_flight, a.problem.flights)]
     inputs: Annotated[list[dict[str, HoldContent]], lambda a: map(_holds, a.problem.flights)]
-    """by flight and input"""
+    """Holds by flight and input."""
     seed: Annotated[int, "fit.seed"]
 
 
@@ -467,21 +468,21 @@ ADDED_KEYS: dict[type, type] = {
     Number: QualityToo,
     HandlingPair: HandlingToo,
 }
-"""further keys of a class, or other sources of its fields"""
+"""Additional keys of a class, or other sources of its fields."""
 
 
 def _whiteness_note(fit: Fit) -> str:
     return next((f.sentence for f in fit.findings if f.code in (COLOURED, TOO_NARROW)), "")
 
 
-# Values that are no attribute: a mapping holds keys as they stand in the file. An analysis is
+# Values that are not attributes: a mapping holds the keys of the file. An analysis is
 # `heli_jax.report.files.Analysis`, which imports this module.
 
 
 def _shown(estimates: Mapping[str, Estimate], status: Status) -> dict[str, Any]:
     """Return the estimates, without values of parameters that are not identifiable."""
-    # A value along a null direction is arbitrary. Values of a fit that did not converge stay: they
-    # may be the start of another.
+    # A value along a null direction is arbitrary. Values of a fit that did not converge are kept,
+    # because another fit may start from them.
     none: dict[str, Any] = dict.fromkeys(("value", "sd_white", "sd_alone"))
     converged = status != "not-converged"
     return {
@@ -515,7 +516,7 @@ def _constants(fit: Fit, problem: Problem) -> dict[str, float]:
 
 
 def _starts(fit: Fit) -> list[StartRow]:
-    """Return the end of each start; None for numbers that are not determined."""
+    """Return the end of each start; None for undetermined values."""
     shown = _shown(fit.estimates, fit.status)
     open_ones: dict[str, Any] = {n: None for n, e in shown.items() if e.value is None}
     return [
@@ -557,7 +558,7 @@ def handling_content(entries: Sequence[Handling]) -> list[dict[str, Any]]:
 def _qualities(of: HandlingQualities | str | None) -> dict[str, Any] | None:
     if of is None or isinstance(of, str):
         return None if of is None else {"numbers": {}, "sentences": [of]}
-    # A number that is not determined is null.
+    # A value that is not determined is null.
     known = {name: n for name, n in of.numbers.items() if n.known}
     numbers = {
         name: {**known[name]._asdict(), "unit": UNITS[name]} if name in known else None
@@ -596,9 +597,9 @@ def _holds(flight: Flight) -> dict[str, dict[str, str]]:
 
 
 class _Section(BaseModel):
-    """Base of a section's pydantic model, made of a mapping or of an object.
+    """Base of a section's pydantic model, made from a mapping or an object.
 
-    Another version may have other keys.
+    Additional keys are allowed, because another version may have other keys.
     """
 
     model_config = ConfigDict(extra="allow", arbitrary_types_allowed=True, protected_namespaces=())
@@ -628,9 +629,9 @@ class _Read(NamedTuple):
 
     words: str
     checked: Any
-    """type for pydantic, in which null may stand for any number"""
+    """Type for pydantic; null may replace any number."""
     sections: tuple[tuple[Any, str], ...] = ()
-    """inner sections, each with the path from this kind to its keys"""
+    """Inner sections, each with the path from this kind to its keys."""
 
     def within(self, between: str) -> tuple[tuple[Any, str], ...]:
         return tuple((section, between + rest) for section, rest in self.sections)
@@ -640,7 +641,7 @@ _PLAIN = {bool: "true | false", int: "integer", float: "number", str: "text"}
 
 
 def _as_tuple(value: Any) -> Any:
-    # JSON has lists alone, and strict validation takes none for a tuple.
+    # JSON has only lists, and strict validation does not accept a list for a tuple.
     return tuple(value) if isinstance(value, list) else value
 
 
@@ -713,10 +714,10 @@ def plain(value: Any) -> Any:
 
 
 def checked(data: bytes) -> dict[str, Any]:
-    """Return the content of a fit.json, which may lack keys or have others.
+    """Return the content of a fit.json, with missing or additional keys allowed.
 
     Raises:
-        ValueError: it is no JSON object, or a value is of the wrong kind.
+        ValueError: it is no JSON object, or a value has the wrong kind.
     """
     try:
         model_of(FitFile).model_validate_json(data, strict=True)
@@ -731,11 +732,11 @@ class Key(NamedTuple):
     """One key of fit.json."""
 
     path: str
-    """in full: `parameters.NAME.sd`"""
+    """Full path: `parameters.NAME.sd`."""
     kind: str
-    """kind of the value in words"""
+    """Kind of the value in words."""
     meaning: str
-    """empty if the name is enough"""
+    """Empty if the name is enough."""
 
 
 def fit_keys() -> list[Key]:

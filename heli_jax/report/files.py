@@ -1,4 +1,4 @@
-"""A fit as files: fit.json and the signals."""
+"""Files of a fit: fit.json and the signals."""
 
 import json
 from pathlib import Path
@@ -19,15 +19,15 @@ from heli_jax.report.fitted_responses import FittedResponses
 
 
 class SensorAgreement(NamedTuple):
-    """Agreement of a log's sensors, of `heli-jax compatibility`."""
+    """Agreement of a log's sensors, from `heli-jax compatibility`."""
 
     compatible: bool
     verdict: str
     doubts: tuple[Finding, ...]
-    """on the errors that were found, beside the fit's own notes"""
+    """Doubts about the detected errors, in addition to the fit's notes."""
     head: tuple[str, ...]
     errors: tuple[tuple[str, ...], ...]
-    """a row of text for each"""
+    """One row of text for each error."""
 
 
 class SupplementaryAnalyses(NamedTuple):
@@ -36,15 +36,15 @@ class SupplementaryAnalyses(NamedTuple):
     choice: Choice | None = None
     intervals: Intervals | None = None
     methods: MethodComparison | None = None
-    """further methods beside the fit's own"""
+    """Methods other than the fit's own."""
     responses: FittedResponses | None = None
-    """of the model and of the flights, with their handling qualities"""
+    """Responses of the model and the flights, with their handling qualities."""
     sensors: SensorAgreement | None = None
-    """of `heli-jax compatibility` alone"""
+    """Only from `heli-jax compatibility`."""
 
 
 class Analysis(NamedTuple):
-    """A fit, and all that its report is made of."""
+    """A fit, and everything that its report needs."""
 
     fit: Fit
     problem: Problem
@@ -58,15 +58,15 @@ def fit_json(
     baseline: Baseline | None,
     supplementary: SupplementaryAnalyses = SupplementaryAnalyses(),
 ) -> dict[str, Any]:
-    """Return a fit as plain data for fit.json; what is not a finite number is null."""
-    # Keys are a public format: programs read them, and `load_fit`. Old ones stay.
+    """Return a fit as plain data for fit.json; numbers that are not finite are null."""
+    # Keys are a public format, read by programs and `load_fit`. Old keys must stay.
     return written(FitFile, Analysis(fit, problem, baseline, supplementary))
 
 
 def check_json(check: Check) -> dict[str, Any]:
     """Return the result of `heli-jax check` as plain data; a number that is not finite is null."""
     verdict, sd = check.verdict, np.sqrt(np.diag(check.verdict.covariance))
-    # Of a parameter that is not determined the number would be no expectation.
+    # A parameter that is not identifiable has no meaningful expected sd.
     lacking = {*verdict.undetermined, *verdict.without_effect}
     pairs = zip(verdict.names, sd, strict=True)
     expected = {name: None if name in lacking else value for name, value in pairs}
@@ -86,35 +86,34 @@ def check_json(check: Check) -> dict[str, Any]:
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write plain data, readable and strict (no NaN)."""
+    """Write plain data as readable, strict JSON (no NaN)."""
     path.write_text(as_json(content) + "\n", encoding="utf-8")
 
 
 def as_json(content: Any) -> str:
-    """Plain data as text, readable and strict (no NaN)."""
-    # Python would write NaN, which JSON does not have and other languages refuse to read.
+    """Return plain data as readable, strict JSON (no NaN)."""
+    # Python would write NaN, which is invalid JSON.
     return json.dumps(content, indent=2, allow_nan=False)
 
 
 def write_signals(path: Path, signals: tuple[Signals, ...]) -> None:
-    """Measured, simulated and residual of all flights in one table, SI.
+    """Write measurement, simulation and residual of all flights in one table, SI.
 
-    `time` counts from the flight's first sample, `log_time` from the log's beginning, as windows
-    do; flights without a log have none. A flight without some signal has empty cells there.
+    `time` starts at the flight's first sample, `log_time` at the log's beginning, like windows.
+    Flights without a log have no `log_time`. Missing signals of a flight are empty cells.
     """
     columns = [_columns(s) for s in signals]
-    # Those of all flights, in the order in which they first appear.
+    # Columns of all flights, in the order of their first appearance.
     names = list(dict.fromkeys(name for of_flight in columns for name in of_flight))
     write_table(path, stacked(columns, names))
 
 
 def _columns(s: Signals) -> dict[str, Any]:
-    """The columns of one flight by their names."""
-    # The name of the flight in every row: a table program can group by it, whatever the rows'
-    # order.
+    """Return the columns of one flight by name."""
+    # Every row names its flight, so that table programs can group rows in any order.
     columns: dict[str, Any] = {"flight": [s.flight] * s.times.size, "time": s.times}
     if s.log_start is not None:
-        # Rounded: 42 + 0.01 k in binary is 42.010000000000005, and nobody's clock has its digits.
+        # Rounding removes binary digits: 42 + 0.01 k may be 42.010000000000005.
         columns["log_time"] = np.round(s.log_times, 9)
     columns |= s.inputs
     for output, measured in s.measured.items():

@@ -1,4 +1,4 @@
-"""The report of a fit: one HTML file with figures, captions and the three statements."""
+"""Report of a fit: one HTML file with figures, captions and the three statements."""
 
 import functools
 import math
@@ -41,26 +41,25 @@ def write_report(
     *,
     png: bool = False,
 ) -> list[str]:
-    """Write report.html and figures/NAME.svg; return the figures' names.
+    """Write report.html and figures/NAME.svg, and return the figures' names.
 
-    The page loads nothing from outside itself. Whatever comes from logs and configurations is
-    escaped.
+    The page loads nothing from outside. Text from logs and configurations is escaped.
 
     Args:
-        directory: where; it exists.
+        directory: existing output directory.
         analysis: the fit and what belongs to it.
-        title: of the page.
-        vehicle_constants: the vehicle file's, by name.
-        origin: command, configuration and files beside the page; nothing of them unless given.
-        png: whether to write figures/NAME.png too.
+        title: title of the page.
+        vehicle_constants: constants of the vehicle file, by name.
+        origin: command, configuration and files beside the page; default none.
+        png: write figures/NAME.png too.
 
     Raises:
-        OSError: the directory cannot be written to.
+        OSError: the directory is not writable.
     """
     folder = directory / "figures"
     folder.mkdir(parents=True, exist_ok=True)
     numbers, shown = Numbers(), list[Picture]()
-    # One after the other, for memory.
+    # Figures are drawn one by one to save memory.
     for name, draw in drawings(analysis).items():
         made = picture(name, draw, numbers, folder=folder, png=png)
         if made is not None:
@@ -78,7 +77,7 @@ def render(
     numbers: Numbers | None = None,
     origin: Origin | None = None,
 ) -> str:
-    """The page as text."""
+    """Return the page as text."""
     fit, problem = analysis.fit, analysis.problem
     numbers, first = numbers or Numbers(), None
     if (worst := worst_output(fit)) is not None:
@@ -93,7 +92,7 @@ def render(
         more=analysis.supplementary,
         card=card(fit, analysis.supplementary.responses),
         summary=summary,
-        # The template asks this module for its rows.
+        # The template calls this module for its rows.
         lines=lines(fit),
         limits={
             "factor": f"{FACTOR:g}",
@@ -116,7 +115,7 @@ def render(
     )
 
 
-# No group may begin another's name.
+# A group must not be a prefix of another.
 GROUPS = {
     "response": "From above, over time: measured and simulated, what is left between them, inputs.",
     "residual": "From above, by lag: its correlation with itself, then with each input; of white "
@@ -132,7 +131,7 @@ GROUPS = {
     "intervals' sd; 95 % of it lie within a curve. Where the dots do not follow it, neither do "
     "intervals and correlations.",
 }
-"""caption of a figure after its title, by the beginning of its name"""
+"""Caption after a figure's title, by the beginning of its name."""
 
 
 def worst_output(fit: Fit) -> tuple[Signals, str] | None:
@@ -188,7 +187,7 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
                 rls = baseline if group == "match" and _of(baseline, pair) else None
                 drawings[name] = later(figures.match, pair, unit, note, rls)
     if baseline is not None:
-        # Time in the log of its flight's first sample [s].
+        # Time of the flight's first sample in the log [s].
         start = next((s.log_start for s in fit.signals if s.flight == baseline.flight), None)
         drawings["rls"] = later(figures.rls_history, baseline, log_start=start)
     return drawings
@@ -206,7 +205,7 @@ def _parts(flights: list[str]) -> list[str]:
     """Return the parts of file names by flight; empty for one flight."""
     if len(flights) == 1:
         return [""]
-    # Names of logs may have any letters; the number makes them unique.
+    # Names of logs may contain any letters; the number makes them unique.
     return [
         f"_{i + 1}_{re.sub('[^A-Za-z0-9]+', '-', f).strip('-')[:40]}".rstrip("_")
         for i, f in enumerate(flights)
@@ -218,13 +217,13 @@ def _of(baseline: Baseline | None, pair: FittedPair) -> bool:
 
 
 def caption(picture: Picture) -> str:
-    """Caption of a figure, with the name of its files."""
+    """Return the caption of a figure, with the name of its files."""
     [words] = [words for begins, words in GROUPS.items() if picture.name.startswith(begins)]
     return f"{picture.title}. {words} (figures/{picture.name}.svg)"
 
 
 def alt_text(picture: Picture, analysis: Analysis) -> str:
-    """Text alternative of a figure."""
+    """Return the text alternative of a figure."""
     fit, intervals = analysis.fit, analysis.supplementary.intervals
     samples: Mapping[str, np.ndarray] = {}
     if picture.name == "pairs_posterior" and intervals and intervals.posterior:
@@ -248,14 +247,14 @@ class Line(NamedTuple):
     """One of the three statements at the head of the page."""
 
     level: str
-    """good, warning, bad or none"""
+    """Level: good, warning, bad or none."""
     word: str
     text: str
-    """one sentence"""
+    """One sentence."""
 
 
 _SPEAK_AGAINST = ("adequacy", "dynamics", "units", "timing", "quality")
-"""topics of doubts about an adequate model"""
+"""Topics of findings that raise doubts about an adequate model."""
 
 
 def lines(fit: Fit) -> tuple[Line, Line, Line]:

@@ -1,6 +1,6 @@
 """Frequency responses of a fitted model and of its flights, both with errors.
 
-The measured ones are conditioned: inputs that move together are separated, and all flights count
+Measured responses are conditioned: correlated inputs are separated, and all flights are used
 (`heli_jax.analysis.flight_responses`).
 """
 
@@ -40,10 +40,10 @@ from heli_jax.identification.result import Estimate
 from heli_jax.simulation.simulate import substeps_for
 
 MOST_PAIRS = 6
-"""pairs of input and output with a figure"""
+"""Most pairs of input and output with a figure."""
 
 _BEYOND = 4.0
-"""last frequency of the model over that of the data"""
+"""Ratio of the last frequencies of model and data."""
 
 
 class FittedPair(NamedTuple):
@@ -52,39 +52,39 @@ class FittedPair(NamedTuple):
     input: str
     output: str
     omega: np.ndarray
-    """[rad/s]"""
+    """Frequencies [rad/s]."""
     H: np.ndarray
-    """measured, without the hold of the input; NaN where it is not known"""
+    """Measured, without the hold of the input; NaN if unknown."""
     sd: np.ndarray
-    """of the real and of the imaginary part of H"""
+    """sd of the real and of the imaginary part of H."""
     coherence: np.ndarray
     model: Point
-    """in continuous time"""
+    """Model in continuous time."""
     half95: float = Z95
-    """half of the 95 % interval of H, in sd"""
+    """Half of the 95 % interval of H [sd]."""
 
 
 NO_RESPONSES = "responses.none-of-fit"
-"""code of the note on flights without a response"""
+"""Code of the note on flights without a response."""
 
 
 class FittedResponses(NamedTuple):
     """Responses of a fit and its flights."""
 
     pairs: tuple[FittedPair, ...]
-    """the most coherent pairs"""
+    """Most coherent pairs."""
     left_out: int
-    """number of further coherent pairs"""
+    """Number of further coherent pairs."""
     handling: tuple[Handling, ...]
     about: str
-    """point of the linearisation in words; empty for a linear model"""
+    """Point of linearisation in words; empty for a linear model."""
     notes: tuple[Finding, ...]
     incoherent: tuple[str, ...] = ()
-    """pairs without coherence, as `lat to p`"""
+    """Pairs without coherence, such as `lat to p`."""
     held_out: tuple[FittedPair, ...] = ()
-    """pairs of the held-out flights"""
+    """Pairs of the held-out flights."""
     coherence: Mapping[str, tuple[str, float]] = {}
-    """by output the most coherent input, and its mean coherence over an octave"""
+    """Most coherent input of each output, and its mean coherence over an octave."""
 
 
 def fitted_responses(
@@ -131,10 +131,9 @@ def fitted_responses(
     )
 
 
-# Parameters of a model are a class of the user's own: they are annotated Any.
+# Params is Any because it may be a user's class.
 def at_record(model: Model, params: Any, fit: Fit) -> OperatingPoint:
-    """Return the operating point of a fit's first flight at which the model is linearised, with
-    the estimated gains."""
+    """Return the operating point of a fit's first flight, with the estimated gains."""
     signals = fit.signals[0]
     # The vehicle receives gain times the logged input.
     gains = {n: fit.nuisance.get(f"gain {n}") for n in signals.inputs}
@@ -160,7 +159,7 @@ class _Curves(NamedTuple):
         names = (*self.free, f"gain {input}", "time_shift")
         root = _root(self.fit, names)
         gain, shift = (self.fit.nuisance.get(n) for n in names[-2:])
-        # The derivatives by the two stand last, after those by the parameters.
+        # The last two derivatives are by gain and delay, after those by the parameters.
         q = len(self.free)
         unit = np.eye(q + 2)
         padded = tuple(
@@ -178,8 +177,10 @@ class _Curves(NamedTuple):
 
 
 def _root(fit: Fit, names: Sequence[str]) -> np.ndarray:
-    """Return R (q, r), where R R' is the covariance of the estimates; NaN for those that are not
-    identifiable, zero for those that were not estimated."""
+    """Return R (q, r), with R R' the covariance of the estimates.
+
+    It is NaN for estimates that are not identifiable, zero for those that were not estimated.
+    """
     known = {**fit.nuisance, **fit.estimates}
     order = [fit.verdict.names.index(n) if n in known else None for n in names]
     rows = np.zeros((len(names), len(fit.verdict.names)))
@@ -216,7 +217,7 @@ def _octave_means(responses: FlightResponses) -> dict[tuple[str, str], np.ndarra
 def _pairs(
     responses: FlightResponses, curves: _Curves, means: Mapping[tuple[str, str], np.ndarray]
 ) -> list[FittedPair]:
-    """Return the coherent pairs of input and output, in order of their sums of coherence."""
+    """Return the coherent pairs of input and output, sorted by their sums of coherence."""
     ranked = []
     for (input, name), mean in means.items():
         total = float(np.sum(mean[mean >= COHERENT]))
@@ -235,7 +236,7 @@ def _pairs(
 def _of_held_out(
     problem: Problem, settings: Settings, curves: _Curves
 ) -> tuple[tuple[FittedPair, ...], tuple[Finding, ...]]:
-    """Return the responses of the held-out flights, or the reason why there is none."""
+    """Return the responses of the held-out flights, or the reason why there are none."""
     held = tuple(f for f in problem.flights if f.hold_out)
     if not held:
         return (), ()

@@ -15,22 +15,22 @@ class Origin(NamedTuple):
 
     command: str
     date: str
-    """with its offset from UTC"""
+    """Date with its offset from UTC."""
     config: str = ""
-    """the configuration in full, as YAML"""
+    """Full configuration as YAML."""
     files: tuple[str, ...] = ()
-    """beside the page, by their names relative to it"""
+    """Files beside the page, as relative paths."""
     point: str = ""
-    """of a study's fit: the keys of the study with their values here"""
+    """Point of a study: its keys with their values."""
 
 
 _asker: ContextVar[tuple[str, str] | None] = ContextVar("heli_jax_asker", default=None)
-"""the command and the point of a study, where this process works for another"""
+"""Command and study point, if this process works for another."""
 
 
 @contextlib.contextmanager
 def made_for(command: str, point: str) -> Iterator[None]:
-    """Attribute what is made in this context to another process's command."""
+    """Attribute results made in this context to another process's command."""
     token = _asker.set((command, point))
     try:
         yield
@@ -39,20 +39,20 @@ def made_for(command: str, point: str) -> Iterator[None]:
 
 
 def command() -> str:
-    """Return the command line of this process, as a shell would take it."""
+    """Return the command line of this process in shell syntax."""
     return _command(sys.argv)
 
 
 def origin(config: str = "", files: tuple[str, ...] = ()) -> Origin:
-    """Return the origin of a page that this process makes now."""
+    """Return the origin of a page made now by this process."""
     now = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
     typed, point = _asker.get() or (command(), "")
     return Origin(typed, now, config, files, point)
 
 
 def _command(words: list[str]) -> str:
-    """Quote a command line as a shell would take it."""
-    # The program by its name alone: where it is installed is nobody's business.
+    """Quote a command line in shell syntax."""
+    # Only the program's name is shown, because its install path is private.
     program = Path(words[0] if words else "")
     if program.name.startswith(("ipykernel", "colab_kernel")):
         return "in a notebook"

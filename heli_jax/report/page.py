@@ -1,6 +1,6 @@
-"""Pages from the templates beside this file; whatever text is put into one is escaped.
+"""Pages from the templates beside this file; all inserted text is escaped.
 
-A figure of lines is there as numbers, which the page draws, and as words for who does not see it.
+A line figure is stored as numbers, which the page draws, and as words for screen readers.
 """
 
 import contextlib
@@ -21,24 +21,24 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 type Draw = "Callable[[], Chart | Figure | None]"
-"""draws a figure; None where there is nothing to draw"""
+"""Function that draws a figure, or returns None if there is nothing to draw."""
 
 MOST_FLIGHTS = 6
-"""flights that get figures of their own; signals.csv has them all"""
+"""Most flights with their own figures; signals.csv has all flights."""
 _FOLDER = Path(__file__).parent
 _SCRIPTS = ("uplot/uPlot.iife.min.js", "charts.js", "flight.js", "tables.js")
 _NOTHING: dict[str, Any] = {"arrays": [], "charts": [], "scenes": []}
 
 
 def filled(template: str, **values: Any) -> str:
-    """The page of a template, such as report.html.j2, with its values."""
-    # Escaped throughout, and a missing value is an error: names come from logs, and a page with a
-    # gap where a number belongs looks like a result.
+    """Return a page made from a template, such as report.html.j2, and its values."""
+    # Everything is escaped, because names come from logs. Missing values are errors, because a page
+    # with gaps would look like a result.
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(_FOLDER),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
-        # Lines that hold a block alone leave no empty line in the page.
+        # Lines that contain only a block leave no empty line.
         trim_blocks=True,
         lstrip_blocks=True,
     )
@@ -49,15 +49,14 @@ def filled(template: str, **values: Any) -> str:
 
 @functools.cache
 def _asset(name: str) -> markupsafe.Markup:
-    """A style or script of ours, as it stands."""
+    """Return an own style or script unchanged."""
     return markupsafe.Markup((_FOLDER / "assets" / name).read_text(encoding="utf-8"))
 
 
 @functools.cache
 def _policy() -> str:
-    """Return the content security policy of a page: only this package's scripts, and nothing
-    loaded."""
-    # The escaping alone keeps a log's text from being run; this is the second lock.
+    """Return the content security policy of a page: only this package's scripts, no loading."""
+    # Escaping already keeps text of a log from running; this is a second protection.
     digests = (hashlib.sha256(_asset(n).encode()).digest() for n in _SCRIPTS)
     hashes = " ".join(f"'sha256-{as_base64(d)}'" for d in digests)
     return f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {hashes}"
@@ -69,19 +68,19 @@ class Picture(NamedTuple):
     name: str
     title: str
     alt: str
-    """text alternative"""
+    """Text alternative."""
     chart: int | None = None
-    """its number among the page's charts; None of an image"""
+    """Number of the chart on the page; None for an image."""
     image: str = ""
-    """a data: address; empty of a chart, and of what is a file alone"""
+    """data: address; empty for a chart, and for a file alone."""
     size: tuple[int, int] = (0, 0)
-    """of the image, width and height [pixel]"""
+    """Width and height of the image [pixel]."""
     file: str = ""
-    """beside the page"""
+    """File beside the page."""
 
 
 def of_file(png: Path, title: str, alt: str) -> Picture:
-    """An image that is drawn already."""
+    """Return the picture of an existing image."""
     from PIL import Image
 
     with Image.open(png) as image:
@@ -97,10 +96,10 @@ def picture(
     folder: Path | None = None,
     png: bool = False,
 ) -> Picture | None:
-    """Draw a figure for a page; None where there is nothing to draw.
+    """Draw a figure for a page; return None if there is nothing to draw.
 
     Args:
-        folder: for NAME.svg, and NAME.png where that is asked for; no files unless given.
+        folder: directory for NAME.svg, and NAME.png if requested; default no files.
     """
     # Charts alone need no Matplotlib, which takes a second to load.
     with style.in_style() if folder else contextlib.nullcontext():

@@ -1,4 +1,4 @@
-"""The files of `heli-jax frf`: responses as NetCDF and CSV, transfer functions, figures, a page."""
+"""Files of `heli-jax frf`: responses as NetCDF and CSV, transfer functions, figures, a page."""
 
 import functools
 import json
@@ -32,11 +32,11 @@ _FILES = (
 )
 _DB = 20.0 / np.log(10.0)
 _SURE = 0.3
-"""largest relative random error of a usable response: of five averages at a coherence of 0.6"""
+"""Largest relative random error of a usable response, that of five averages at coherence 0.6."""
 _TOO_LARGE = 2.0
-"""chi-squared per degree of freedom from which on the order of a transfer function is too low"""
+"""chi-squared per degree of freedom above which the order of a transfer function is too low."""
 _NEAR_ZERO = 0.1
-"""relative distance of a zero that nearly cancels a pole"""
+"""Relative distance of a zero that nearly cancels a pole."""
 
 
 def write_responses(
@@ -49,9 +49,8 @@ def write_responses(
     config: str = "",
     png: bool = False,
 ) -> None:
-    """Write responses.nc, responses.csv, transfer_functions.json, handling_qualities.json,
-    figures/ and responses.html.
-    """
+    """Write responses.nc, responses.csv, transfer_functions.json, handling_qualities.json, figures/
+    and responses.html."""
     write_table(directory / "responses.csv", table(responses))
     write_netcdf(directory / "responses.nc", responses, units)
     fits = [_content(*fit, responses.window) for fit in responses.fits]
@@ -64,7 +63,7 @@ def write_responses(
     numbers = Numbers()
     pictures = [
         picture(
-            # A model's names are Python's: nothing in them that a file's name may not have.
+            # Names of a model are Python names, so they are valid in file names.
             f"{name}-{input}",
             functools.partial(_draw, responses, units, input, name),
             numbers,
@@ -217,7 +216,7 @@ def fit_sentences(fit: TransferFit | str, window: float) -> list[str]:
         )
     if not forgets(fit, window):
         last = max(fit.poles, key=lambda p: p.real)
-        # Two periods in a window are the least that it resolves.
+        # A window resolves a period only if it contains two of them.
         slow = abs(last) * window < 4.0 * np.pi
         said.append(
             f"a pole of {number(last.real, 2)} 1/s is not forgotten within a window of "
@@ -313,22 +312,26 @@ def useful_band(omega: np.ndarray, pair: Pair) -> tuple[str, str, str]:
     if not seen.any():
         return "not determined", "–", "–"
     mean = f"{np.mean(pair.coherence[seen]):.2f}"
-    # Beside a sine the window's leakage is coherent too.
+    # The window's leakage around a sine is coherent too.
     with np.errstate(invalid="ignore"):
         sure = pair.sd < _SURE * np.abs(pair.H)
     good = (np.where(seen, pair.coherence, 0.0) > COHERENT) & sure
     bands = np.ma.clump_masked(np.ma.array(omega, mask=good))
     if not bands:
         return mean, "–", "–"
-    # The widest in octaves.
+    # The width is measured in octaves.
     widest = max((omega[band] for band in bands), key=lambda w: w[-1] / w[0])
     low, high = (number(float(w) / (2.0 * np.pi), 3) for w in (widest[0], widest[-1]))
     return mean, low, high
 
 
 def write_netcdf(path: Path, responses: FlightResponses, units: Mapping[str, str]) -> None:
-    """Write responses.nc; `units` are SI, of inputs and outputs by name."""
-    # Slow to import.
+    """Write responses.nc.
+
+    Args:
+        units: SI units of inputs and outputs by name.
+    """
+    # xarray is slow to import.
     import xarray as xr
 
     outputs = responses.outputs

@@ -1,4 +1,4 @@
-"""Draws of the posterior and samples of the bootstrap as files: posterior.nc and bootstrap.nc."""
+"""Files of posterior draws and bootstrap samples: posterior.nc and bootstrap.nc."""
 
 import importlib.util
 import re
@@ -42,7 +42,7 @@ type _Variables = dict[str, tuple[Any, np.ndarray, dict[str, str]]]
 
 
 def sample_files(comparison: Intervals | None) -> tuple[str, ...]:
-    """Return the names of the files that `write_samples` writes."""
+    """Return the names of the files written by `write_samples`."""
     if comparison is None:
         return ()
     posterior = (POSTERIOR,) if comparison.posterior is not None else ()
@@ -86,7 +86,7 @@ def write_samples(
 
 
 def posterior_tree(fit: Fit, posterior: Posterior, attributes: Mapping[str, str]) -> "xr.DataTree":
-    """Return the draws as arviz reads them, in the groups posterior and sample_stats."""
+    """Return the draws in the format of arviz, in the groups posterior and sample_stats."""
     import xarray as xr
 
     dims = ("chain", "draw")
@@ -105,7 +105,7 @@ def posterior_tree(fit: Fit, posterior: Posterior, attributes: Mapping[str, str]
     chains, count = next(iter(posterior.draws.values())).shape
     coordinates = {"chain": np.arange(chains), "draw": np.arange(count)}
     groups = {
-        # arviz takes a group by itself, so each has the attributes.
+        # arviz reads single groups, so each has the attributes.
         "/": xr.Dataset(attrs=dict(attributes)),
         "posterior": xr.Dataset(draws, coordinates, dict(attributes)),
         "sample_stats": xr.Dataset(statistics, coordinates, dict(attributes)),
@@ -114,7 +114,7 @@ def posterior_tree(fit: Fit, posterior: Posterior, attributes: Mapping[str, str]
 
 
 def bootstrap_dataset(fit: Fit, booted: Bootstrap, attributes: Mapping[str, str]) -> "xr.Dataset":
-    """Return the samples of the bootstrap by parameter over the number of the record."""
+    """Return the bootstrap samples by parameter and record number."""
     import xarray as xr
 
     variables: _Variables = {
@@ -127,7 +127,7 @@ def bootstrap_dataset(fit: Fit, booted: Bootstrap, attributes: Mapping[str, str]
 
 
 def _variable(name: str, taken: Mapping[str, Any]) -> str:
-    """Return a name without slashes, which would begin a NetCDF group."""
+    """Return a name without slashes, which would start a NetCDF group."""
     plain = re.sub(r"\W+", "_", name).strip("_") or "nuisance"
     plain = f"_{plain}" if plain[0].isdigit() else plain
     unique, k = plain, 2

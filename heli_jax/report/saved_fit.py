@@ -1,4 +1,4 @@
-"""A fit read back from its run directory: plain data, no model and no log."""
+"""A fit read back from its run directory, as plain data without model and log."""
 
 import csv
 import math
@@ -20,40 +20,40 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _LIMIT_BYTES = 1_000_000_000
-"""largest size of each file"""
+"""Largest size of each file [bytes]."""
 
 
 class SavedFit(NamedTuple):
-    """Content of fit.json and signals.csv; the names are those of `Fit`."""
+    """Content of fit.json and signals.csv, with the names of `Fit`."""
 
     directory: Path
     model: str
     method: str
     status: str
     verdict: str
-    """text of the identifiability analysis"""
+    """Text of the identifiability analysis."""
     identifiable: bool
     adequate: bool | None
-    """True if the model explains the record; None if that was not judged"""
+    """True if the model explains the record; None if not judged."""
     estimates: dict[str, Estimate]
     nuisance: dict[str, Estimate]
     intervals: dict[str, dict[str, tuple[float, float]]]
-    """95 %, by parameter and method: 'gaussian', and those that were asked for"""
+    """95 % intervals by parameter and method: 'gaussian', and the requested ones."""
     metrics: dict[str, Metrics]
-    """of the simulation, over the fitted flights, by output"""
+    """Metrics of the simulation by output, over the fitted flights."""
     validation: dict[str, Metrics]
-    """of the simulation, over the flights held out, by output"""
+    """Metrics of the simulation by output, over the held-out flights."""
     signals: tuple[Signals, ...]
     notes: tuple[str, ...]
-    """the sentences of the findings"""
+    """Sentences of the findings."""
     untrusted: tuple[str, ...]
-    """the parameters whose intervals may not be used"""
+    """Parameters with unusable intervals."""
     content: dict[str, Any]
-    """all of fit.json"""
+    """Complete content of fit.json."""
 
     @property
     def adequacy(self) -> str:
-        """`yes`, `no (...)` or `not judged`, as the fit had it."""
+        """`yes`, `no (...)` or `not judged`, as in the fit."""
         return adequacy_of(self.content)
 
     @property
@@ -67,10 +67,10 @@ class SavedFit(NamedTuple):
         return bool((self.content.get("residuals") or {}).get("overconfident", False))
 
     def to_dataframe(self, *, nuisance: bool = False) -> "pd.DataFrame":
-        """Return the estimates as a pandas data frame, as `Fit.to_dataframe`.
+        """Return the estimates as a pandas data frame, like `Fit.to_dataframe`.
 
         Args:
-            nuisance: True to append initial states, biases, gains and offsets.
+            nuisance: append initial states, biases, gains and offsets.
         """
         from heli_jax.exports import estimates_frame
 
@@ -92,7 +92,7 @@ def load_fit(directory: str | Path) -> SavedFit:
     """Read the run directory of an earlier fit.
 
     Raises:
-        InputError: it holds no fit.json and signals.csv that a fit wrote.
+        InputError: it contains no fit.json and signals.csv of a fit.
         TypeError: it is no path.
     """
     require_kind("directory", directory, (str, Path), "the path of a fit's run directory")
@@ -110,7 +110,7 @@ def load_fit(directory: str | Path) -> SavedFit:
         return _saved(directory, content, text.decode("utf-8"))
     except InputError:
         raise
-    # A key is missing or holds another kind, a row is cut off, a cell is no number.
+    # A key is missing or has another kind, a row is incomplete, or a cell is no number.
     except (
         LookupError,
         TypeError,
@@ -161,7 +161,7 @@ def _records[R: (Estimate, Metrics)](
     kind: type[R], saved: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, R]:
     """Return records by name, from the keys of their fields."""
-    # null stands for NaN.
+    # null represents NaN.
     numbers = ("value", *Metrics._fields)
     made = {}
     for name, e in saved.items():
@@ -175,11 +175,11 @@ def _number(value: float | None) -> float:
 
 
 def _signals(text: str, content: Mapping[str, Any]) -> tuple[Signals, ...]:
-    """Return the flights of signals.csv; NaN where a cell is empty."""
+    """Return the flights of signals.csv; NaN for an empty cell."""
     held_out = {flight["flight"]: flight.get("hold_out", False) for flight in content["data"]}
-    # An output may have been measured in the flights held out alone.
+    # An output may be measured only in held-out flights.
     outputs = list(dict.fromkeys([*content["metrics"], *content["validation"]]))
-    # A reader, not split(","): flights' names come from files and may hold commas.
+    # Flight names come from files and may contain commas, so split(",") would fail.
     lines = csv.reader(text.splitlines())
     head = next(lines, [])
     if head[:2] != ["flight", "time"]:
@@ -197,14 +197,14 @@ def _flight(
     name: str, hold_out: bool, head: list[str], cells: list[list[str]], outputs: list[str]
 ) -> Signals:
     table = np.array([[float(c) if c else math.nan for c in row] for row in cells])
-    # A flight without some signal has an empty column there.
+    # A signal that a flight lacks is an empty column.
     columns = {n: v for n, v in zip(head, table.T, strict=True) if not np.isnan(v).all()}
     measured, simulated, _, innovations = (
         {o: columns.pop(f"{o}_{what}") for o in outputs if f"{o}_{what}" in columns}
         for what in ("measured", "simulated", "residual", "innovation")
     )
     times = columns.pop("time")
-    log = columns.pop("log_time", None)  # of earlier versions, and without a log, there is none
+    log = columns.pop("log_time", None)  # missing in earlier versions, and without a log
     start = None if log is None else float(log[0] - times[0])
-    # The other columns are inputs.
+    # The remaining columns are inputs.
     return Signals(name, hold_out, times, columns, measured, simulated, innovations or None, start)

@@ -1,4 +1,4 @@
-"""Figures as files: colours, one set of rcParams, how Matplotlib draws a chart, saving."""
+"""Figures as files: colours, one set of rcParams, charts drawn by Matplotlib, saving."""
 
 import io
 import re
@@ -13,12 +13,12 @@ import numpy as np
 
 from heli_jax.report.charts import Chart, Panel, thinned
 
-# Imported where it draws: `info` and `--help` need none of it, and would wait half a second for it.
+# Matplotlib is imported only for drawing: `info` and `--help` would wait half a second for it.
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's palette: told apart with every common kind of colour blindness, and in grey.
+# Palette of Okabe and Ito, distinguishable with common colour blindness and in grey.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 BLUE, VERMILLION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
 CYCLE = (BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY, BLACK, "#7F7F7F")
@@ -26,7 +26,7 @@ GREY, PALE = "#6B6B6B", "#A8A8A8"
 
 STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
-    # Beside the first, which sets the widths, fonts of about its widths.
+    # The first font sets the widths; the others have similar widths.
     "font.sans-serif": ["DejaVu Sans", "Verdana", "Arial", "sans-serif"],
     "font.size": 9.0,
     "axes.titlesize": 10.0,
@@ -38,7 +38,7 @@ STYLE: dict[Any, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
-    # Powers of ten only below 0.001 and from 10000 on.
+    # Powers of ten are used only below 0.001 and from 10000.
     "axes.formatter.limits": (-3, 4),
     "axes.formatter.use_mathtext": False,
     "axes.unicode_minus": True,
@@ -56,29 +56,30 @@ STYLE: dict[Any, Any] = {
     "lines.solid_joinstyle": "round",
     "figure.facecolor": "white",
     "savefig.facecolor": "white",
-    # Letters as text, in a font of the reader's: as outlines they are most of a file.
+    # Letters stay text in the reader's font; outlines would be most of the file.
     "svg.fonttype": "none",
-    # Without a salt the ids in an SVG are random, and two runs of one fit differ in every figure.
+    # Without a salt the ids in an SVG are random, and figures differ between runs.
     "svg.hashsalt": "heli_jax",
-    # A fifth of a pixel: nobody sees it, and noisy lines lose many of their points.
+    # A fifth of a pixel is invisible, and noisy lines lose many points.
     "path.simplify": True,
     "path.simplify_threshold": 0.2,
 }
 
 WIDTH = 7.4
-"""width of a figure [inch]"""
+"""Width of a figure [inch]."""
 _POINTS, _CORNERS = 800, 4000
-"""of a drawn line at most (lowest and highest of every 1.5 pixels), and of all lines of a figure"""
+"""Most points of a drawn line (lowest and highest of every 1.5 pixels), and of all lines of a
+figure."""
 _DPI = 110
-# A hundredth of a point is enough, and half as long as a millionth.
+# A hundredth of a point is precise enough, and half as long as a millionth.
 _PLACES, _FURTHER = re.compile(rb' (?:d|x|y)="[^"]+"'), re.compile(rb"(?<=\.\d\d)\d+| \n")
 _NOT_XML = bytes(set(range(32)) - {9, 10, 13})
-"""control characters"""
+"""Control characters."""
 
 
 def figure(height: float, width: float = WIDTH) -> "Figure":
-    """Return an empty figure with its own canvas [inch]."""
-    # Without pyplot, which keeps all figures in a global list, and is not for threads.
+    """Return an empty figure of a size [inch] with its own canvas."""
+    # pyplot is avoided, because it keeps all figures in a global list and is not thread-safe.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -94,7 +95,7 @@ def head(drawing: "Figure", title: str, note: str = "") -> None:
 
 
 def figure_of(chart: Chart) -> "Figure":
-    """Return a chart as Matplotlib draws it for a file; within `in_style`."""
+    """Return a chart drawn by Matplotlib for a file; call within `in_style`."""
     panels = chart.panels
     drawing = figure(0.9 + 1.1 * sum(p.height for p in panels))
     ratios = [p.height for p in panels]
@@ -128,7 +129,7 @@ def _draw(ax: "Axes", p: Panel, most: int) -> None:
             ax.fill_between(s.x, s.low, s.high, alpha=0.4, lw=0, **look)
         elif s.kind == "bars" and s.low is not None and s.high is not None:
             ax.plot(s.x, s.y, "o", ms=s.width, mew=0.0, **look)
-            # One path, broken by NaN: `errorbar` writes two elements into the SVG for each bar.
+            # One path broken by NaN is smaller: `errorbar` writes two SVG elements for each bar.
             ends = np.stack([s.low, s.high, np.full(s.y.size, np.nan)], axis=1).ravel()
             ax.plot(np.repeat(s.x, 3), ends, lw=0.6, color=s.color)
         elif s.kind == "points":
@@ -145,7 +146,7 @@ def _draw(ax: "Axes", p: Panel, most: int) -> None:
     if p.logarithmic:
         ax.set_yscale("log")
     elif p.label.endswith("[deg]"):
-        # Steps of 15, 30, 45 and 90 degrees: a phase is read in parts of a right angle.
+        # Steps of 15, 30, 45 and 90 degrees suit a phase.
         ax.yaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 1.5, 3, 4.5, 9, 10]))
     ax.set_ylim(*p.limits)
     if p.logarithmic:
@@ -153,29 +154,29 @@ def _draw(ax: "Axes", p: Panel, most: int) -> None:
 
 
 def pretty(unit: str | None) -> str:
-    """A unit as it is printed: kg m², 1/s²; `–` for a plain number."""
+    """Return a unit for print: kg m², 1/s²; `–` for a plain number."""
     if unit is None or unit in ("", "1"):
         return "–"
     return unit.replace("^2", "²").replace("^3", "³").replace("^4", "⁴").replace("*", " ")
 
 
 def label(name: str, unit: str | None) -> str:
-    """`roll [rad]`; the name alone where the unit is not known."""
+    """Return a label such as `roll [rad]`; the name alone if the unit is unknown."""
     return f"{name} [{pretty(unit)}]" if unit is not None else name
 
 
 _NAME = 26
-"""letters of a name in a title"""
+"""Most letters of a name in a title."""
 
 
 def short(name: str) -> str:
-    """A name from a log, which may have any length, as a title has it."""
+    """Return a name from a log, shortened for a title."""
     half = _NAME // 2
     return name if len(name) <= _NAME else f"{name[:half]}…{name[-half:]}"
 
 
 def plain_log_ticks(ax: "Axes", which: Literal["x", "y"] = "x") -> None:
-    """0.1, 0.2, 0.5, 1 on a logarithmic axis, powers where they are far from one."""
+    """Label a logarithmic axis with 0.1, 0.2, 0.5, 1, and with powers far from one."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     axis = ax.xaxis if which == "x" else ax.yaxis
@@ -184,12 +185,12 @@ def plain_log_ticks(ax: "Axes", which: Literal["x", "y"] = "x") -> None:
     subs = (1.0, 2.0, 5.0) if high < 3e3 * low else (1.0,)
     axis.set_major_locator(LogLocator(subs=subs, numticks=12))
     axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
-    # Ticks without labels between 1, 2 and 5 would be taken for a linear division.
+    # Unlabelled ticks between 1, 2 and 5 would suggest a linear axis.
     axis.set_minor_locator(NullLocator())
 
 
 def few_ticks(ax: "Axes", which: Literal["x", "y"], most: int) -> None:
-    """Set the most ticks of an axis."""
+    """Set the largest number of ticks of an axis."""
     from matplotlib.ticker import MaxNLocator
 
     axis = ax.xaxis if which == "x" else ax.yaxis
@@ -198,17 +199,17 @@ def few_ticks(ax: "Axes", which: Literal["x", "y"], most: int) -> None:
 
 @contextmanager
 def in_style() -> Iterator[None]:
-    """Matplotlib's settings for the style, as long as the context lasts."""
+    """Apply Matplotlib's settings of the style within the context."""
     import matplotlib
 
     with matplotlib.rc_context(STYLE), warnings.catch_warnings():
-        # A name of a log in letters that this vehicle's font lacks; the reader's may have them.
+        # A log's name may contain letters that this font lacks, but the reader's font has.
         warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
         yield
 
 
 def styled(draw: Callable[[], "Chart | Figure | None"]) -> "Figure | None":
-    """Draw in the style; None where there is nothing to draw."""
+    """Draw in the style; return None if there is nothing to draw."""
     with in_style():
         made = draw()
         return figure_of(made) if isinstance(made, Chart) else made
@@ -217,21 +218,23 @@ def styled(draw: Callable[[], "Chart | Figure | None"]) -> "Figure | None":
 def save(
     draw: Callable[[], "Chart | Figure | None"], path: Path, *, png: bool = True
 ) -> bytes | None:
-    """Draw in the style and write `path`.svg and `path`.png; returns the SVG, or None where there
-    is nothing to draw."""
-    # Saving reads the settings again (fonts, the SVG's salt): it belongs inside the context too.
+    """Draw in the style and write `path`.svg and `path`.png.
+
+    The SVG is returned, or None if there is nothing to draw.
+    """
+    # Saving reads the settings again (fonts, the SVG's salt), so it must be inside the context.
     with in_style():
         drawn = styled(draw)
         if drawn is None:
             return None
-        # The layout once, for both files.
+        # The layout is computed once for both files.
         drawn.draw_without_rendering()
         drawn.set_layout_engine("none")
         buffer = io.BytesIO()
-        # Without a date: the same fit gives the same file.
+        # Without a date the same fit gives the same file.
         drawn.savefig(buffer, format="svg", metadata={"Date": None})
         text = _PLACES.sub(lambda m: _FURTHER.sub(b"", m[0]), buffer.getvalue())
-        # What XML cannot hold, from a name of a log.
+        # Names of a log may contain characters that XML forbids.
         data = text.translate(None, _NOT_XML)
         path.with_suffix(".svg").write_bytes(data)
         if png:

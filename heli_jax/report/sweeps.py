@@ -1,7 +1,7 @@
 """Figures of a sweep, from a Dataset over `element`, and its page.
 
-Medians leave out elements that are not ok, which are marked in red, and values that are not finite.
-A result of several flights is drawn as its mean over them.
+Medians exclude failed elements, which are marked in red, and values that are not finite. A result
+of several flights is drawn as its mean over them.
 """
 
 import functools
@@ -30,31 +30,31 @@ from heli_jax.report.style import pretty
 from heli_jax.sweeps.datasets import chunks_of
 
 RESULTS = 6
-"""results with figures of their own"""
+"""Results with their own figures."""
 DRAWN = 1 << 16
-"""elements that are drawn at most, a random choice"""
+"""Most elements drawn, chosen at random."""
 _DOTS, _MARKS = 2000, 300
-"""dots and red marks of a panel at most"""
+"""Most dots and red marks of a panel."""
 _SLICES, _PAIRS = 8, 6
-"""panels of slices and of maps at most"""
+"""Most panels of slices and of maps."""
 _TICKS = 6
-"""of an axis at most"""
+"""Most ticks of an axis."""
 _WIDE = 30.0
-"""range of positive numbers, as a factor, from which on an axis is logarithmic"""
+"""Range of positive numbers, as a factor, above which an axis is logarithmic."""
 _BINS, _A_BIN = 20, 5
-"""bins of an axis at most, and elements in each at least"""
+"""Most bins of an axis, and fewest elements in each."""
 _CELLS, _GRID = 24, 180
-"""cells along an axis at most, and distinct values of a grid that have their own cells, at most"""
+"""Most cells along an axis, and most distinct values of a grid with their own cells."""
 _DPI = 160
-"""of what is pixels in an SVG"""
+"""Resolution of bitmap parts of an SVG [dots per inch]."""
 _OK = 0
-"""the status of an element that counts; that of heli_jax.sweeps, whose import takes JAX"""
+"""Status of a successful element; defined here because importing heli_jax.sweeps loads JAX."""
 
 type Which = Literal["x", "y"]
 
 
 class Column:
-    """An axis or a result: a number (n,) for each drawn element, NaN if it is not finite."""
+    """Axis or result: a number (n,) for each drawn element, NaN if not finite."""
 
     def __init__(
         self, variable: xr.DataArray, elements: np.ndarray, ok: np.ndarray, *, axis: bool
@@ -75,7 +75,7 @@ class Column:
         if self.empty:
             return
         self.distinct = np.unique(seen)
-        # The values of a grid come twice at least.
+        # In a grid each value occurs at least twice.
         chosen = axis and 2 * self.distinct.size <= seen.size
         self.few = self.distinct.size == 1 or (chosen and self.distinct.size <= _GRID)
         low, high = float(seen[0]), float(seen[-1])
@@ -91,10 +91,10 @@ class Column:
             half = 0.05 * abs(low) or 0.5
             low, high = low - half, high + half
         self.view = low, high
-        """from the least to the largest value drawn"""
+        """Smallest and largest value drawn."""
 
     def edges(self, count: int) -> np.ndarray:
-        """Return edges of even cells, or of one cell for each value of a grid, ascending."""
+        """Return ascending edges of even cells, or of one cell for each value of a grid."""
         if self.few and self.distinct.size > 1:
             between = 0.5 * (self.distinct[1:] + self.distinct[:-1])
             first, last = 2 * self.distinct[0] - between[0], 2 * self.distinct[-1] - between[-1]
@@ -116,7 +116,7 @@ class Column:
 
 
 class Table:
-    """Results of a sweep, read once; a random choice of the elements if there are many."""
+    """Results of a sweep, read once; a random choice of elements if there are many."""
 
     def __init__(self, ds: xr.Dataset) -> None:
         self._ds = ds
@@ -124,7 +124,7 @@ class Table:
         self.size, self.n_ok = ok.size, int(np.count_nonzero(ok))
         lots = _by_lot(np.flatnonzero(ok), DRAWN), _by_lot(np.flatnonzero(~ok), DRAWN // 2)
         self.elements = np.sort(np.concatenate(lots))
-        """indices of the drawn elements, ascending, (n,)"""
+        """Indices of the drawn elements, ascending, (n,)."""
         self.ok = ok[self.elements]
         self.results = results(ds)
         self._columns: dict[str, Column] = {}
@@ -138,16 +138,16 @@ class Table:
 
     @property
     def axes(self) -> list[Column]:
-        """Axes with a finite value."""
+        """Return the axes with a finite value."""
         return [c for c in map(self.column, self._ds.attrs["axes"]) if not c.empty]
 
     def failed(self, *columns: Column) -> np.ndarray:
-        """Return elements that are not ok where these columns are finite, at most `_MARKS`."""
+        """Return at most `_MARKS` failed elements for which these columns are finite."""
         where = np.logical_and.reduce([~self.ok, *(c.finite for c in columns)])
         return _by_lot(np.flatnonzero(where), _MARKS)
 
     def head(self, figure: Figure, what: str, *notes: str) -> None:
-        """Write the title, with the number of elements that are ok, and the legend."""
+        """Write the title, with the number of successful elements, and the legend."""
         failed = self.size - self.n_ok
         lot = f"{self.elements.size} drawn, by lot" if self.elements.size < self.size else ""
         marks = "red marks: not ok" + (f" ({_MARKS} of {failed})" if failed > _MARKS else "")
@@ -156,7 +156,7 @@ class Table:
 
     @property
     def nothing(self) -> str:
-        """Text of an empty panel."""
+        """Return the text of an empty panel."""
         return "no finite value" if self.n_ok else "no element is ok"
 
 
@@ -164,7 +164,7 @@ def write_figures(directory: Path, ds: xr.Dataset) -> list[Path]:
     """Write slices-RESULT and maps-RESULT of the first results as PNG and SVG; return the files."""
     table, written = Table(ds), []
     directory.mkdir(parents=True, exist_ok=True)
-    # One after another, for memory.
+    # Figures are drawn one by one to save memory.
     for result, stem in stems(table.results[:RESULTS]).items():
         for draw in (slices, maps):
             path = directory / f"{draw.__name__}-{stem}"
@@ -203,7 +203,7 @@ def results(ds: xr.Dataset) -> list[str]:
 def slices(table: Table, result: str) -> Figure | None:
     """Draw a result against each axis: dots, and the median with a 5-95 % band in bins.
 
-    None without an axis, or if the result is not drawn.
+    Return None without an axis, or if the result is not drawn.
     """
     axes = table.axes[:_SLICES]
     if result not in table.results or not axes:
@@ -257,8 +257,11 @@ def _with_margin(y: Column) -> tuple[float, float]:
 
 
 def _binned(x: Column, y: Column) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return medians of an axis (b,) in bins of equal count, or its grid, and quantiles 5, 50 and
-    95 % of a result (3, b); None for fewer than two bins."""
+    """Return medians (b,) of an axis in bins of equal count, and quantiles of a result (3, b).
+
+    A grid has its values as bins. The quantiles are 5, 50 and 95 %. The result is None for fewer
+    than two bins.
+    """
     order = np.flatnonzero(x.used & y.used)
     order = order[np.argsort(x.values[order])]
     along, values = x.values[order], y.values[order]
@@ -267,7 +270,7 @@ def _binned(x: Column, y: Column) -> tuple[np.ndarray, np.ndarray] | None:
     else:
         count = min(_BINS, along.size // _A_BIN)
         starts = np.linspace(0, along.size, count + 1).astype(int)[:-1]
-        # Equal values are in one bin.
+        # Equal values share a bin.
         starts = np.unique(np.searchsorted(along, along[starts]))
     if starts.size < 2:
         return None
@@ -280,16 +283,16 @@ def maps(table: Table, result: str) -> Figure | None:
     every = list(itertools.combinations(table.axes, 2))
     if result not in table.results or not every:
         return None
-    # All pairs of the first axes.
+    # The first axes have all their pairs.
     pairs = sorted(every, key=lambda p: max(map(table.axes.index, p)))[:_PAIRS]
     z = table.column(result)
     columns = min(len(pairs), 2)
     figure, panels = _panels(len(pairs), columns, 3.2 if columns == 1 else 2.5)
-    # About four elements a cell.
+    # A cell contains about four elements.
     k = int(np.clip(np.sqrt(np.count_nonzero(z.used) / 4), 4, _CELLS))
     grids = [(x.edges(k), y.edges(k)) for x, y in pairs]
     medians = [_medians(x, y, z, grid) for (x, y), grid in zip(pairs, grids, strict=True)]
-    # One scale for all panels, without outliers.
+    # All panels share one scale, without outliers.
     values = np.concatenate([m[np.isfinite(m)] for m in medians])
     low, high = np.quantile(values, [0.01, 0.99]) if values.size else (0.0, 1.0)
     norm = LogNorm(low, high) if low > 0.0 and high > _WIDE * low else None
@@ -349,7 +352,7 @@ def _dots(ax: Axes, x: np.ndarray, y: np.ndarray) -> None:
 
 
 def _crosses(ax: Axes, x: np.ndarray, y: np.ndarray, **looks: Any) -> None:
-    """Mark elements that are not ok."""
+    """Mark failed elements."""
     if x.size:
         look = {"ls": "", "marker": "x", "mew": 0.7, "ms": 4.0, "alpha": 0.7, "zorder": 3, **looks}
         colour = {"color": style.VERMILLION, "rasterized": x.size > 50, "clip_on": False}
@@ -369,13 +372,15 @@ def _by_lot(elements: np.ndarray, most: int) -> np.ndarray:
     """Return at most `most` of the elements, a random choice."""
     if elements.size <= most:
         return elements
-    # Every k-th element of a grid would show a few values of an axis only.
+    # Every k-th element of a grid would show only a few values of an axis.
     return elements[np.sort(np.random.default_rng(0).choice(elements.size, most, replace=False))]
 
 
 def _numbers(variable: xr.DataArray, elements: np.ndarray) -> np.ndarray:
-    """Return a number (n,) for each of some elements, ascending: the mean over flights, NaN if it
-    is not finite or too large for Matplotlib."""
+    """Return a number (n,) for each of some elements, ascending: the mean over flights.
+
+    It is NaN if not finite or too large for Matplotlib.
+    """
     parts = []
     for which, part in chunks_of(variable):
         first, last = np.searchsorted(elements, [which.start, which.stop])
@@ -395,7 +400,7 @@ _KINDS = {
     "slices": ("{} against each axis", "dots, and the median with a 5 to 95 % band"),
     "maps": ("{} over pairs of axes", "colours: median of the elements in each cell"),
 }
-"""title and caption of a figure by the beginning of its file name"""
+"""Title and caption of a figure by the beginning of its file name."""
 
 
 def write_page(path: Path, directory: Path, title: str) -> None:
@@ -417,7 +422,7 @@ def write_page(path: Path, directory: Path, title: str) -> None:
     path.write_text(page, encoding="utf-8")
 
 
-# Any: what summary.json holds.
+# Any: content of summary.json.
 def _results(content: dict[str, Any]) -> tables.Table:
     rows = [
         (name, *(number(r.get(k), _DIGITS) for k in _QUANTILES), pretty(r.get("unit")))

@@ -1,4 +1,4 @@
-"""Tables of the page and of the terminal: rows of text under heads."""
+"""Tables of the page and of the terminal: rows of text with headings."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -42,14 +42,14 @@ from heli_jax.vehicle import Constant
 
 
 class Table(NamedTuple):
-    """Heads and rows of text; the first column names the row."""
+    """Headings and rows of text; the first column names the row."""
 
     head: tuple[str, ...]
     rows: list[tuple[str, ...]]
 
 
 def pairs(content: Mapping[str, object], unit: str = "") -> Table:
-    """Names and values."""
+    """Return a table of names and values."""
     return Table(
         ("", ""),
         [(n, f"{v:.2f}{unit}" if isinstance(v, float) else str(v)) for n, v in content.items()],
@@ -63,18 +63,18 @@ class Bar(NamedTuple):
     value: str
     unit: str
     low: float | None
-    """None without an interval"""
+    """None without an interval."""
     high: float | None
     words: str
-    """the interval as text"""
+    """Interval as text."""
 
 
 class Bars(NamedTuple):
-    """The estimates on one axis: their relative deviation from the estimate."""
+    """The estimates on one axis, as relative deviations from the estimate."""
 
     rows: tuple[Bar, ...]
     reach: str
-    """half range of the axis; empty without a bar"""
+    """Half range of the axis; empty without a bar."""
 
 
 def bars(fit: Fit) -> Bars:
@@ -88,7 +88,7 @@ def bars(fit: Fit) -> Bars:
         ends = [end / e.value - 1.0 for end in (e.lower95, e.upper95) if known and end is not None]
         parts.append(sorted(ends) if len(ends) == 2 and all(map(math.isfinite, ends)) else None)
     most = max((abs(v) for pair in parts if pair for v in pair), default=0.0)
-    # Longer bars are cut off.
+    # Longer bars are cut.
     reach = next((r for r in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5) if most <= r), 1.0)
     placed = []
     for (name, e, unit), pair in zip(rows, parts, strict=True):
@@ -108,7 +108,7 @@ def correlation(fit: Fit) -> list[tuple[str, list[tuple[str, float]]]]:
     """Return rows of the correlation matrix: name, and text and number of each cell."""
     rows = []
     for name, values in zip(fit.verdict.names, fit.verdict.correlation, strict=True):
-        # Five digits near 1, where sqrt(1 - r^2) counts.
+        # Near 1 five digits are needed for sqrt(1 - r^2).
         numbers = [float(r) if math.isfinite(r) else 0.0 for r in values]
         cells = [(_signed(r, 5 if 0.995 < abs(r) < 1.0 else 2), r) for r in numbers]
         rows.append((name, cells))
@@ -174,7 +174,7 @@ def intervals(comparison: Intervals, fit: Fit) -> Table:
     for name, by_method in comparison.by_parameter.items():
         cells = []
         for m in present:
-            # With the digits of the Gaussian sd.
+            # The digits are those of the Gaussian sd.
             ends = by_method.get(m, (math.nan, math.nan))
             low, high, _ = measured(fit.estimates[name].sd, *ends)
             cells.append(f"{low} to {high}" if m in by_method else NOTHING)
@@ -183,8 +183,7 @@ def intervals(comparison: Intervals, fit: Fit) -> Table:
 
 
 def sampling(posterior: Posterior) -> Table:
-    """Return the table of NUTS convergence: R-hat and effective draws by parameter, divergent
-    steps."""
+    """Return the table of NUTS convergence: R-hat, effective draws and divergent steps."""
     rows = [
         (name, f"{c.rhat:.3f}", f"{c.effective:.0f}", NOTHING)
         for name, c in posterior.convergence.items()
@@ -353,7 +352,7 @@ def residuals(fit: Fit, problem: Problem) -> Table:
     }
     rows = []
     for name, w in fit.whiteness.items():
-        output = name.rsplit("/", 1)[-1]  # a flight's name may hold slashes as well
+        output = name.rsplit("/", 1)[-1]  # a flight's name may contain slashes too
         unit = pretty(naming.unit(problem.model.Outputs, output))
         sd = number(fit.noise.get(name), 3), number(stated.get(name), 3)
         rows.append(
@@ -406,12 +405,13 @@ def product(
     """Return a product of powers of estimates and constants.
 
     Args:
-        powers: by estimate or constant.
-        names: the order of `correlation`.
-        correlation: between the estimates, (q, q).
+        powers: exponents by estimate or constant.
+        names: order of `correlation`.
+        correlation: correlation of the estimates, (q, q).
 
     Returns:
-        `sd` is None if an estimate is not determined. None if a part is missing or not positive.
+        The product; `sd` is None if an estimate is not determined. None if a factor is missing or
+        not positive.
     """
     free = [n for n in powers if n in estimates]
     if not free or any(n not in estimates and n not in constants for n in powers):
@@ -427,7 +427,7 @@ def product(
             return None
         at = [list(names).index(n) for n in free]
         among = np.asarray(correlation, float)[np.ix_(at, at)]
-    # The sd of the logarithm, with the correlations.
+    # The sd of the logarithm includes the correlations.
     logs = np.array([powers[n] * (estimates[n].sd or 0.0) / values[n] for n in free])
     sd = math.sqrt(max(float(logs @ among @ logs), 0.0))
     value = math.prod(values[n] ** power for n, power in powers.items())
@@ -511,7 +511,7 @@ def methods(comparison: MethodComparison) -> Table:
 
 
 def _by_method(e: Estimate | None) -> str:
-    """`0.02403 (0.02395 to 0.02411)`"""
+    """Return an estimate as `0.02403 (0.02395 to 0.02411)`."""
     if e is None:
         return NOTHING
     value, _, _, interval = _cells(e)
@@ -538,7 +538,7 @@ _NO_RESULT = (
     "reached."
 )
 _AS_READ = {"s": ("ms", 1e3)}
-"""displayed unit by SI unit, with its factor"""
+"""Displayed unit by SI unit, with its factor."""
 
 
 def handling(entries: Sequence[Handling]) -> Table:

@@ -1,4 +1,4 @@
-"""A simulated manoeuvre as a page: its figures, and the flight in 3D, in one file."""
+"""Page of a simulated manoeuvre: its figures, and the flight in 3D, in one file."""
 
 import functools
 from collections.abc import Mapping, Sequence
@@ -20,21 +20,21 @@ from heli_jax.report.page import MOST_FLIGHTS, Picture, filled, picture
 from heli_jax.simulation.trajectory import Trajectory
 
 _HUGE = 1e9
-"""what no state of a vehicle reaches, and no figure can draw"""
+"""Size that no state of a vehicle reaches and no figure can draw."""
 
 
-# Parameters of a model are a class of the user's own: they are annotated Any.
+# Params is Any because it may be a user's class.
 
 
 class Shown(NamedTuple):
-    """A run as the page holds it."""
+    """A run in the form stored in the page."""
 
     name: str
     pictures: list[Picture]
     scene: int | None
-    """the flight in 3D, of a whole helicopter: its number among the page's scenes"""
+    """Number of the 3D scene on the page, for a full helicopter."""
     size: float
-    """how many times its size the vehicle is drawn there"""
+    """Magnification of the vehicle in the scene."""
 
 
 def write_view(
@@ -46,24 +46,24 @@ def write_view(
     notes: Sequence[str] = (),
     made: Origin | None = None,
 ) -> None:
-    """Write the page of some runs of a model, with NumPy arrays, by their names.
+    """Write the page of runs of a model by name, with NumPy arrays.
 
-    It loads nothing from outside itself, and titles and names are escaped.
+    It loads nothing from outside, and titles and names are escaped.
 
     Raises:
-        OSError: the place cannot be written to.
+        OSError: the place is not writable.
     """
     whole = is_full_nonlinear(model)
     shown, numbers = [], Numbers()
     for name, whole_run in list(runs.items())[:MOST_FLIGHTS]:
         run = _finite(whole_run)
         number, size = None, 1.0
-        # Of two samples one may still not be finite: figures leave it out, a 3D scene cannot.
+        # One of two samples may still be NaN. Figures skip it, but a 3D scene cannot.
         if whole and _good(run).all():
             number, size = len(numbers.scenes), size_of(run, float(params.R))
             numbers.scenes.append(scene(run, params, numbers, name))
         shown.append(Shown(name, _pictures(run, model, numbers), number, size))
-    # Flights that are not drawn are counted on the page, so that nobody takes those shown for all.
+    # The page states the number of flights not drawn, so that they are not overlooked.
     page = filled(
         "view.html.j2",
         title=title,
@@ -85,7 +85,7 @@ def _good(run: Trajectory) -> np.ndarray:
 
 
 def _finite(run: Trajectory) -> Trajectory:
-    """The run up to where it ceases to be finite; two samples at least."""
+    """Return the run before its first non-finite sample, with at least two samples."""
     good = _good(run)
     return run if good.all() else run.first(max(2, int(np.argmin(good))))
 
@@ -98,60 +98,61 @@ def _pictures(run: Trajectory, model: Model, numbers: Numbers) -> list[Picture]:
     return [p for p in made if p is not None]
 
 
-# The path, the attitude, and the shape of a vehicle that flies along it: `assets/flight.js` draws
-# them. States and parameters are records of a model, a class of the user's own: annotated Any.
+# Path, attitude and shape of a flying vehicle, drawn by `assets/flight.js`. States and parameters
+# are Any, because they are user classes.
 
 MOST_MOMENTS = 3000
-"""of a flight, between which the page interpolates"""
+"""Most moments of a flight; the page interpolates between them."""
 _SMALLEST = 0.1
-"""rotor diameter over the length of the path: a smaller vehicle is drawn larger"""
+"""Least rotor diameter relative to the length of the path; smaller vehicles are enlarged."""
 _AROUND = 16
-"""corners of what is round"""
+"""Corners of round shapes."""
 _DIGITS = 4
-"""of a coordinate of the shape [m]: a tenth of a millimetre is more than a screen shows"""
+"""Decimals of the shape's coordinates [m]; a tenth of a millimetre is below the screen's
+resolution."""
 
 type Points = Float[np.ndarray, "n 3"]
 
 
 def moments_of(n: int) -> np.ndarray:
     """Return the indices of the samples kept: all of n, or at most `MOST_MOMENTS` evenly spaced."""
-    # Rounded, not truncated: the first and the last sample are among them.
+    # Rounding keeps the first and the last sample; truncation might not.
     return np.unique(np.round(np.linspace(0, n - 1, min(n, MOST_MOMENTS))).astype(int))
 
 
 def size_of(run: Trajectory, R: float) -> float:
     """Return the magnification of the drawn vehicle, so that it is visible on a long path."""
     path = _path(run.states)
-    # Whole numbers: the page says 'drawn 3 times its size'.
+    # Whole numbers suit the page's text 'drawn 3 times its size'.
     length = float(np.max(np.ptp(path, axis=0)))
     return float(np.ceil(max(1.0, _SMALLEST * length / (2.0 * R))))
 
 
 def attitude(states: Any) -> Rotation:
-    """The turns from body axes (forward, right, down) to x, y and down."""
+    """Return the rotations from body axes (forward, right, down) to x, y and down."""
     angles = [np.asarray(getattr(states, n)) for n in ("psi", "theta", "phi")]
     return Rotation.from_euler("ZYX", np.stack(angles, axis=-1))
 
 
 def placed(shape: Points, turn: Rotation, at: np.ndarray) -> Points:
-    """A shape in body axes (forward, right, down) in the figure: forward, left and up.
+    """Return a shape in the figure's axes: forward, left and up.
 
     Args:
-        shape: points [m].
+        shape: points in body axes (forward, right, down) [m].
         at: (3,) position of the body's origin in the figure [m].
     """
-    # Forward, left and up are right-handed, as a viewer takes axes to be; forward, right and up
-    # are not, and the vehicle would be its mirror image.
+    # Forward, left and up are right-handed, as viewers expect. With forward, right and up the
+    # vehicle would be its mirror image.
     return turn.apply(shape) * np.array([1.0, -1.0, -1.0]) + at
 
 
 def scene(run: Trajectory, params: Any, numbers: Numbers, name: str = "") -> dict[str, Any]:
-    """The flight as plain data; its arrays go to the page's numbers."""
+    """Return the flight as plain data; its arrays are stored in the page's numbers."""
     path, size, R = _path(run.states), size_of(run, float(params.R)), float(params.R)
     kept, pod = moments_of(path.shape[0]), _pod(R)
     fan = [[0, 1 + i, 1 + (i + 1) % _AROUND] for i in range(_AROUND)]
     bounds = np.stack([path.min(axis=0) - 2.2 * size * R, path.max(axis=0) + 2.2 * size * R])
-    # Quaternions and not angles: between two headings of 359 and 1 degree lie two degrees.
+    # Quaternions interpolate correctly: headings of 359 and 1 degree differ by two degrees.
     turns = _continuous(attitude(run.states).as_quat()[kept])
     return {
         "name": name,
@@ -171,14 +172,14 @@ def scene(run: Trajectory, params: Any, numbers: Numbers, name: str = "") -> dic
 
 
 def _continuous(quaternions: np.ndarray) -> np.ndarray:
-    """(n, 4), each of the two signs of a turn that is nearer to the one before."""
+    """Return quaternions (n, 4) with the signs that are nearest to the previous ones."""
     along = np.sum(quaternions[1:] * quaternions[:-1], axis=1)
     signs = np.concatenate([[1.0], np.cumprod(np.where(along < 0.0, -1.0, 1.0))])
     return quaternions * signs[:, None]
 
 
 def _path(states: Any) -> Points:
-    """The positions in the figure's axes: forward, left and up."""
+    """Return the positions in the figure's axes: forward, left and up."""
     x, y, z = (np.asarray(getattr(states, n), np.float64) for n in ("x", "y", "z"))
     return np.stack([x, -y, z], axis=1)
 
@@ -193,7 +194,7 @@ def _circle(radius: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _pod(R: float) -> Points:
-    """The fuselage: an ellipsoid of rings between two ends, nose first."""
+    """Return the fuselage: an ellipsoid of rings between two ends, nose first."""
     a, b = _circle(1.0)
     rings = [
         np.stack([np.full(_AROUND, np.cos(s)), a * np.sin(s), b * np.sin(s)], axis=1)
@@ -210,12 +211,12 @@ def _disk(p: Any) -> Points:
 
 
 def _hub(p: Any) -> np.ndarray:
-    # Never within the fuselage, however little a vehicle's file says that it lies above.
+    # The rotor is never drawn within the fuselage, however low the vehicle's file places it.
     return np.array([-float(p.lr), 0.0, -max(float(p.hr), 0.3 * float(p.R))])
 
 
 def _outlines(p: Any) -> list[Points]:
-    """Mast, tail boom with fin, tail rotor, rotor's rim, skids and their legs, each a line."""
+    """Return mast, tail boom, fin, tail rotor, rotor rim, skids and their legs as lines."""
     R, tail, hub = float(p.R), float(p.L_T), _hub(p)
     a, b = _circle(float(p.R_T))
     wheel = np.stack([a - tail, np.zeros(_AROUND), b], axis=1)
@@ -235,8 +236,8 @@ def _outlines(p: Any) -> list[Points]:
 
 
 def _ticks(low: float, high: float) -> np.ndarray:
-    """About five round numbers between two."""
-    # 1, 2 or 5 times a power of ten, at most eight of them; + 0.0 turns -0 into 0.
+    """Return about five round numbers between two."""
+    # Steps are 1, 2 or 5 times a power of ten, for at most eight numbers; + 0.0 turns -0 into 0.
     step = 10.0 ** np.floor(np.log10((high - low) / 5.0))
     step *= next(f for f in (1.0, 2.0, 5.0, 10.0) if (high - low) / (f * step) <= 7.0)
     return step * np.arange(np.ceil(low / step), np.floor(high / step) + 1.0) + 0.0

@@ -1,8 +1,8 @@
-"""Flights for regression: smoothed signals, their derivatives, and the states that outputs show.
+"""Flights for regression: smoothed signals, their derivatives, and states from outputs.
 
-A signal x is smoothed by a short kernel of unit area, w(s) = c (1 - s^2)^4, and differentiated by
+A signal x is smoothed by a short kernel of unit area, w(s) = c (1 - s^2)^4. It is differentiated by
 parts, (w * x)' = w' * x (modulating functions: M. Shinbrot, NACA TN 3288, 1954). A linear equation
-x' = A x + B u holds exactly for the smoothed signals, whatever the kernel's width.
+x' = A x + B u holds exactly for the smoothed signals, for any width of the kernel.
 """
 
 import itertools
@@ -24,32 +24,33 @@ from heli_jax.flights.holds import without_jumps
 from heli_jax.numerics.white_noise import noise_guess
 
 ORDERS = 3
-"""a signal, its first and its second derivative"""
+"""Number of derivatives: a signal, its first and its second derivative."""
 _HALF_WIDTHS = (4, 6, 8, 12, 16, 24, 32, 48, 64)
-"""candidates, of the kernel [samples]"""
+"""Candidate half widths of the kernel [samples]."""
 _MOST_LEFT_OUT = 0.05
-"""part of a signal's sd that smoothing may remove beside the noise"""
+"""Largest part of a signal's sd that smoothing may remove besides the noise."""
 _BRIDGED = 3
-"""missing samples in a row that are interpolated; more end a segment"""
+"""Longest gap that is interpolated [samples]; longer gaps end a segment."""
 _LOST = 2.5
-"""usual steps of a slow sensor that are interpolated: one lost sample, with jitter"""
+"""Longest gap of a slow sensor that is interpolated [usual steps]: one lost sample, with jitter."""
 _DETERMINED = 1e-8
-"""largest residual of a unit vector in the span of the measured outputs"""
+"""Largest residual of a unit vector in the span of the measured outputs."""
 _SEGMENTS = 20
-"""of a flight at most, the longest: each adds initial values of hidden states"""
+"""Most segments of a flight (the longest count), because each adds initial values of hidden states.
+"""
 _RESOLVED = 4
-"""samples that are kept, in a half width of the kernel"""
+"""Samples kept in a half width of the kernel."""
 
 # The kernel and its first three derivatives vanish at the ends.
 _SHAPE = Polynomial([1.0, 0.0, -1.0]) ** 4
 _AREA = 2.0 * _SHAPE.integ()(1.0)
 _KERNEL = tuple(p / _AREA for p in (_SHAPE.integ(), *map(_SHAPE.deriv, range(ORDERS))))
-"""its integral, and its derivatives from the zeroth on"""
+"""The kernel's integral, and its derivatives from the zeroth on."""
 
 
 def margin(half: int) -> int:
-    """Return the samples at either end of a segment that smoothing removes."""
-    return half + 2  # a delayed and held input needs two more
+    """Return the number of samples that smoothing removes at each end of a segment."""
+    return half + 2  # two more for a delayed and held input
 
 
 def shortest(half: int) -> int:
@@ -63,25 +64,26 @@ def smoothed(
     """Return the smoothed signal and its derivatives per second, (3, N - 2 `margin`).
 
     Args:
-        y: without missing samples.
+        y: signal without missing samples.
         half: half width of the kernel [samples].
-        held: True for an input with a zero-order hold; else it is linear between samples.
+        held: True for an input with a zero-order hold, else it is linear between samples.
         late: delay [s].
     """
-    # Whole samples of the delay by index, the rest by the weights.
+    # Whole samples of the delay shift the index; the weights contain the rest.
     whole, rest = divmod(late / dt, 1.0)
     y = y[np.clip(np.arange(y.size) - int(whole), 0, y.size - 1)]
     j = np.arange(-margin(half), margin(half) + 1) - rest
     s = j / half
     scale = float(half) ** -np.arange(ORDERS)[:, None]
     if held:
-        # The kernel's integrals over each sample time: weights at the samples would delay a jump.
+        # The kernel is integrated over each sample time, because weights at the samples would delay
+        # a jump.
         weights = scale * np.stack(
             [_kernel(r, s) - _kernel(r, s - 1.0 / half) for r in range(ORDERS)]
         )
     else:
         weights = scale / half * np.stack([_kernel(r + 1, s) for r in range(ORDERS)])
-        # Corrected so that sums have the exact derivatives of parabolas.
+        # The correction makes sums reproduce the derivatives of parabolas exactly.
         weights[0] /= weights[0].sum()
         weights[1] -= weights[1].sum() * weights[0]
         weights[1] /= -(weights[1] @ j)
@@ -108,7 +110,7 @@ def _bridged(y: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
         return y
     from scipy.interpolate import PchipInterpolator
 
-    # A slow sensor on a fast grid misses most samples.
+    # On a fast grid a slow sensor misses most samples.
     filled = PchipInterpolator(seen, y[seen], extrapolate=False)(np.arange(y.size))
     steps = np.diff(seen)
     long = steps > 1 + max(_BRIDGED, _LOST * float(np.median(steps)))
@@ -118,8 +120,7 @@ def _bridged(y: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
 
 
 def kernel_width(flights: Sequence[Flight]) -> int:
-    """Return the half width [samples] of the widest kernel that removes little more than noise from
-    every output."""
+    """Return the half width of the widest kernel that removes little but noise [samples]."""
     signals = []
     for flight in flights:
         parts, bridged = segments(flight.outputs)
@@ -170,62 +171,62 @@ def coefficients(
 
 
 def generic(count: int) -> Float[np.ndarray, " q"]:
-    """Return random numbers (count,), at which no terms cancel."""
+    """Return random numbers (count,) for which no terms cancel."""
     return np.random.default_rng(11).uniform(0.5, 1.5, count)
 
 
 class Structure(NamedTuple):
-    """States that measured outputs determine, and the equations to regress."""
+    """States determined by measured outputs, and the equations to regress."""
 
     states: tuple[str, ...]
     signals: tuple[str, ...]
-    """measured outputs, then inputs: the columns of `shown`"""
+    """Measured outputs, then inputs: the columns of `shown`."""
     shown: dict[int, Float[np.ndarray, "r z"]]
-    """by state, coefficients of each derivative of each signal"""
+    """Coefficients of each derivative of each signal, by state."""
     equations: tuple[str, ...]
-    """the states and outputs of `rows`"""
+    """States and outputs of `rows`."""
     rows: tuple[int, ...]
-    """rows of `coefficients` to regress: of states, and of outputs that determine none"""
+    """Rows of `coefficients` to regress: states, and outputs that determine no state."""
 
     @property
     def hidden(self) -> tuple[int, ...]:
-        """The states that no output determines."""
+        """States that no output determines."""
         return tuple(i for i in range(len(self.states)) if i not in self.shown)
 
 
 def structure(model: Model, both: Float[np.ndarray, "r c q"], outputs: Sequence[str]) -> Structure:
     """Return the measured states and the equations to regress.
 
-    A state is measured if outputs determine it with known coefficients, or if it is the derivative
-    of such a state, as a rate of an angle.
+    A state is measured if outputs determine it with known coefficients. The derivative of a
+    measured state, like the rate of an angle, is measured too.
 
     Args:
-        both: `coefficients` at `generic` values of the free parameters, with derivatives by these.
+        both: `coefficients` at `generic` values of the free parameters, with their derivatives.
     """
     value, depends = both[..., 0], (both[..., 1:] != 0).any(axis=-1)
     states, inputs = naming.names(model.State), naming.names(model.Inputs)
     n, p, names = len(states), len(outputs), naming.names(model.Outputs)
     rows = [n + names.index(y) for y in outputs]
-    # y - D u = C x with known coefficients; other outputs are equations to regress.
+    # y - D u = C x is used if its coefficients are known. Other outputs are regressed.
     known = [i for i, row in enumerate(rows) if not depends[row].any()]
     right = np.zeros((len(known), ORDERS, p + len(inputs)))
     for k, i in enumerate(known):
         right[k, 0, i] = 1.0
         right[k, 0, p:] = -value[rows[i], n:]
     shown = _solved(value[[rows[i] for i in known], :n], right)
-    # x_i' - A_ik x_k - B_i u = A_ij x_j, with measured k, gives further states j.
+    # With measured k, x_i' - A_ik x_k - B_i u = A_ij x_j determines further states j.
     rest = [j for j in range(n) if j not in shown]
     equations = [i for i in shown if not depends[i].any() and np.any(value[i, rest] != 0)]
     sides = []
     for i in equations:
-        # Rolled by one order: the time derivative.
+        # Rolling by one order gives the time derivative.
         side = np.roll(shown[i], 1, axis=0)
         side[0, :] = 0.0
         side -= sum(value[i, k] * shown[k] for k in shown)
         side[0, p:] -= value[i, n:]
         sides.append(side)
     if sides:
-        # Once only: each derivative adds noise.
+        # This is done only once because each derivative adds noise.
         more = _solved(value[np.ix_(equations, rest)], np.stack(sides))
         shown = {**shown, **{rest[j]: columns for j, columns in more.items()}}
     hidden = [i for i in range(n) if i not in shown]
@@ -238,7 +239,7 @@ def structure(model: Model, both: Float[np.ndarray, "r c q"], outputs: Sequence[
 def _solved(
     left: Float[np.ndarray, "k n"], right: Float[np.ndarray, "k r z"]
 ) -> dict[int, Float[np.ndarray, "r z"]]:
-    """Return the unknowns that left x = right determines, by index."""
+    """Return the unknowns determined by left x = right, by index."""
     if not left.size:
         return {}
     inverse = np.linalg.pinv(left, rcond=1e-10)
@@ -251,8 +252,7 @@ def _solved(
 def hidden_constants(
     model: Model, base: Mapping[str, float], structures: Sequence[Structure]
 ) -> set[str]:
-    """Return the parameters that are delays, or set eigenvalues of hidden states, on which the
-    signals of the regression depend.
+    """Return the parameters that are delays, or set eigenvalues of hidden states in the regression.
 
     Args:
         base: all parameters by name; NaN if not given, other values do not matter.
@@ -264,7 +264,7 @@ def hidden_constants(
         block = both[np.ix_(hidden, hidden)]
         depends = block[..., 1:] != 0
         # An entry sets an eigenvalue if it is on the diagonal, or if constant entries close a loop
-        # with it, as for a stiffness.
+        # with it (a stiffness).
         plain = (block[..., 0] != 0) & ~depends.any(axis=-1)
         loop = np.linalg.matrix_power(np.eye(len(hidden)) + plain.T, len(hidden)) > 0
         constants |= {names[j] for j in np.flatnonzero((depends & loop[..., None]).any((0, 1)))}
@@ -272,14 +272,14 @@ def hidden_constants(
 
 
 class Segment(NamedTuple):
-    """A segment without gaps, smoothed: arrays (signals, n), SI."""
+    """Smoothed segment without gaps; arrays (signals, n), SI."""
 
     known: Float[np.ndarray, "k n"]
-    """the measured states, in the order of `Structure.shown`, then the inputs"""
+    """Measured states in the order of `Structure.shown`, then inputs."""
     left: Float[np.ndarray, "e n"]
-    """the left-hand sides of the equations: derivatives per second, or outputs"""
+    """Left-hand sides of the equations: derivatives per second, or outputs."""
     step: float
-    """time between samples [s]"""
+    """Time between samples [s]."""
 
 
 class Record(NamedTuple):
@@ -299,12 +299,12 @@ def record(
     parts, bridged = segments(flight.outputs)
     parts = [p for p in parts if p.stop - p.start >= shortest(half)]
     parts = sorted(parts, key=lambda p: p.start - p.stop)[:_SEGMENTS]
-    # Neighbours within a kernel have the same samples.
+    # Adjacent values of the smoothed signal are strongly correlated.
     every = max(1, half // _RESOLVED)
     inputs, shown, made = naming.names(model.Inputs), structure.shown, []
     for part in parts:
         signals = {n: smoothed(y[part], flight.dt, half) for n, y in bridged.items()}
-        # A delayed input begins before the segment.
+        # A delayed input starts before the segment.
         length = part.stop - part.start
         before = np.clip(np.arange(part.start - length, part.stop), 0, None)
         for name in inputs:

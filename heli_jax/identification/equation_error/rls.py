@@ -1,6 +1,6 @@
 """Recursive least squares (Kim and Tilbury, 1997), and a/Ixx and a/If from Hd(z).
 
-RLS, eqs 25-33, is in Potter's square-root form: P = S S^T is kept as its factor S, so that it stays
+RLS, eqs 25-33, uses Potter's square-root form: P = S S^T is stored as its factor S, which keeps P
 symmetric and positive definite. With forgetting, the covariance form loses this within thousands of
 samples.
 """
@@ -27,15 +27,16 @@ from heli_jax.numbers import terse
 from heli_jax.vehicle import of_helicopter
 
 _P0 = 1e12
-"""initial variance of every coefficient, for signals of unit rms"""
+"""Initial variance of every coefficient, for signals of unit rms."""
 _PER_ORDER = 10
-"""fewest samples in a row, for each order"""
+"""Fewest consecutive samples for each order."""
 _MEANT = 0.05
-"""largest relative error of the coefficient of s^2 under the structure of eq. 23"""
+"""Largest relative error of the coefficient of s^2 under the structure of eq. 23."""
 _STARTING = 100
-"""first samples that are left out of the one-step errors, at most"""
+"""Most initial samples that are excluded from the one-step errors."""
 _WORSE = 1.5
-"""rms error of the simulation over that one step ahead from which on noise biases the estimate"""
+"""Ratio of the rms errors of simulation and one-step prediction above which noise biases the
+estimate."""
 
 
 class RLSState(NamedTuple):
@@ -43,30 +44,30 @@ class RLSState(NamedTuple):
 
     theta: Float[Array, " q"]
     S: Float[Array, "q q"]
-    """square root of the covariance matrix: P = S S^T"""
+    """Square root of the covariance matrix: P = S S^T."""
 
 
 class RLSInfo(NamedTuple):
     """Results of a step."""
 
     error: Float[Array, ""]
-    """y(k) - Phi(k)^T Theta(k-1), eq. 29"""
+    """Prediction error y(k) - Phi(k)^T Theta(k-1), eq. 29."""
     largest: Float[Array, ""]
-    """largest variance on the diagonal of P"""
+    """Largest variance on the diagonal of P."""
 
 
 class RLSResult(NamedTuple):
     """RLS over a record."""
 
     theta: Float[Array, " q"]
-    """final estimate"""
+    """Final estimate."""
     history: Float[Array, "N q"]
     error: Float[Array, " N"]
     largest: Float[Array, " N"]
 
 
 def rls_init(size: int, p0: float | Float[Array, ""] = 1e6) -> RLSState:
-    """Theta(0) = 0 and P(0) = p0 I: a large p0 lets the first samples decide alone."""
+    """Return Theta(0) = 0 and P(0) = p0 I; with a large p0 the first samples alone decide."""
     scale = jnp.sqrt(jnp.asarray(p0))
     return RLSState(jnp.zeros(size, scale.dtype), scale * jnp.eye(size, dtype=scale.dtype))
 
@@ -78,20 +79,23 @@ def rls_step(
     forgetting: Float[Array, ""],
     bound: Float[Array, ""],
 ) -> tuple[RLSState, RLSInfo]:
-    """One sample, eqs 29-33 with the gain of eq. 33 (which eq. 31 equals with the new P); a sample
-    j steps ago weighs forgetting^j."""
+    """Update the estimate by one sample: eqs 29-33 with the gain of eq. 33.
+
+    Eq. 31 with the new P gives the same gain. A sample j steps ago has the weight forgetting^j.
+    """
     theta, S = state
     f = jnp.sum(S * phi[:, None], axis=0)
     alpha = forgetting + jnp.sum(f * f)
     gain = jnp.sum(S * f[None, :], axis=1) / alpha
     error = y - jnp.sum(phi * theta)
     theta = theta + gain * error
-    # Potter's update of the factor: this part of the gain takes S S^T to (1 - gain phi^T) P.
+    # Potter's update: this factor of the gain turns S S^T into (1 - gain phi^T) P.
     shrink = 1.0 / (1.0 + jnp.sqrt(forgetting / alpha))
     S = (S - shrink * gain[:, None] * f[None, :]) / jnp.sqrt(forgetting)
     variances = jnp.sum(S * S, axis=1)
     largest = jnp.max(variances)
-    # Wind-up: with forgetting, P grows without limit in directions that are not excited.
+    # The bound prevents wind-up: with forgetting, P grows without limit in directions without
+    # excitation.
     S = jax.lax.cond(largest > bound, _bounded, lambda S, *_: S, S, variances, bound)
     return RLSState(theta, S), RLSInfo(error, largest)
 
@@ -99,12 +103,14 @@ def rls_step(
 def _bounded(
     S: Float[Array, "q q"], variances: Float[Array, " q"], bound: Float[Array, ""]
 ) -> Float[Array, "q q"]:
-    """Reduce the largest variance to the bound by a pseudo-measurement of that parameter, which
-    leaves Theta and the excited directions."""
+    """Reduce the largest variance to the bound by a pseudo-measurement of that parameter.
+
+    Theta and the excited directions do not change.
+    """
     i = jnp.argmax(variances)
     f, p = S[i], variances[i]
-    # A measurement of variance r leaves p r / (p + r). A batched cond computes both branches: the
-    # divisor must not vanish below the bound.
+    # A measurement of variance r leaves the variance p r / (p + r). A batched cond computes both
+    # branches, so the divisor must not vanish below the bound.
     r = p * bound / jnp.maximum(p - bound, jnp.finfo(S.dtype).tiny)
     alpha = p + r
     gain = jnp.sum(S * f[None, :], axis=1) / alpha
@@ -118,7 +124,7 @@ def regressors(u: Float[Array, " N"], y: Float[Array, " N"], order: int) -> Floa
     return jnp.stack([jnp.pad(s, (j, 0))[: s.shape[0]] for s, j in lags], axis=1)
 
 
-# As arrays forgetting, p0 and bound share one compiled program; as numbers each value has its own.
+# Arrays of forgetting, p0 and bound share one compiled program; each number would have its own.
 @eqx.filter_jit
 def rls(
     u: Float[Array, " N"],
@@ -131,12 +137,12 @@ def rls(
 ) -> RLSResult:
     """Run RLS over a record: Theta = [-a1 ... -an, b0 ... bn] of Hd(z), eqs 25-33.
 
-    The first n samples have no recorded past: they serve as past only, and the histories hold
-    zeros there.
+    The first n samples lack a recorded past. They serve only as past, and the histories are zero
+    there.
 
     Args:
-        order: n of Hd(z); the paper's is 4.
-        forgetting: see `rls_regression`, as p0 and bound.
+        order: n of Hd(z); 4 in the paper.
+        forgetting: see `rls_regression`, also for p0 and bound.
 
     Raises:
         ValueError: order below 1, fewer than 2 order + 1 samples, or u and y of unequal length.
@@ -167,9 +173,9 @@ def rls_regression(
 
     Args:
         forgetting: in (0, 1].
-        bound: largest variance that P may reach, against wind-up; 100 p0 unless given.
+        bound: largest variance in P, against wind-up; default 100 p0.
     """
-    # A scan carries one dtype: that of the records.
+    # A scan carries one dtype, that of the records.
     p0, factor = jnp.asarray(p0, phi.dtype), jnp.asarray(forgetting, phi.dtype)
     limit = jnp.asarray(100.0 * p0 if bound is None else bound, phi.dtype)
 
@@ -182,8 +188,10 @@ def rls_regression(
 
 
 def transfer_function(theta: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Return num and den (n + 1,) of Hd(z), highest power first, from Theta (2n + 1,), eqs 24 and
-    26."""
+    """Return num and den (n + 1,) of Hd(z) from Theta (2n + 1,), eqs 24 and 26.
+
+    The highest power comes first.
+    """
     theta = np.asarray(theta)
     n = theta.size // 2
     # Theta holds -a (eq. 25).
@@ -201,22 +209,22 @@ class Baseline:
     forgetting: float
     dt: float
     history: np.ndarray
-    """(N, 2n + 1) [-a1 ... -an, b0 ... bn] after each sample"""
+    """[-a1 ... -an, b0 ... bn] after each sample, (N, 2n + 1)."""
     continuous_num: np.ndarray | None
     continuous_den: np.ndarray | None
     note: str
-    """why the continuous form is not the inverse of the hold; empty if it is"""
+    """Reason why the continuous form is not the inverse of the hold; empty if it is."""
     combinations: dict[str, float]
     simulated: np.ndarray
-    """Hd over the whole record, from its first measured outputs"""
+    """Simulation of Hd over the whole record, from its first measured outputs."""
     metrics: Metrics
-    """of that simulation"""
+    """Metrics of the simulation."""
     findings: tuple[Finding, ...]
-    """doubts about the estimates"""
+    """Doubts about the estimates."""
 
     @property
     def theta(self) -> np.ndarray:
-        """The final coefficients (2n + 1,)."""
+        """Final coefficients (2n + 1,)."""
         return self.history[-1]
 
     @property
@@ -246,7 +254,7 @@ class Baseline:
 
     @property
     def sentences(self) -> list[str]:
-        """The sentences of the findings."""
+        """Sentences of the findings."""
         return [f.sentence for f in self.findings]
 
 
@@ -257,11 +265,11 @@ def baseline(
 
     Args:
         params: the model's Params, for the vehicle's geometry and rotor speed.
-        order: n of Hd(z); the paper's is 4.
-        forgetting: in (0, 1]; a sample j steps ago weighs forgetting^j.
+        order: n of Hd(z); 4 in the paper.
+        forgetting: in (0, 1]; a sample j steps ago has the weight forgetting^j.
 
     Raises:
-        ValueError: too few samples in a row.
+        ValueError: too few consecutive samples.
     """
     output, part, findings = _samples(model, flight, _PER_ORDER * order)
     if part.stop - part.start < _PER_ORDER * order:
@@ -271,7 +279,7 @@ def baseline(
         )
     input_ = next(n for n in naming.names(model.Inputs) if n in flight.inputs)
     u, y = flight.inputs[input_][part], flight.outputs[output][part]
-    # Scaled to unit rms, which P(0) is for.
+    # P(0) assumes signals of unit rms.
     u_scale, y_scale = (float(np.sqrt(np.mean(v**2))) or 1.0 for v in (u, y))
     run = rls(
         jnp.asarray(u / u_scale),
@@ -285,7 +293,8 @@ def baseline(
     num, den = transfer_function(history[-1])
     from scipy.signal import lfilter, lfiltic
 
-    # Simulated from the first measured outputs: one step ahead any model predicts well.
+    # Simulation from the first measured outputs is the harder test: any model predicts one step
+    # well.
     begun = lfiltic(num, den, y[order - 1 :: -1], u[order - 1 :: -1])
     simulated = np.r_[y[:order], lfilter(num, den, u[order:], zi=begun)[0]]
     diverges = not np.abs(simulated).max() <= 1e6 * np.abs(y).max()
@@ -314,9 +323,9 @@ def baseline(
 
 
 def _samples(model: Model, flight: Flight, least: int) -> tuple[str, slice, list[Finding]]:
-    """Return the first output with `least` samples in a row (else the first), and its longest part
-    without a missing sample."""
-    # An angle before its rate: eq. 23 is of an angle.
+    """Return the first output with `least` consecutive samples (else the first output), and its
+    longest part without a gap."""
+    # An angle comes before its rate because eq. 23 describes an angle.
     names = [n for n in naming.names(model.Outputs) if n in flight.outputs]
     names = sorted(names, key=lambda n: naming.unit(model.Outputs, n) != "rad")
     parts = {}
@@ -345,7 +354,7 @@ def _continuous(num: np.ndarray, den: np.ndarray, dt: float) -> tuple[_Polynomia
     try:
         return d2c(num, den, dt, "zoh"), []
     except ValueError as e:
-        # Without its remedy.
+        # The remedy after the semicolon does not apply here.
         refused = str(e).split(";")[0]
     try:
         return d2c(num, den, dt, "real-log"), [found("rls.real-logarithm", reason=refused)]
@@ -364,14 +373,14 @@ def _combinations(
     if den is None:
         return {}, []
     p = naming.replace(params, **{n: jnp.asarray(v) for n, v in flight.known.items()})
-    # A model without the stand.
+    # The model has no stand.
     p = p if reads(model, p, "zeta") else naming.replace(p, zeta=0.0 * p.zeta)
     ratios = ratios_from_denominator(p, den, output)
     values, doubts = {n: float(v) for n, v in ratios.values.items()}, []
     if wrong := [n for n, v in values.items() if not (math.isfinite(v) and v > 0)]:
         shown = [f"{n} = {terse(values[n])}" for n in wrong]
         doubts.append(found("rls.impossible", "doubt", *wrong, values=shown))
-    # The ratios do not use p2.
+    # The ratios do not use p2, so it serves as a check.
     p2, expected = float(ratios.p2), float(ratios.p2_expected)
     if abs(p2 / expected - 1.0) > _MEANT:
         doubts.append(found("rls.other-structure", value=p2, expected=expected))
@@ -381,14 +390,14 @@ def _combinations(
 def _bias(
     errors: Float[np.ndarray, " k"], y: Float[np.ndarray, " N"], agreement: Metrics
 ) -> list[Finding]:
-    """Return findings on a bias of least squares by noise on past measured outputs."""
-    # While P falls from its initial value the errors are those of no model.
+    """Return findings on bias: noise on past measured outputs biases least squares."""
+    # The first errors are excluded, because P is still near its initial value.
     errors = errors[min(_STARTING, errors.size // 4) :]
     one_step = float(np.sqrt(np.mean(errors**2)))
     if one_step < 1e-8 * float(np.sqrt(np.mean(y**2))):
-        return []  # no noise: the rest is rounding
+        return []  # no noise, only rounding
     findings = []
-    # A bias shows in simulation, where no past measured output hides it.
+    # Simulation shows a bias, because it uses no past measured outputs.
     if agreement.rmse > _WORSE * one_step:
         ratio, simulated = agreement.rmse / one_step, agreement.rmse
         findings.append(

@@ -1,12 +1,12 @@
 """Start values of a linear model's parameters by equation error.
 
 Each state's derivative is regressed on states and inputs (Klein and Morelli, Aircraft System
-Identification, 2006, chapter 5). Measurement noise on the regressors and gusts bias the result, so
-it serves as a start of a fit only.
+Identification, 2006, chapter 5). Gusts, and measurement noise on the regressors, bias the result.
+It therefore only starts a fit.
 
 Hidden states are integrated by their own equations from the measured signals. Their initial values,
-and a constant in each equation and flight (trim, bias), are projected out. Levenberg-Marquardt
-finds the least squares; if parameters enter linearly its first step is the regression.
+and a constant for each equation and flight (trim, bias), are projected out. Levenberg-Marquardt
+minimises the sum of squares; if parameters enter linearly its first step is the regression.
 """
 
 import functools
@@ -38,27 +38,27 @@ from heli_jax.identification.problem import Free, Sign
 from heli_jax.vehicle import of_helicopter
 
 _EVALUATIONS = 40
-"""of the residuals in one search, at most"""
+"""Most evaluations of the residuals in one search."""
 _SMALL = 1e-6
-"""relative fall of the sum of squares, and relative step, at which the search ends"""
+"""Relative decrease of the sum of squares, and relative step, that end the search."""
 _NOT_FINITE = 1e100
-"""residuals that stand for those that are not finite"""
+"""Replacement for residuals that are not finite."""
 _DEPENDENT = 1e-9
-"""part of the largest singular value below which nuisances depend on one another"""
+"""Fraction of the largest singular value below which nuisances are dependent."""
 
 
 class Rows(NamedTuple):
-    """Residuals of all flights and equations at one point, weighted."""
+    """Weighted residuals of all flights and equations at one point."""
 
     r: Float[np.ndarray, " n"]
     J: Float[np.ndarray, "n q"]
-    """derivative of r"""
+    """Derivative of r."""
     equation: np.ndarray
-    """(n,) index of the equation in `Regression.equations`"""
+    """Index of the equation in `Regression.equations`, (n,)."""
 
     @property
     def cost(self) -> float:
-        """The sum of squares."""
+        """Sum of squares."""
         return float(self.r @ self.r)
 
 
@@ -67,19 +67,19 @@ class Regression(NamedTuple):
 
     model: Model
     base: Mapping[str, float]
-    """all parameters by name, SI"""
+    """All parameters by name, SI."""
     names: tuple[str, ...]
-    """the estimated parameters (q,)"""
+    """Estimated parameters (q,)."""
     records: tuple[Record, ...]
 
     @property
     def equations(self) -> tuple[str, ...]:
-        """The states and outputs whose equations are regressed."""
+        """States and outputs whose equations are regressed."""
         return tuple(dict.fromkeys(e for r in self.records for e in r.structure.equations))
 
     def rows(self, values: Float[np.ndarray, " q"], weights: Mapping[str, float]) -> Rows | None:
-        """Return residuals and derivatives at values (q,), SI; None if they are not finite, as at a
-        divisor of zero."""
+        """Return residuals and derivatives at values (q,), SI; None if they are not finite
+        (division by zero)."""
         parts = []
         for flight in self.records:
             equations = flight.structure.equations
@@ -89,7 +89,7 @@ class Regression(NamedTuple):
                 with np.errstate(all="ignore"):
                     matrices = coefficients(self.model, known, self.names, values)
                     x = _flight_residuals(flight, matrices, weight)
-            except (ValueError, np.linalg.LinAlgError):  # an infinite matrix or signal
+            except (ValueError, np.linalg.LinAlgError):  # infinite matrix or signal
                 return None
             index = [self.equations.index(n) for n in equations]
             parts.append(Rows(x[:, 0], x[:, 1:], np.repeat(index, x.shape[0] // len(index))))
@@ -105,15 +105,15 @@ def _flight_residuals(
     pairs = [_residual(segment, record.structure, matrices) for segment in record.segments]
     residual = np.concatenate([r for r, _ in pairs], axis=1)
     e, n, c = residual.shape
-    # Initial values and constants enter linearly and are projected out. J leaves out that the
-    # responses to initial values change with the parameters.
+    # Initial values and constants enter linearly and are projected out. J neglects that the
+    # responses to initial values depend on the parameters.
     initial = [scipy.linalg.block_diag(*(free[i] for _, free in pairs)) for i in range(e)]
     constants = np.broadcast_to(np.eye(e)[:, None, :], (e, n, e))
     nuisances = weight * np.concatenate([np.array(initial), constants], axis=-1)
     x, N = (weight * residual).reshape(e * n, c), nuisances.reshape(e * n, -1)
     size = np.linalg.norm(N, axis=0)
     N = N[:, size > 0] / size[size > 0]
-    # A very slow free motion and the constant are dependent columns.
+    # The columns of the constant and of a very slow free motion are nearly dependent.
     return x - N @ np.linalg.lstsq(N, x, rcond=_DEPENDENT)[0]
 
 
@@ -128,7 +128,7 @@ def _residual(
     residual[..., 0] += segment.left
     if not hidden:
         return residual, np.zeros((*residual.shape[:2], 0))
-    # h' = A h + f from zero, and the free motions.
+    # h' = A h + f starts from zero; the free motions are separate.
     A, through = matrices[np.ix_(hidden, hidden)], matrices[np.ix_(rows, hidden)]
     phi, first, second = _first_order_hold(A[..., 0], segment.step)
     f = np.einsum("hkc,kN->Nhc", matrices[np.ix_(hidden, columns)], known)
@@ -137,7 +137,7 @@ def _residual(
         return _recurrence(phi, np.concatenate([0.0 * f[:1], first @ f[:-1] + second @ f[1:]]))
 
     h = integrated(f[..., :1])
-    # Sensitivities have the same dynamics; the derivatives of A and f drive them.
+    # Sensitivities have the same dynamics, driven by the derivatives of A and f.
     f[..., 1:] += np.einsum("hjq,Nj->Nhq", A[..., 1:], h[..., 0])
     h = np.concatenate([h, integrated(f[..., 1:])], axis=-1)
     residual -= np.einsum("eh,Nhc->eNc", through[..., 0], h)
@@ -148,8 +148,11 @@ def _residual(
 
 
 def _first_order_hold(A: Float[np.ndarray, "h h"], step: float) -> tuple[np.ndarray, ...]:
-    """Return phi, first and second of x(k+1) = phi x(k) + first f(k) + second f(k+1), for
-    x' = A x + f with f straight between samples, by one exponential (Van Loan, 1978)."""
+    """Return phi, first and second of x(k+1) = phi x(k) + first f(k) + second f(k+1).
+
+    This solves x' = A x + f with f linear between samples, by one matrix exponential (Van Loan,
+    1978).
+    """
     h = A.shape[0]
     block = np.zeros((3 * h, 3 * h))
     block[:h, :h], block[:h, h : 2 * h] = A * step, np.eye(h) * step
@@ -177,7 +180,7 @@ def search(
     keep_sign: np.ndarray,
     weights: Mapping[str, float],
 ) -> "_Optimum | None":
-    """Minimise the equation error from `start` (q,), SI; None if it is not finite there.
+    """Minimise the equation error from `start` (q,), SI; return None if it is not finite there.
 
     Parameters with `keep_sign` (q,) are searched in their logarithms.
     """
@@ -216,27 +219,27 @@ def search(
 
 
 _ROUNDS = 3
-"""of regression, each with the residuals of the last for weights"""
+"""Rounds of regression; each takes its weights from the previous residuals."""
 _NULL = 1e-5
-"""singular value of unit columns below which parameters are exchangeable"""
+"""Singular value of unit columns below which parameters are exchangeable."""
 Origin = Literal["equation error", "frequency error", "as stated", "vehicle"]
 
 
 class StartValue(NamedTuple):
-    """The start of one parameter. The names of the fields are keys of fit.json."""
+    """Start of one parameter; the fields are keys of fit.json."""
 
     value: float
     unit: str
     origin: Origin
     reason: str
-    """why no regression or fit found it; empty if one did"""
+    """Reason why neither regression nor fit found it; empty if one did."""
 
 
 class Equation(NamedTuple):
     """One regressed equation."""
 
     name: str
-    """of the state or output on its left-hand side"""
+    """State or output on the left-hand side."""
     r_squared: float
 
 
@@ -246,13 +249,13 @@ class EquationErrorStart(NamedTuple):
     values: dict[str, StartValue]
     equations: tuple[Equation, ...]
     half_width: float
-    """of the smoothing kernel [s]"""
+    """Half width of the smoothing kernel [s]."""
     hidden: tuple[str, ...]
-    """states that no output shows: integrated by their own equations"""
+    """States that no output determines, integrated by their own equations."""
 
     @property
     def findings(self) -> list[Finding]:
-        """The origin of each value."""
+        """Origin of each value."""
         names = [n for n, v in self.values.items() if v.origin == "equation error"]
         explained = {
             "equations": [e.name for e in self.equations],
@@ -266,7 +269,7 @@ class EquationErrorStart(NamedTuple):
 
 
 def reasons_of(values: Mapping[str, StartValue]) -> list[Finding]:
-    """Return a finding for each reason why values were not found."""
+    """Return one finding for each reason for missing values."""
     grouped: dict[tuple[str, str], list[str]] = {}
     for name, v in values.items():
         if v.reason:
@@ -293,11 +296,11 @@ def equation_error_start(
     """Return start values of the free parameters of a linear model.
 
     Args:
-        model: with `linear=True`.
+        model: model with `linear=True`.
         vehicle: the model's Params, SI; free parameters may be NaN.
-        flights: flights held out are not used.
-        free: bounds and start by parameter. A start that is not NaN is kept if the regression
-            does not determine the parameter, as for time constants of hidden states.
+        flights: held-out flights are ignored.
+        free: bounds and start by parameter. A start other than NaN is kept if the regression does
+            not determine the parameter, such as a time constant of a hidden state.
 
     Raises:
         ValueError: nothing can be regressed, or a parameter has no start.
@@ -306,7 +309,8 @@ def equation_error_start(
     regression, half, reasons = _regression(model, vehicle, flights, free)
     keep = {n for n in regression.names if _keeps_sign(model, n, free[n].sign, regression.base[n])}
     optimum = _optimum(regression, keep)
-    # One at a time: of two exchangeable parameters the other is determined once one is held.
+    # Parameters are fixed one at a time: fixing one of two exchangeable parameters determines the
+    # other.
     while (out := _undetermined(regression, optimum.rows)) is not None:
         name, reasons[name] = out
         _require_value(regression.base, name, reasons[name])
@@ -331,8 +335,8 @@ def equation_error_start(
 def _regression(
     model: Model, vehicle: Any, flights: Sequence[Flight], free: Mapping[str, Free]
 ) -> tuple[Regression, int, dict[str, str]]:
-    """Return the regression, the kernel's half width [samples], and for each parameter that it
-    cannot determine the reason."""
+    """Return the regression, the kernel's half width [samples], and the reason for each
+    undetermined parameter."""
     if not model.linear:
         raise ValueError(
             f"start: equation-error is for linear models, and {model.name} is none: expected a "
@@ -340,7 +344,7 @@ def _regression(
         )
     stated = {n: f.start for n, f in free.items() if math.isfinite(f.start)}
     base = {n: float(np.asarray(v)) for n, v in naming.asdict(vehicle).items()} | stated
-    # With generic numbers of what is free, NaN is left only where a constant is missing.
+    # Free parameters get generic numbers, so NaN remains only where a constant is missing.
     some = base | dict(zip(free, generic(len(free)), strict=True))
     structures = []
     for flight in flights:
@@ -403,9 +407,9 @@ def _keeps_sign(model: Model, name: str, sign: Sign | None, at_hand: float) -> b
 
 
 def _optimum(regression: Regression, keep_sign: set[str]) -> _Optimum:
-    """Return the weighted least squares; weights are one over each equation's residual rms."""
+    """Return the weighted least squares; weights are the inverse residual rms of each equation."""
     keep = np.array([n in keep_sign for n in regression.names], bool)
-    # The first weights are one over the sd of the left-hand sides.
+    # The first weights are the inverse sd of the left-hand sides.
     weights = {n: 1.0 / size for n, size in _sizes(regression).items()}
     optimum = _first_search(regression, keep, weights)
     for _ in range(_ROUNDS - 1):
@@ -427,7 +431,7 @@ def _first_search(
     """Return the best of searches from zero, from the known values, and from one."""
     at_hand = np.array([regression.base[n] for n in regression.names])
     known = np.where(np.isfinite(at_hand) & (at_hand != 0), at_hand, 1.0)
-    # Products of parameters may have two optima, and a parameter may be a divisor.
+    # Products of parameters may cause two optima, and a parameter may be a divisor.
     starts = [np.where(keep, known, 0.0), known, np.where(keep, known, 1.0)]
     runs = [search(regression, start, keep, weights) for start in starts]
     finite = [run for run in runs if run is not None]
@@ -449,7 +453,7 @@ def _sizes(regression: Regression) -> dict[str, float]:
 
 
 def _undetermined(regression: Regression, rows: Rows) -> tuple[str, str] | None:
-    """Return a parameter that the regression does not determine, with the reason; else None."""
+    """Return a parameter that the regression does not determine and the reason, or None."""
     norms, names = np.linalg.norm(rows.J, axis=0), regression.names
     if not norms.all():
         return names[int(np.argmin(norms))], "no measured state or output moves with it"
@@ -458,7 +462,7 @@ def _undetermined(regression: Regression, rows: Rows) -> tuple[str, str] | None:
         return None
     part = np.abs(directions[-1])
     involved = [i for i in np.argsort(-part) if part[i] > 0.1]
-    # Prefer one that has a known value to keep.
+    # A parameter with a known value is preferred, because it can keep that value.
     first = ([i for i in involved if math.isfinite(regression.base[names[i]])] or involved)[-1]
     others = ", ".join(names[i] for i in involved if i != first)
     return names[first], f"the equations do not tell it from {others}"
@@ -481,7 +485,7 @@ def _value(
 
 
 def _inside(free: Free, value: float) -> float:
-    """Return the value, moved inside its bounds by 1 % of their span if it is not."""
+    """Return the value; if outside its bounds, move it inside by 1 % of their span."""
     low = -math.inf if free.lower is None else free.lower
     high = math.inf if free.upper is None else free.upper
     if low < value < high:

@@ -1,4 +1,4 @@
-"""The numbers of a problem as arrays, and the unknowns at the start values."""
+"""Arrays of a problem's numbers, and the unknowns at the start values."""
 
 from typing import Any
 
@@ -32,7 +32,11 @@ from heli_jax.identification.unknowns.layout import (
 
 
 def data_of(problem: Problem, flights: tuple[Flight, ...], layout: Layout | None = None) -> Data:
-    """Return the numbers of a problem over the given flights; `layout` where it is at hand."""
+    """Return the numbers of a problem for the given flights.
+
+    Args:
+        layout: the problem's layout, if it is already computed.
+    """
     dtype = np.dtype(jnp.result_type(float))
     nuisance, frees = problem.nuisance, list(problem.free.values())
     bounds = [transforms.limits(f) for f in frees]
@@ -48,7 +52,8 @@ def data_of(problem: Problem, flights: tuple[Flight, ...], layout: Layout | None
         low=column([b[0] for b in bounds]),
         high=column([b[1] for b in bounds]),
         prior_mean=column([f.prior.mean if f.prior else 0.0 for f in frees]),
-        # Without a prior the sd is infinite: problems share programs whatever their priors are.
+        # Without a prior the sd is infinite, so that problems with any priors share compiled
+        # programs.
         prior_sd=column([f.prior.sd if f.prior else np.inf for f in frees]),
         flights=tuple(
             _flight_data(problem, f, dtype, u) for f, u in zip(flights, follows, strict=True)
@@ -61,7 +66,7 @@ def data_of(problem: Problem, flights: tuple[Flight, ...], layout: Layout | None
 
 
 def _placed(numbers: Data) -> Data:
-    """Put signals on the device, once instead of with every call; scalars are faster by call."""
+    """Put signals on the device once instead of at every call; scalars are faster by call."""
     leaves, structure = jax.tree.flatten(numbers)
     signals = iter(jax.device_put([v for v in leaves if v.ndim]))
     return jax.tree.unflatten(structure, [next(signals) if v.ndim else v for v in leaves])
@@ -70,27 +75,32 @@ def _placed(numbers: Data) -> Data:
 def _flight_data(
     problem: Problem, flight: Flight, dtype: np.dtype, follows: dict[str, np.ndarray] | None
 ) -> FlightData:
-    """Return the numbers of a flight; `follows`: by input the part that follows the instruments."""
+    """Return the numbers of a flight.
+
+    Args:
+        follows: by input, the part that follows the instruments.
+    """
     model = problem.model
 
     def arrays(by_name: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         return {n: np.asarray(by_name[n], dtype) for n in naming.names(model.Inputs)}
 
     inputs = arrays(flight.inputs)
-    # By name, as JAX orders them.
+    # JAX orders dictionaries by name too.
     outputs = {n: np.asarray(y, dtype) for n, y in sorted(flight.outputs.items())}
     return FlightData(
         dt=np.asarray(flight.dt, dtype),
         inputs=model.Inputs(**inputs),
         outputs=outputs,
         known={n: np.asarray(v, dtype) for n, v in flight.known.items()},
-        # Ones until `_with_state_scales`.
+        # These are placeholders for `_with_state_scales`.
         state_scale={n: np.ones((), dtype) for n in naming.names(model.State)},
-        # Ten times the signal: so weak a prior only keeps an unknown without effect from drifting.
+        # A prior of ten times the signal is weak: it only stops unknowns without effect from
+        # drifting.
         bias_scale={
             n: np.asarray(10.0 * _size(y[np.isfinite(y)]), dtype) for n, y in outputs.items()
         },
-        # By the motion of an input, or its size if it is constant.
+        # The scale is the motion of an input, or its size if it is constant.
         offset_scale={
             n: np.asarray(10.0 * _size(u - np.mean(u) if np.ptp(u) > 0 else u), dtype)
             for n, u in inputs.items()
@@ -105,25 +115,25 @@ def _rms(values: jax.Array | np.ndarray) -> float:
 
 
 def _size(values: jax.Array | np.ndarray) -> float:
-    """Return the rms of a signal; 1 if that is zero or not finite."""
+    """Return the rms of a signal; 1 if it is zero or not finite."""
     rms = _rms(values)
     return rms if np.isfinite(rms) and rms > 0 else 1.0
 
 
 def _with_state_scales(problem: Problem, layout: Layout, data: Data) -> Data:
-    """Return the data with the sds of the initial states' weak priors: ten times what each state
-    does in a run from the start values.
+    """Return the data with the sds of the weak priors of initial states.
 
-    The run is brought to the size of the measured outputs first, since a gain may be unknown.
+    They are ten times each state's motion in a simulation from the start values. The simulation is
+    first scaled to the measured outputs, since a gain may be unknown.
     """
-    # Initial states are zero in it, so the scales that are there do not matter.
+    # Its initial states are zero, so their current scales do not matter.
     runs = jax.device_get(_simulated(layout, data, start_vector(layout, data, problem)))
     scaled, names = [], naming.names(layout.model.State)
     for i, (flight, outputs) in enumerate(zip(data.flights, by_output(layout, runs), strict=True)):
         y = {n: np.asarray(v) for n, v in flight.outputs.items()}
-        # Windows are too short to grow.
+        # Windows are too short for growth.
         near = _samples_near(outputs, y) if layout.windows[i][0] == 1 else None
-        # On average over the outputs: one gain that is off scales them all.
+        # The average over outputs is used because one wrong gain scales them all.
         sizes = [_size(v[np.isfinite(v)]) / _size(outputs[n][:near]) for n, v in y.items()]
         ratio, dtype = 10.0 * float(np.mean(sizes)), flight.dt.dtype
         states = zip(names, runs.states[i], strict=True)
@@ -133,9 +143,9 @@ def _with_state_scales(problem: Problem, layout: Layout, data: Data) -> Data:
 
 
 def _simulated(layout: Layout, data: Data, z: jax.Array) -> SimulatedOutputs:
-    """Simulate at z."""
-    # By the program of the residuals, where that simulates: it has to be compiled anyway, and a
-    # program for the simulation alone would take longer than the derivatives.
+    """Return the simulation at z."""
+    # The program of the residuals is used if it simulates. It must be compiled anyway, and
+    # compiling a separate simulation takes longer than computing the derivatives.
     if layout.noise_model == "white":
         ones = tuple({n: np.ones((), z.dtype) for n in names} for names in layout.outputs)
         at = residual_and_jacobian(layout, data, Noise(ones, np.zeros((), z.dtype)), z)
@@ -145,12 +155,17 @@ def _simulated(layout: Layout, data: Data, z: jax.Array) -> SimulatedOutputs:
 
 
 _GROWN = 100.0
-"""times all that was measured of a flight, from which on a run that grows shows no sizes: its
-unstable mode drowns all other states"""
+"""Growth of a simulation, relative to the largest measurement, beyond which its unstable mode hides
+all other states."""
 
 
 def _samples_near(simulated: dict[str, np.ndarray], measured: dict[str, np.ndarray]) -> int:
-    """Return how many samples of outputs (N,) an unstable model stays near the record."""
+    """Return the number of samples before a growing simulation leaves the record.
+
+    Args:
+        simulated: outputs (N,) of an unstable model.
+        measured: the measured outputs.
+    """
     near = [len(next(iter(simulated.values())))]
     for n, y in measured.items():
         if runs_away(simulated[n], y):
@@ -160,24 +175,24 @@ def _samples_near(simulated: dict[str, np.ndarray], measured: dict[str, np.ndarr
 
 
 def runs_away(simulated: np.ndarray, measured: np.ndarray) -> bool:
-    """Return True if a simulation grows far beyond the measurement, as no wrong gain makes it.
+    """True if a simulation grows far beyond the measurement, more than a wrong gain explains.
 
     Args:
         simulated: an output (N,).
-        measured: of it (M,), NaN where a sample is missing.
+        measured: the measured output (M,), NaN for missing samples.
     """
     half = len(simulated) // 2
     grows = not _rms(simulated[half:]) <= 10.0 * _rms(simulated[:half])
     return grows and not _rms(simulated) < _GROWN * _size(measured[np.isfinite(measured)])
 
 
-# Where z begins.
+# Start of z.
 
 
 def start_vector(layout: Layout, data: Data, problem: Problem) -> Float[Array, " q"]:
     """Return z at the start values: gains 1, no shift, the model's own initial state, no bias."""
     dtype = data.low.dtype
-    # Fetched at once: each entry by itself would be a program of its own.
+    # All entries are fetched at once, because each would be a separate program.
     limits = zip(*jax.device_get((data.sign, data.low, data.high)), strict=True)
     z = [
         transforms.to_coordinate(kind, np.asarray(f.start, dtype), *of_one)
@@ -187,61 +202,64 @@ def start_vector(layout: Layout, data: Data, problem: Problem) -> Float[Array, "
     z += [one] * len(layout.gains) + [zero] * layout.shift
     z += [np.asarray(np.log(problem.noise[n].start), dtype) for n in layout.disturbance]
     z += [np.asarray(np.log(problem.filtered_noise[n].start), dtype) for n in layout.filtered]
-    # Zero is the mean of the weak priors, and a factor of one of the noise's guess.
+    # Zero is the mean of the weak priors, and a noise factor of one.
     whole = np.zeros(layout.size, dtype)
     whole[: len(z)] = jax.device_get(z)
-    # A linear model without a start of its own begins at zero, as z does.
+    # A linear model without start values begins at zero, as z does.
     if layout.initial_state and not (layout.model.linear and layout.model.start is None):
         _initial_states(layout, data, problem, whole)
     return jnp.asarray(whole)
 
 
 def _initial_states(layout: Layout, data: Data, problem: Problem, z: np.ndarray) -> None:
-    """Enter the model's own initial state (of a whole helicopter its hover); of a nonlinear model
-    the nearest one with the measured outputs at the first sample of the window."""
+    """Enter the model's own initial state (hover for a full helicopter).
+
+    For a nonlinear model, enter the nearest state that matches the measured outputs at the window's
+    first sample.
+    """
     names, places = naming.names(layout.model.State), flight_places(layout)
     values = {n: np.asarray(f.start, z.dtype) for n, f in problem.free.items()}
     for flight, own, (_, m) in zip(data.flights, places, layout.windows, strict=True):
-        # Values that are known of this flight count.
+        # Known values of this flight take precedence.
         params = layout.model.Params(**{**data.base, **values, **flight.known})
         by_model = own_start(layout.model, params)
         first = np.array([by_model[n] for n in names])
-        # Coordinates of states are in units of their weak priors' sds.
+        # States are in units of their weak priors' sds.
         scales = np.array([float(flight.state_scale[n]) for n in layout.states])
         for k, at in enumerate(own.states):
             x0 = first
-            # One step finds the initial states of a linear model from anywhere. Of others a far
-            # start may be in the valley of another solution.
+            # One step finds the initial states of a linear model from anywhere. In nonlinear models
+            # a far start may lead to another solution.
             if not layout.model.linear:
                 x0 = _state_that_shows(layout, params, flight, k * m, first)
             z[at] = x0[[names.index(n) for n in layout.states]] / scales
 
 
-# Any: the model's Params, whose class may be a user's own.
+# Params is Any because its class may be a user's.
 def own_start(model: Model, params: Any) -> dict[str, float]:
-    """Return the model's initial state; zeros of a whole helicopter's are as in hover."""
+    """Return the model's initial state; for a full helicopter hover replaces zeros."""
     start = {n: float(v) for n, v in naming.asdict(model.initial_state(params)).items()}
     if not is_full_nonlinear(model):
         return start
-    # With the side force of its tail a helicopter hovers at a bank, with its rotor tilted. From
-    # level it would slide away.
+    # Because of its tail's side force a helicopter hovers at a bank with a tilted rotor. Starting
+    # level it would drift sideways.
     try:
         hover = trim(model, params).state
-    except ValueError:  # the start values cannot fly; the optimum may
+    except ValueError:  # the start values cannot fly, but the optimum may
         return start
     return {n: v if v != 0.0 else float(getattr(hover, n)) for n, v in start.items()}
 
 
 _LINE = 5
-"""samples of the straight line whose value at the first one is taken"""
+"""Samples of the straight line that gives the value at the first sample."""
 
 
 def _state_that_shows(
     layout: Layout, params: Any, flight: FlightData, k: int, first: np.ndarray
 ) -> np.ndarray:
-    """Return the state (n,) nearest to `first` with the measured outputs at sample k.
+    """Return the state (n,) nearest to `first` that matches the measured outputs at sample k.
 
-    Three Gauss-Newton steps: outputs are mostly states themselves, or angles of them.
+    Three Gauss-Newton steps suffice, because outputs are mostly states or functions of angles.
     """
     measured = {n: _at_start(np.asarray(y)[k:]) for n, y in flight.outputs.items()}
     measured = {n: v for n, v in measured.items() if np.isfinite(v)}
@@ -253,16 +271,17 @@ def _state_that_shows(
         _, _, C, _ = jacobians(layout.model, params, state, inputs)
         outputs = naming.asdict(layout.model.output(params, state, inputs))
         error = np.array([v - float(outputs[n]) for n, v in measured.items()])
-        # The shortest step: states without effect on the outputs stay.
+        # The shortest step leaves states without effect on the outputs unchanged.
         x = x + np.linalg.pinv(np.asarray(C)[rows], rcond=1e-8) @ error
     return x
 
 
 def _at_start(y: np.ndarray) -> float:
-    """Return the value at the first sample, averaged over a few; NaN where nothing is measured."""
+    """Return the value at the first sample, averaged over a few; NaN without measurements."""
     seen = np.flatnonzero(np.isfinite(y[:_LINE]))
     if seen.size < 3:
-        # Too few for a line. The first sample of a slow sensor is later, and nearer than zero.
+        # There are too few samples for a line. A slow sensor's first sample is later, but better
+        # than zero.
         seen = seen if seen.size else np.flatnonzero(np.isfinite(y))
         return float(y[seen[0]]) if seen.size else float("nan")
     return float(np.polyval(np.polyfit(seen, y[seen], 1), 0.0))

@@ -1,4 +1,4 @@
-"""Search for significant disturbances, and the optimum with or without them."""
+"""Search for significant disturbances, and for the optimum with or without them."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,15 +19,14 @@ from heli_jax.identification.unknowns.layout import Noise, Solution, disturbance
 
 
 def likely_gusts(at: Solution) -> tuple[Float[Array, " q"], Evaluation]:
-    """Return z with the disturbances of the greatest likelihood, all else as it is, and its
-    evaluation.
+    """Return z with the most likely disturbances, all else unchanged, and its evaluation.
 
-    The accuracy to expect of a fit depends on the size, and a search may begin a decade off.
+    The expected accuracy of a fit depends on their size, and a search may start a decade off.
     """
     layout, data, noise, z = at
     places = np.array([layout.disturbance_at(n) for n in layout.disturbance])
-    # Without the initial states and biases of the flights, which nobody states: one that begins in
-    # a bank is no gust, and weighed as one it made gusts a tenth of what they were.
+    # Nuisances are fitted first. Otherwise an unknown initial bank counts as gust: one case gave
+    # gusts a tenth of their true size.
     settled = fit_nuisances(layout, data, noise, z)
     likely = noise_guess_at(layout, data, noise, settled, finer=True)
     z = jnp.asarray(z).at[places].set(likely[places])
@@ -35,51 +34,52 @@ def likely_gusts(at: Solution) -> tuple[Float[Array, " q"], Evaluation]:
 
 
 NO_DISTURBANCE = 2.71
-"""twice a log-likelihood ratio below which a disturbance is not significant at 5 %: sigma_w = 0 is
-a boundary, where half of the chi-squared with one degree of freedom holds (Self and Liang, 1987)"""
+"""Twice the log-likelihood ratio below which a disturbance is not significant at 5 %. At the
+boundary sigma_w = 0 half of the chi-squared with one degree of freedom holds (Self and Liang,
+1987)."""
 _SURE = 0.4
-"""sd of log sigma_w below which a disturbance is significant without a search without it"""
+"""sd of log sigma_w below which a disturbance is significant without a separate search."""
 _NONE = 30.0
-"""logarithm by which sigma_w lies below the smallest noise where there is no disturbance"""
+"""Logarithm by which sigma_w lies below the smallest noise if there is no disturbance."""
 
 
 def significant_disturbances(search: Search, optimum: RelaxedOptimum) -> RelaxedOptimum:
-    """Return the optimum with the disturbances that are significant, the others all but zero.
+    """Return the optimum with the significant disturbances, the others almost zero.
 
-    Where sigma_w goes to zero tau_w has no effect, and the optimiser does not converge. With
-    sigma_w all but zero the residuals are those of output error.
+    If sigma_w goes to zero, tau_w has no effect and the optimiser does not converge. If all sigma_w
+    are almost zero, the residuals equal those of output error.
 
     Args:
-        optimum: with all disturbances; the search for it may have been cut short.
+        optimum: the optimum with all disturbances; its search may have been cut short.
     """
     layout = search.layout
     candidates = [d for d in disturbances_of(layout.model) if d.sigma in layout.sigmas]
     absent: list[Disturbance] = []
-    # One after another, each beside those that have not been given up: two that can stand for one
-    # another would both be found superfluous if each were left out of the full set.
+    # Disturbances are removed one after another. If each were left out of the full set, two
+    # exchangeable ones would both look superfluous.
     for d in candidates:
-        # A disturbance that is well determined needs no search without it.
+        # A well-determined disturbance needs no search without it.
         if _is_known(search, optimum, d):
             continue
         without, ratio = _without(search, optimum, d)
         if len(candidates) == 1:
             optimum = optimum._replace(ratio=ratio)
-        # Negated: a ratio that is NaN is no evidence of a disturbance.
+        # The condition is negated because a NaN ratio is no evidence of a disturbance.
         if without.best.converged and not ratio > NO_DISTURBANCE:
             optimum = without.after(optimum)
             absent.append(d)
     if not optimum.best.converged:
-        # The search was cut short before it was known that there is something to find.
+        # The search was cut short before the disturbance was confirmed, so it continues.
         optimum = relaxed_from(search, optimum.noise, optimum.best.z).after(optimum)
     if len(candidates) == 1:
         return optimum
-    # Both of its parameters: without a size the correlation time is in no likelihood.
+    # Both parameters are absent: without sigma_w the correlation time has no effect.
     names = [n for d in absent for n in (d.sigma, d.tau) if n in layout.disturbance]
     return optimum._replace(absent=tuple(names))
 
 
 def with_noise_guess(search: Search, noise: Noise, z: Float[Array, " q"]) -> Float[Array, " q"]:
-    """Return z with the disturbances from a coarse search about their start values."""
+    """Return z with the disturbances from a coarse search around their start values."""
     layout = search.layout
     for name in layout.disturbance:
         start = np.log(search.problem.noise[name].start)
@@ -88,8 +88,7 @@ def with_noise_guess(search: Search, noise: Noise, z: Float[Array, " q"]) -> Flo
 
 
 def _is_known(search: Search, optimum: RelaxedOptimum, d: Disturbance) -> bool:
-    """Return True if all parameters of a disturbance are determined, within what a record can
-    show."""
+    """True if all parameters of a disturbance are determined, and within what a record can show."""
     layout, z = search.layout, optimum.best.z
     e = evaluate(layout, search.data, optimum.noise, z)
     if not (optimum.best.converged and np.all(np.isfinite(e.J))):
@@ -100,7 +99,7 @@ def _is_known(search: Search, optimum: RelaxedOptimum, d: Disturbance) -> bool:
         return False
     if d.tau not in layout.disturbance:
         return True
-    # At the limits `unpack` clips, so that the likelihood is flat there; it is all but flat below a
+    # `unpack` clips at the limits, so the likelihood is flat there. It is nearly flat below one
     # sample.
     _, high = (float(v) for v in disturbance_limits(layout, search.data)[d.tau])
     low = np.log(min(float(f.dt) for f in search.data.flights))
@@ -110,15 +109,14 @@ def _is_known(search: Search, optimum: RelaxedOptimum, d: Disturbance) -> bool:
 def _without(
     search: Search, optimum: RelaxedOptimum, d: Disturbance
 ) -> tuple[RelaxedOptimum, float]:
-    """Return the optimum without one disturbance, and twice the log-likelihood that it loses."""
+    """Return the optimum without one disturbance, and twice the log-likelihood lost."""
     layout, data = search.layout, search.data
-    # Far below the smallest noise rather than zero, whose logarithm no z holds.
+    # A value far below the smallest noise replaces zero, whose logarithm is infinite.
     smallest = min(float(s) for by_name in optimum.noise.sd for s in by_name.values())
     at = layout.disturbance_at(d.sigma)
-    # Without it all other parameters are fitted anew, from where they are: a likelihood ratio is
-    # that of two optima, not of one and a point.
+    # All other parameters are fitted again, because a likelihood ratio compares two optima.
     z = optimum.best.z.at[at].set(np.log(smallest) - _NONE)
-    # The rows are laid out about the level of their own innovations.
+    # The rows depend on the level of their own innovations.
     alone = evaluate(layout, data, optimum.noise, z)
     noise = layout.objective.noise_at_start(layout, data, alone, optimum.noise)
     without = relaxed_from(search, noise, z)

@@ -1,4 +1,4 @@
-"""Residuals, Jacobian and simulation at one point as NumPy arrays, and linear algebra on them."""
+"""Residuals, Jacobian and simulation at one point as NumPy arrays, and their linear algebra."""
 
 from typing import NamedTuple
 
@@ -14,38 +14,38 @@ from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
 from heli_jax.numerics.jitted import jitted
 
 NULL = 1e-8
-"""part of the largest singular value, of columns of one size, below which the data do not determine
-a direction: the square of that is rounding in float64"""
+"""Fraction of the largest singular value, with columns of equal size, below which a direction is
+not determined; its square is rounding in float64."""
 _TAKES_PART = 1e-3
-"""part of a unit direction without effect from which on a coordinate is not determined either"""
+"""Component in a direction without effect above which a coordinate is not determined either."""
 
 
 class Evaluation(NamedTuple):
     """Residuals, Jacobian and simulation at one point."""
 
     simulated: tuple[dict[str, np.ndarray], ...]
-    """with the bias, SI, by flight and output (N,)"""
+    """Simulation with the bias, SI, by flight and output (N,)."""
     raw: tuple[dict[str, np.ndarray], ...]
-    """measured - simulated, SI, by flight and output (N,); NaN where nothing is measured"""
+    """Measured less simulated, SI, by flight and output (N,); NaN without measurement."""
     innovations: tuple[Innovations, ...]
     r: np.ndarray
-    """(n,) whitened residuals with the rows of the priors"""
+    """Whitened residuals with the rows of the priors (n,)."""
     J: np.ndarray
-    """(n, q) derivative of r by z"""
+    """Derivative of r by z (n, q)."""
     named: np.ndarray
-    """values of the named unknowns, in their units"""
+    """Values of the named unknowns, in their units."""
     slopes: np.ndarray
-    """their derivatives by their own coordinates"""
+    """Derivatives of the named values by their coordinates."""
     z: np.ndarray
-    """(q,)"""
+    """Unknowns (q,)."""
 
 
 def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Evaluation:
     """Evaluate residuals, Jacobian, simulation and named unknowns at a point."""
     at = residual_and_jacobian(layout, data, noise, z)
-    # The residuals of output error hold a simulation; those of a filter are one-step predictions.
+    # Output-error residuals already contain a simulation; filter innovations do not.
     outputs = simulated_at(layout, data, z) if at.simulated is None else at.simulated
-    # Fetched at once, with one wait for the device.
+    # Everything is fetched at once, with one wait for the device.
     outputs, innovations, r, J, values, slopes = jax.device_get(
         (outputs, at.innovations, at.r, at.J, *named(layout, data, z))
     )
@@ -60,7 +60,7 @@ def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) ->
 def simulated_outputs(
     layout: Layout, data: Data, z: Float[Array, " q"]
 ) -> tuple[dict[str, np.ndarray], ...]:
-    """Return by flight and output the simulation (N,) with the bias, SI."""
+    """Return the simulation with the bias by flight and output (N,), SI."""
     return by_output(layout, jax.device_get(simulated_at(layout, data, z)))
 
 
@@ -73,14 +73,15 @@ def named(layout: Layout, data: Data, z: Float[Array, " q"]) -> tuple[Array, Arr
         shift = () if u.shift is None else (u.shift,)
         return jnp.stack([*u.params.values(), *u.gains.values(), *shift])
 
-    # Each depends on its own coordinate alone: the rest of the Jacobian is zero.
+    # Each value depends on its own coordinate alone, so the rest of the Jacobian is zero.
     return values(z), jnp.diagonal(jax.jacfwd(values)(z))
 
 
 def deviations(J: np.ndarray) -> np.ndarray:
     """Return the standard deviations (q,) of all coordinates from whitened rows (n, q).
 
-    Infinite for a coordinate without effect, and for those in a direction without effect.
+    They are infinite for a coordinate without effect or with a component in a direction without
+    effect.
     """
     return combined_deviations(J, np.eye(J.shape[1]), NULL, _TAKES_PART)
 
@@ -93,10 +94,10 @@ def combined_deviations(
     Args:
         J: the rows (n, q).
         combinations: (k, q).
-        no_effect: part of the largest singular value below which a direction has no effect.
-        takes_part: part of such a direction from which on a combination is not determined either.
+        no_effect: fraction of the largest singular value below which a direction has no effect.
+        takes_part: component in such a direction above which a combination is not determined.
     """
-    # A simulation that diverged determines nothing.
+    # A diverged simulation determines nothing.
     if not np.isfinite(J).all():
         return np.full(len(combinations), np.inf)
     norms, sizes, right = _svd(J)
@@ -112,8 +113,8 @@ def directions(J: np.ndarray, least: float = NULL) -> np.ndarray:
     """Return orthonormal directions (n, k) in which the unknowns move finite rows (n, q).
 
     Args:
-        least: part of the largest singular value of columns of one size, below which a direction is
-            rounding, or dependent on the others.
+        least: fraction of the largest singular value, with columns of equal size, below which a
+            direction is rounding or dependent.
     """
     norms, sizes, right = _svd(J)
     seen = sizes > least * max(sizes[0], 1e-300)
@@ -121,7 +122,7 @@ def directions(J: np.ndarray, least: float = NULL) -> np.ndarray:
 
 
 def pseudoinverse(J: np.ndarray) -> np.ndarray:
-    """Return the pseudoinverse (q, n) of rows (n, q), with columns brought to one size first."""
+    """Return the pseudoinverse (q, n) of rows (n, q), computed with columns of equal size."""
     norms, sizes, right = _svd(J)
     kept = sizes > NULL * sizes[0]
     V = right[kept].T / sizes[kept]
@@ -129,13 +130,16 @@ def pseudoinverse(J: np.ndarray) -> np.ndarray:
 
 
 def _svd(J: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the norms of the columns of J (n, q), and singular values (q,) and right singular
-    vectors (q, q) of J with columns of size 1, so that units do not matter."""
+    """Return column norms of J (n, q), and singular values (q,) and right singular vectors (q, q)
+    of J with unit columns.
+
+    Unit columns make the result independent of units.
+    """
     J = np.asarray(J, np.float64)
     norms = np.linalg.norm(J, axis=0)
     norms = np.where(norms > 0, norms, 1.0)
-    # Of J and not of J'J, whose small singular values, the squares, are rounding. The triangle has
-    # the same singular values, and q rows instead of n.
+    # J'J is avoided because its small eigenvalues are rounding. The triangular factor has the same
+    # singular values with q rows instead of n.
     _, sizes, right = np.linalg.svd(np.linalg.qr(J / norms, mode="r"))
-    # With fewer rows than unknowns there are directions without effect.
+    # With fewer rows than unknowns some directions have no effect.
     return norms, np.concatenate([sizes, np.zeros(J.shape[1] - sizes.size)]), right

@@ -1,8 +1,8 @@
 """Filter error: the innovations of a Kalman filter, over their standard deviations.
 
-Maximum likelihood where a disturbance acts on the vehicle (Jategaonkar, 2006, chapter 5): its
-intensity and correlation time are estimated beside the parameters, the scale of the measurement
-noise is concentrated out of the likelihood unless it is given.
+Maximum likelihood for vehicles with a disturbance (Jategaonkar, 2006, chapter 5). The disturbance's
+intensity and correlation time are estimated with the parameters. The scale of the measurement noise
+is concentrated out of the likelihood unless it is given.
 """
 
 from collections.abc import Sequence
@@ -59,20 +59,20 @@ from heli_jax.identification.unknowns.layout import (
 from heli_jax.simulation.options import SimulationOptions
 from heli_jax.simulation.simulate import simulate
 
-# Records of a fitted model with the disturbance drawn anew.
+# Records of a fitted model with new random disturbances.
 
 
 _BATCH = 8
-"""records that are drawn side by side"""
+"""Records that are drawn in one batch."""
 
 
 def disturbed_records(reached: Solution, u: Unknowns, i: int, keys: Array) -> dict[str, Array]:
-    """Return by name the outputs (runs, N) with a disturbance drawn for each key."""
+    """Return the outputs (runs, N) by name, with a disturbance drawn for each key."""
     layout, drive = reached.layout, driven(reached.layout, reached.data, u, i)
     model, params, dtype = layout.model, drive.params, reached.z.dtype
     first = drive.state if drive.state is not None else model.initial_state(params)
     names, sds = naming.names(model.State), initial_sd_of(model, params, dtype)
-    # Factored without the sds, which may be zero.
+    # The correlation is factored without the sds, which may be zero.
     factor = sds[:, None] * jnp.linalg.cholesky(correlation_of(model, params, dtype))
 
     @jax.jit
@@ -96,17 +96,17 @@ def disturbed_records(reached: Solution, u: Unknowns, i: int, keys: Array) -> di
 
 
 _FLOOR = 1e-3
-"""least square of the likelihood's row over the count: it stays real however far the noise falls"""
+"""Least square of the likelihood's row over the count, which keeps the row real if the noise
+decreases."""
 _BLIND = 1e4
-"""times the signal: a noise that makes a filter ignore the measurement"""
+"""Noise that makes a filter ignore the measurement, as a multiple of the signal."""
 _DIGITS = 1e13
-"""variance of an innovation over that of the measurement beyond which float64 has no digits left"""
+"""Ratio of the variances of innovation and measurement beyond which float64 has no digits left."""
 _TOLERANCE = 1e-6
 _FELL = 0.9
-"""fall of the noise (in the log of the variance) beyond which the likelihood's row is at its
-floor"""
+"""Decrease of the log noise variance beyond which the likelihood's row is at its floor."""
 _CORRECTED = 0.02
-"""part by which the slope of a correction changes, from which on the parameters move with it"""
+"""Relative change of a correction's slope above which the parameters change too."""
 
 
 class FilterError(Objective):
@@ -115,13 +115,13 @@ class FilterError(Objective):
     noise_model = "disturbance"
 
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
-        """Return the innovations over their sd, and the rows that make J'J Fisher's information."""
+        """Return the innovations over their sd, and rows that make J'J the Fisher information."""
         by_flight = filtered_flights(layout, data, noise, u)
         return Residuals(_likelihood_rows(layout, data, noise, u, by_flight), None, by_flight)
 
     def tags(self, layout: Layout, data: Data, count: int) -> RowTags:
-        """Return what the rows are: innovations, one row of the scale unless that is concentrated
-        out, and the variances of the same samples."""
+        """Return the row tags: innovations, one row of the scale unless it is concentrated out, and
+        the variances of the same samples."""
         tags = super().tags(layout, data, count)
         n = int(tags.residual.sum())
         for of_rows in tags[:3]:
@@ -129,13 +129,15 @@ class FilterError(Objective):
         return tags
 
     def scaled_outputs(self, problem: Problem) -> tuple[tuple[str, ...], bool]:
-        """Return the outputs with a noise factor of their own, and whether the common factor is
-        concentrated out. It is if every sigma_w and sigma_y is unknown; every output but the first
-        then has a factor. With one given, or process noise of the model's own, all outputs have
-        one."""
+        """Return the outputs with their own noise factor, and whether the common factor is
+        concentrated out.
+
+        It is if every sigma_w and sigma_y is unknown; all outputs but the first then have a factor.
+        If one is given, or the model has its own process noise, all outputs have one.
+        """
         if "sigma_y" in problem.fixed_noise:
             return (), False
-        # Only with all of them unknown: a factor common to noises of which one is given is none.
+        # A common factor needs all noises unknown: a given noise fixes it.
         sigmas = [d.sigma for d in disturbances_of(problem.model)]
         unknown = bool(sigmas) and not any(n in problem.fixed_noise for n in sigmas)
         concentrated = unknown and only_disturbed(problem.model)
@@ -143,7 +145,7 @@ class FilterError(Objective):
         return outputs[concentrated:], concentrated
 
     def first_noise(self, problem: Problem, noise: Noise, flights: Sequence[Flight]) -> Noise:
-        """Add the corrections, zero before the first relaxation."""
+        """Add the corrections, which are zero before the first relaxation."""
         return noise._replace(corrections=first_corrections(problem))
 
     def noise_at_start(self, layout: Layout, data: Data, e: Evaluation, noise: Noise) -> Noise:
@@ -156,8 +158,10 @@ class FilterError(Objective):
     def relax(
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
     ) -> tuple[Float[Array, " q"], Noise]:
-        """Scale all noise by one factor, with the disturbance in z, which leaves the optimum where
-        it is."""
+        """Scale all noise, including the disturbance in z, by one factor.
+
+        The optimum stays the same.
+        """
         n, e = measured_count(data), evaluate(layout, data, noise, z)
         freedom = n / max(n - layout.determined, 1)
         squares, logs = innovation_sums(e, noise)
@@ -166,10 +170,10 @@ class FilterError(Objective):
             measured = signal_numbers(layout, data).size
             corrections = corrections_at(layout, data, noise, e, z, measured)
             return z, noise._replace(log_variance_ratio=level, corrections=corrections)
-        # The most likely scale, with the degrees of freedom of the unknowns.
+        # This is the most likely scale, corrected for the degrees of freedom of the unknowns.
         factor = np.sqrt(squares / n * freedom)
         for name in layout.sizes:
-            # The gains depend on ratios of noises alone, and so does the optimum.
+            # The gains, and so the optimum, depend only on ratios of noises.
             at = layout.disturbance_at(name)
             z = z.at[at].add(jnp.asarray(np.log(factor), z.dtype))
         sd = tuple(
@@ -179,20 +183,22 @@ class FilterError(Objective):
         return z, Noise(sd, level)
 
     def noise_matters(self, problem: Problem, layout: Layout, before: Noise, after: Noise) -> bool:
-        """Return True where priors are weighed against a scale that is concentrated out, where that
-        is far from what it was or the noise fell past what the likelihood's row can show, or where
-        a correction changed."""
+        """True if the change of the noise affects the optimum.
+
+        This has three causes. Priors are weighed against a concentrated scale, or that scale
+        changed much. The noise fell below the floor of the likelihood's row. A correction changed.
+        """
         if layout.concentrated:
             return any(f.prior for f in problem.free.values()) or _is_far(before, after)
         fell = before.log_variance_ratio - after.log_variance_ratio
         return bool(fell > _FELL) or corrections_changed(before, after) > _CORRECTED
 
     def log_likelihood(self, layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
-        """Return the log-likelihood of the innovations (Schweppe, 1965), at the scale that
-        maximises it if that is concentrated out."""
+        """Return the log-likelihood of the innovations (Schweppe, 1965); a concentrated scale
+        maximises it."""
         n = measured_count(data)
         squares, logs = innovation_sums(e, noise)
-        # The sums are of log(s / sd^2): the sd restore the units of the outputs.
+        # The sums use log(s / sd^2), so the sd restore the units of the outputs.
         for flight, sd in zip(data.flights, noise.sd, strict=True):
             for k, y in flight.outputs.items():
                 logs += 2.0 * float(np.log(sd[k])) * int(np.isfinite(np.asarray(y)).sum())
@@ -201,7 +207,7 @@ class FilterError(Objective):
         return float(-0.5 * (squares + n * np.log(2.0 * np.pi) + logs))
 
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
-        """Return the records; each run has a disturbance of its own."""
+        """Return the records; each run has its own disturbance."""
         return [
             disturbed_records(
                 reached, u, i, jax.random.split(jax.random.fold_in(jax.random.key(seed), i), runs)
@@ -212,18 +218,18 @@ class FilterError(Objective):
     def expected_error(
         self, layout: Layout, data: Data, noise: Noise, e: Evaluation, z: Array
     ) -> dict[str, float]:
-        """Return by output the power of the simulation's error over that which disturbance and
-        noise explain.
+        """Return, by output, the ratio of the simulation error's power to that explained by
+        disturbance and noise.
 
-        A filter with very noisy measurements never corrects its state: the variance of its
-        innovations is then that of a simulation's error.
+        A filter with very noisy measurements never corrects its state. The variance of its
+        innovations is then that of a simulation error.
         """
         largest: dict[str, float] = {}
         for f in data.flights:
             for n, y in f.outputs.items():
                 size = float(np.sqrt(np.nanmean(np.square(np.asarray(y)))))
                 largest[n] = max(largest.get(n, _BLIND * 1e-300), _BLIND * size)
-        # The same in all flights, which share their covariances here too.
+        # All flights get the same noise, because they share covariances.
         blinding = tuple(
             {n: np.asarray(largest[n], np.asarray(s).dtype) for n, s in sd.items()}
             for sd in noise.sd
@@ -236,7 +242,7 @@ class FilterError(Objective):
         for error, innovation, blind_sd, sd in each:
             for n, s in innovation.variance.items():
                 factor = float(scales.get(n, 1.0)) ** 2
-                # Less the noise that was put in, and no less than zero.
+                # The added noise is subtracted, but the result is not negative.
                 of_state = np.maximum(np.asarray(s) - float(blind_sd[n]) ** 2 * factor, 0.0)
                 seen = np.isfinite(error[n])
                 with np.errstate(all="ignore"):
@@ -250,8 +256,7 @@ class FilterError(Objective):
         }
 
     def ill_conditioned(self, problem: Problem, e: Evaluation, sd: dict[str, float]) -> bool:
-        """Return True if the filter has lost its digits: variances below zero, or too large for
-        float64."""
+        """True if the filter lost precision: variances are negative or too large for float64."""
         ratios = np.concatenate(
             [
                 np.asarray(s) / sd[f"{label}/{n}"] ** 2
@@ -259,12 +264,12 @@ class FilterError(Objective):
                 for n, s in flight.variance.items()
             ]
         )
-        # NaN marks a missing sample, unless the filter itself went wrong.
+        # NaN marks a missing sample, unless the filter itself failed.
         ratios = ratios[~np.isnan(ratios)] if np.isfinite(e.r).all() else ratios
         return bool(
             not ratios.size
             or not np.isfinite(ratios).all()
-            # The variance of an innovation is at least that of its measurement.
+            # The variance of an innovation cannot be below that of its measurement.
             or ratios.min() < 1.0 - _TOLERANCE
             or ratios.max() > _DIGITS
         )
@@ -278,15 +283,17 @@ class FilterError(Objective):
         if at.layout.concentrated:
             return []
         size = float(np.sqrt(innovation_sums(e, at.noise)[0] / measured_count(at.data)))
-        # The intervals are too narrow, or too wide, by the same factor.
+        # The intervals are wrong by the same factor.
         if 0.8 < size < 1.25:
             return []
         return [found("noise.innovations-size", value=size, distrusts=at.layout.of_interest)]
 
 
 def _is_far(before: Noise, after: Noise) -> bool:
-    """Return True if the rows' variance was far from 1, so that a search weighed them wrongly
-    against the rows of variances and may have ended early."""
+    """True if the rows' variance was far from 1.
+
+    The search then weighed them wrongly against the rows of variances, and may have ended early.
+    """
     ratios = [
         float(sd[n] / old[n]) for sd, old in zip(after.sd, before.sd, strict=True) for n in sd
     ]
@@ -328,23 +335,22 @@ def _filter_arguments(
 def _likelihood_rows(
     layout: Layout, data: Data, noise: Noise, u: Unknowns, by_flight: tuple[Innovations, ...]
 ) -> Array:
-    r"""Return rows whose sum of squares is minus twice the log-likelihood but for a constant; zero
-    where nothing is measured.
+    r"""Return rows whose sum of squares is minus twice the log-likelihood, up to a constant.
 
-    $e_k/\sqrt{s_k}$, and with the common scale of all noise concentrated out each times
-    $\exp(\tfrac12(\overline{\log s} - level))$; else one row more, whose square is
-    $N(1 + \overline{\log s} - level)$.
+    Rows are zero without a measurement. The rows are $e_k/\sqrt{s_k}$. If the common scale of all
+    noise is concentrated out, each is multiplied by $\exp(\tfrac12(\overline{\log s} - level))$.
+    Otherwise one row is added, whose square is $N(1 + \overline{\log s} - level)$.
 
-    These rows have half of the variances' information ($\tfrac14 s'^2/s^2$ of $\tfrac12$), and
-    the optimiser would take twice the step along the noise. As many rows again, zero themselves,
-    have the derivative $\tfrac12 (s'_k/s_k - \overline{s'/s})$: with them J'J is Fisher's
-    information (Mehra, 1970; Maine and Iliff, 1985, leave that part out). The mean is taken off:
-    with the scale concentrated out it has no information, else the additional row has it.
+    These rows contain half of the variances' information ($\tfrac14 s'^2/s^2$ of $\tfrac12$), so
+    the optimiser would take twice the step along the noise. Further rows of value zero have the
+    derivative $\tfrac12 (s'_k/s_k - \overline{s'/s})$. They make J'J the Fisher information (Mehra,
+    1970; Maine and Iliff, 1985, omit that part). The mean is subtracted: a concentrated scale has
+    no information, otherwise the additional row contains it.
     """
     y, sd = measured_signals(layout, data, noise)
     at = signals(layout)
     seen = jnp.isfinite(y)
-    # One where nothing is measured, so that no derivative of a root or a logarithm is NaN.
+    # One replaces missing measurements, so that no derivative of a root or logarithm is NaN.
     s = jnp.where(seen, jnp.concatenate([by_flight[i].variance[n] for i, n in at]), 1.0)
     error = jnp.concatenate([by_flight[i].error[n] for i, n in at])
     rows = jnp.where(seen, error, 0.0) / jnp.sqrt(s)
@@ -352,22 +358,23 @@ def _likelihood_rows(
     count = jnp.sum(seen.astype(rows.dtype))
     mean = jnp.sum(log_s) / count
     above = mean - noise.log_variance_ratio
-    # The level, that of the last relaxation, brings the factor near 1 and the rows to variance 1.
+    # The level of the last relaxation keeps the factor near 1 and the rows at variance 1.
     if layout.concentrated:
         rows, last = rows * jnp.exp(0.5 * above), []
     else:
-        # N mean(log s) as a square: the 1 keeps it above zero, where the root has a derivative.
+        # N mean(log s) is written as a square; adding 1 keeps it positive, where the root is
+        # differentiable.
         above += correction(layout, noise, u) / count
         last = [jnp.sqrt(count * jnp.maximum(1.0 + above, _FLOOR))[None]]
     log_s = jnp.where(seen, log_s - mean, 0.0)
-    # The last rows are zero themselves, with the derivative of what is subtracted left out.
+    # The last rows are zero; only the first term contributes a derivative.
     return jnp.concatenate([rows, *last, 0.5 * (log_s - jax.lax.stop_gradient(log_s))])
 
 
 def innovation_sums(e: Evaluation, noise: Noise) -> tuple[float, float]:
     """Return the sums over all measurements of e^2/s and of log(s/sd^2)."""
     squares, logs = 0.0, 0.0
-    with np.errstate(all="ignore"):  # of an unstable start
+    with np.errstate(all="ignore"):  # the start may be unstable
         for flight, sd in zip(e.innovations, noise.sd, strict=True):
             for n, s in flight.variance.items():
                 squares += float(np.nansum(flight.error[n] ** 2 / s))
@@ -378,27 +385,30 @@ def innovation_sums(e: Evaluation, noise: Noise) -> tuple[float, float]:
 OBJECTIVE = FilterError()
 
 
-# Predictions some seconds ahead, from the state that a filter has estimated: the simulation of an
-# unstable vehicle leaves any record, and one step ahead any model predicts well.
+# Predictions some seconds ahead start from the filter's state. The simulation of an unstable
+# vehicle diverges from any record, and any model predicts one step well.
 
 
 SECONDS = 2.0
-"""length of a window, which begins with the filter's prediction"""
+"""Length of a window, which starts from the filter's prediction [s]."""
 
 
 class Ahead(NamedTuple):
-    """Predictions up to `SECONDS` ahead of one flight, by output; NaN where nothing is measured."""
+    """Predictions of one flight up to `SECONDS` ahead, by output; NaN without measurement."""
 
     predicted: dict[str, Float[np.ndarray, " N"]]
-    """SI"""
+    """Prediction [SI]."""
     variance: dict[str, Float[np.ndarray, " N"]]
-    """of the error, by disturbance and noise"""
+    """Variance of the prediction error due to disturbance and noise."""
 
 
 def predictions_ahead(at: Solution) -> tuple[Ahead, ...]:
-    """Return by flight the predictions in windows from the filter's state at the begin of each, at
-    the end of a fit by filter error."""
-    # Outside of what is compiled: how many samples that are decides where windows begin.
+    """Return predictions by flight in windows that start from the filter's state.
+
+    Args:
+        at: the end of a fit by filter error.
+    """
+    # The window length must be a static number in the compiled program.
     samples = tuple(max(1, round(SECONDS / float(flight.dt))) for flight in at.data.flights)
     return tuple(
         Ahead(
@@ -430,8 +440,8 @@ def errors_ahead(
     """Return measured less predicted in windows of `every` samples, and its variance.
 
     Args:
-        positional: model, params, inputs, measured and sd, as of `kalman.innovations`.
-        every: samples of a window, each begun at what the filter predicts for its first.
+        positional: model, params, inputs, measured and sd, as for `kalman.innovations`.
+        every: samples of a window; each starts from the filter's prediction of its first sample.
     """
     drive, first, y, R = begun(*positional, options)
     filter_ = filter_of(drive)

@@ -1,18 +1,19 @@
 r"""Frequency error: output error on the Fourier transforms of records, with the noise's spectrum.
 
 For a linear model with inputs that are held, or linear between samples, and $z = e^{i\omega dt}$ at
-a frequency of the record's own,
+a Fourier frequency of the record,
 
 $$X = (zI - A_d)^{-1}\,[B_d U + z\,(x_0 - x_N)]$$
 
-is exact, also for unstable vehicles: nothing is simulated. The ends of the record are n unknowns,
-with n more for the ends of slow gusts; linear least squares projects them out. The noise's
-spectrum, a matrix over the outputs, is estimated from the residual and weights the frequencies. The
-estimate is maximum likelihood in gusts too, as long as no feedback brings them into the inputs.
-Nonlinear models are linearised at the operating point.
+is exact, also for unstable vehicles, and needs no simulation. The ends of the record are n
+unknowns, with n more for the ends of slow gusts; linear least squares projects them out. The
+noise's spectrum, a matrix over the outputs, is estimated from the residual and weights the
+frequencies. The estimate is maximum likelihood also in gusts, unless feedback transfers them into
+the inputs. Nonlinear models are linearised at the operating point.
 
-If flights hold an excitation that was added to an input and that no feedback reaches, the errors
-are weighted by the response to the part of the input that follows it: feedback then has no effect.
+Flights may contain an excitation that was added to an input and that feedback does not affect. The
+errors are then weighted by the response to the part of the input that follows it, which removes the
+effect of feedback.
 
 Sources: Pintelon and Schoukens (2012), chapters 6, 9 and 10; Klein and Morelli (2006), chapter 7.
 """
@@ -93,7 +94,7 @@ class FrequencyError(Objective):
     noise_model = "spectrum"
 
     def tags(self, layout: Layout, data: Data, count: int) -> RowTags:
-        """Return empty tags: rows are sums over the lines of all flights."""
+        """Return empty tags, because rows are sums over the lines of all flights."""
         return untagged(count)
 
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
@@ -101,8 +102,7 @@ class FrequencyError(Objective):
         return Residuals(rows_of_lines(layout, data, noise, u), None)
 
     def refusal(self, problem: Problem) -> str | None:
-        """Return a reason for flights with different outputs, without a part that has all outputs,
-        or without a trim."""
+        """Return why flights are unusable: different outputs, no complete part, or no trim."""
         flights = problem.training
         refused = other_outputs(flights) or without_parts(flights) or absent_instrument(problem)
         return refused or cannot_linearise(problem)
@@ -116,23 +116,25 @@ class FrequencyError(Objective):
     def instrumented(
         self, problem: Problem, flights: Sequence[Flight]
     ) -> tuple[dict[str, np.ndarray], ...] | None:
-        """Return by flight and input the part that follows the instruments."""
+        """Return, by flight and input, the part that follows the instruments."""
         return instrumented_inputs(problem, flights)
 
     def first_noise(self, problem: Problem, noise: Noise, flights: Sequence[Flight]) -> Noise:
-        """Add the spectrum of what is measured."""
+        """Add the spectrum of the measured signals."""
         return first_spectrum(noise, flights)
 
     def data_at_start(self, data: Data) -> Data:
         """Return by instrument the parts of inputs and outputs that follow the instruments."""
-        # The equations by instrument have several solutions. Least squares of these parts end near
-        # the right one; those of the measured signals, which hold feedback, need not.
+        # The equations by instrument have several solutions. Least squares of these parts ends near
+        # the right one; with measured signals, which contain feedback, it may not.
         by = data.flights[0].by_instrument is not None
         return as_instruments_have_it(data) if by else data
 
     def noise_of_check(self, layout: Layout, data: Data, noise: Noise) -> Noise:
-        """Return the spectrum of the part of the outputs that the inputs do not explain: the errors
-        at the start values would include the error of these."""
+        """Return the spectrum of the outputs' part that the inputs do not explain.
+
+        The errors at the start values would include errors of these values.
+        """
         whitening = whitening_without_model(layout, data)
         return noise if whitening is None else noise._replace(whitening=whitening)
 
@@ -153,7 +155,7 @@ class FrequencyError(Objective):
                 sound = False
         if not sound:
             return z, noise._replace(log_variance_ratio=np.asarray(np.nan))
-        # The nuisances are part of the point of linearisation.
+        # The nuisances define the point of linearisation.
         if not layout.model.linear:
             z = in_time(layout, data, noise, z)
         logs = -2.0 * np.concatenate(once_a_length(log_determinants, whitening))
@@ -168,19 +170,19 @@ class FrequencyError(Objective):
     def finish(
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
     ) -> Float[Array, " q"]:
-        """Find biases and initial states, which no row determines, by a simulation in time."""
+        """Estimate biases and initial states, which no row determines, by a simulation in time."""
         return in_time(layout, data, noise, z) if layout.model.linear else z
 
     def log_likelihood(self, layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
-        """Return the log-likelihood of complex normal errors at the lines used, in SI units of the
+        """Return the log-likelihood of complex normal errors at the used lines, in SI units of the
         outputs; NaN by instrument.
 
         Args:
-            noise: that `e` was evaluated with.
+            noise: the noise that `e` was evaluated with.
         """
         if data.flights[0].by_instrument is not None:
             return float("nan")
-        # A row for each unknown of interest, and one for the rest of the errors.
+        # There is one row for each unknown of interest, and one for the rest of the errors.
         rows = np.asarray(e.r)[: len(layout.of_interest) + 1]
         squares = float(np.sum(np.square(rows)))
         logs = float(np.sum(np.concatenate(once_a_length(log_determinants, noise.whitening))))
@@ -198,12 +200,12 @@ class FrequencyError(Objective):
         ]
 
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
-        """Return the simulated flights: disturbances are in the noise."""
+        """Return the simulated flights; the noise includes the disturbances."""
         return OUTPUT_ERROR.records(reached, u, runs, seed)
 
 
 def first_spectrum(noise: Noise, flights: Sequence[Flight]) -> Noise:
-    """Return the noise with the spectrum of what is measured, as if all of it were noise.
+    """Return the noise with the spectrum of the measured signals, as if all of them were noise.
 
     White noise would give most weight to the frequencies of the largest power, gusts included.
     """
@@ -216,14 +218,16 @@ def first_spectrum(noise: Noise, flights: Sequence[Flight]) -> Noise:
 
 
 _NOTABLE = 0.3
-"""standard deviations from which on an estimate is named"""
+"""Shift above which an estimate is reported [standard deviations]."""
 _GROWS = 3.0
-"""e-foldings of an unstable mode over a flight, beyond which a simulation leaves the record"""
+"""Growth of an unstable mode over a flight beyond which a simulation diverges from the record
+[e-foldings]."""
 
 
 def linearisation_notes(at: Solution, e: Evaluation) -> list[Finding]:
-    """Return the point of linearisation, and the shifts of the estimates that it causes: those
-    which the model's own simulation, in place of the record, gives in one step of Gauss and Newton.
+    """Return the point of linearisation, and the shifts of the estimates that it causes.
+
+    The shifts are one Gauss-Newton step with the model's own simulation as the record.
     """
     layout, data, noise, _ = at
     if layout.model.linear:
@@ -267,34 +271,38 @@ def linearisation_notes(at: Solution, e: Evaluation) -> list[Finding]:
 OBJECTIVE = FrequencyError()
 
 
-# The rows of frequency error: one for each unknown, and one for the rest of the errors.
+# Rows of frequency error: one for each unknown, and one for the rest of the errors.
 #
 # With whitened errors $e$, their derivatives $J$ by the unknowns and instruments $Z$, the estimate
-# solves $Z^T e = 0$. The rows $r = R^{-T} Z^T e$ with $R^T R = Z^T Z$ have the identity as their
-# covariance, and their derivative $R^{-T} Z^T J$ the information of the estimate, $M^T (Z^T Z)^{-1}
-# M$ with $M = Z^T J$. Directly $Z = J$, and with the row $|e - J J^+ e|$ beside them the sum of
-# squares is that of all errors: maximum likelihood, in a few rows. By instrument $Z$ are the
-# derivatives of the response to what of the inputs follows the instruments.
+# solves $Z^T e = 0$. The rows $r = R^{-T} Z^T e$ with $R^T R = Z^T Z$ have unit covariance. Their
+# derivative $R^{-T} Z^T J$ contains the information of the estimate, $M^T (Z^T Z)^{-1} M$ with $M =
+# Z^T J$. Without instruments $Z = J$; with the additional row $|e - J J^+ e|$ the sum of squares is
+# that of all errors: maximum likelihood with few rows. By instrument, $Z$ are the derivatives of
+# the response to the part of the inputs that follows the instruments.
 #
 # Sources: Söderström and Stoica (1983) for estimates by instrument and their covariance; Pintelon
 # and Schoukens (2012), chapter 9.
 
 
 _NOTHING = 100.0
-"""times the machine precision: eigenvalues of the normalised information that are rounding"""
+"""Eigenvalues of the normalised information that are rounding, as a multiple of the floating-point
+precision."""
 
 
 class Products(NamedTuple):
-    """Products of columns: whitened errors e without the effects of the ends of the records, the
-    derivatives J of the response by the unknowns, instruments Z, and the effects of the ends Q."""
+    """Products of columns e, J, Z and Q.
+
+    e are the whitened errors without the effects of the records' ends, J the derivatives of the
+    response by the unknowns, Z instruments, and Q effects of the ends.
+    """
 
     ee: Float[Array, ""]
     Ze: Float[Array, " q"]
-    """the negative product: the derivatives of e are -J"""
+    """Negative product, because the derivatives of e are -J."""
     ZZ: Float[Array, "q q"]
     ZJ: Float[Array, "q q"]
     QZ: Float[Array, "m q"]
-    """zero after `projected`"""
+    """Zero after `projected`."""
     QJ: Float[Array, "m q"]
 
 
@@ -318,7 +326,7 @@ def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Floa
     """Return the rows, with the derivative of a Gauss-Newton step.
 
     Args:
-        noise: with the whitening of each record.
+        noise: noise with the whitening of each record.
     """
     v = shared_of(layout, u)
     at, rest = jax.lax.stop_gradient((v, u))
@@ -328,14 +336,14 @@ def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Floa
     if data.flights[0].by_instrument is not None:
         left = jnp.zeros_like(left)
     r, M, left = jax.lax.stop_gradient((r, M, left))
-    # The derivative is M by definition.
+    # This makes the derivative M by definition.
     return jnp.append(r + M @ (v - at), left)
 
 
 def _weighed(of: Products) -> tuple[Float[Array, " q"], Float[Array, "q q"]]:
     """Return R^-T Z^T e and R^-T Z^T J, with R^T R = Z^T Z; zero for directions without effect."""
     sizes = jnp.sqrt(jnp.maximum(jnp.diagonal(of.ZZ), 0.0))
-    # Columns are normalised, so that units do not matter.
+    # Columns are normalised to be independent of units.
     over = jnp.where(sizes > 0, 1.0 / jnp.where(sizes > 0, sizes, 1.0), 0.0)
     values, vectors = jnp.linalg.eigh(of.ZZ * over[:, None] * over[None, :])
     kept = values > _NOTHING * jnp.finfo(values.dtype).eps * values[-1]
@@ -351,11 +359,12 @@ def products_of_lines(
     v: Float[Array, " q"],
     unknowns: Callable[[Array], Unknowns],
 ) -> Products:
-    """Return the products over all records. Z is J, or by instrument the derivatives of the
-    response to the inputs by instrument.
+    """Return the products over all records.
+
+    Z is J, or by instrument the derivatives of the response to the inputs by instrument.
 
     Args:
-        noise: with the whitening of each record.
+        noise: noise with the whitening of each record.
         v: unknowns that all flights share.
     """
     total, with_instruments = [], data.flights[0].by_instrument is not None
@@ -377,8 +386,8 @@ def products_of_lines(
 
 
 type _Differentiated = tuple[tuple[Matrices, Driving], tuple[Matrices, Driving]]
-"""a model with its inputs, and the derivatives of both by the unknowns, a last axis; None in place
-of those that are zero"""
+"""A model with its inputs, and their derivatives by the unknowns in a last axis; None replaces zero
+derivatives."""
 
 
 def _of_record(
@@ -390,11 +399,11 @@ def _of_record(
     """Return the products over one record of all flights of a group."""
 
     def at_lines(of: _Differentiated) -> Any:
-        # Flights behind blocks (b, f, k, ...).
+        # The axis of flights follows that of blocks (b, f, k, ...).
         signals = (of[0][1], of[1][1])
         return jax.tree.map(lambda v: jnp.moveaxis(at.lines(v), -1, 1), signals)
 
-    # Block by block: the derivatives at all lines would not fit the caches.
+    # Blocks are processed in turn, because the derivatives at all lines exceed the caches.
     def of_block(of: Any) -> Products:
         (W, R, H, effects), own = of
         Q = basis_of(H, effects)
@@ -404,7 +413,7 @@ def _of_record(
             J = _slopes(H, W, X, direct, direct_lines)
             if by is None:
                 return products(J, J, e, Q)
-            # Inputs by instrument have no ends.
+            # Inputs by instrument have no effects of ends.
             of_inputs = times(R, by_lines[0].U @ by[0][0].B.T)
             return products(_slopes(H, W, of_inputs, by, by_lines), J, e, Q)
 
@@ -428,8 +437,9 @@ def _slopes(
     of: _Differentiated,
     signals: tuple[Driving, Driving],
 ) -> Float[Array, "s q"]:
-    """Return the derivatives of the whitened response at the lines of a block, with states X:
-    H (dAd X + dB U + B dU) + W (dC X + dD held + D dheld).
+    """Return the derivatives of the whitened response at the lines of a block, with states X.
+
+    They are H (dAd X + dB U + B dU) + W (dC X + dD held + D dheld).
 
     Args:
         signals: inputs of the model at the lines, and their derivatives.
@@ -439,14 +449,15 @@ def _slopes(
 
     def response(moving: tuple[Matrices, Driving]) -> Float[Array, " s"]:
         m, signals = eqx.combine(moving, value)
-        # Not X @ Ad.T, whose derivatives XLA lays out so that the next product turns them over.
+        # X @ Ad.T would be slower: XLA lays out its derivatives so that the next product transposes
+        # them.
         driving, passing = (
             jnp.einsum("kcj,ij->kci", X, A) + jnp.einsum("kcj,ij->kci", v, B)
             for A, v, B in ((m.Ad, signals.U, m.B), (m.C, signals.held, m.D))
         )
         return (times(H, driving) + times(W, passing)).reshape(-1)
 
-    # Only arrays that depend on the unknowns: long signals usually do not.
+    # Only arrays that depend on the unknowns are kept; long signals usually do not.
     moving = jax.tree.map(
         lambda d, v: None if d is None else v, slopes, value, is_leaf=lambda d: d is None
     )
@@ -458,12 +469,14 @@ def _slopes(
 
 
 def differentiated[T](make: Callable[[Array], T], v: Float[Array, " q"]) -> tuple[T, T]:
-    """Return arrays in tuples and their derivatives by v, a last axis; None in place of those that
-    are zero."""
+    """Return arrays in tuples and their derivatives by v in a last axis.
+
+    None replaces zero derivatives.
+    """
     moving: list[bool] = []
 
-    # Called beside `make`, it records which derivatives are zero: to trace a model once more for
-    # that takes as long as to differentiate it.
+    # It runs together with `make` and records which derivatives are zero. A separate trace of the
+    # model would take as long as differentiating it.
     @jax.custom_jvp
     def look(*leaves: Array) -> Array:
         return jnp.zeros((), v.dtype)

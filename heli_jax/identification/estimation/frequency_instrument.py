@@ -1,7 +1,7 @@
-r"""Instruments: logged excitations that were added to inputs, and that no feedback reaches.
+r"""Instruments: logged excitations added to inputs, which feedback does not affect.
 
 The part of an input that follows them, $\hat U = S_{ur} S_{rr}^{-1} R$, is independent of gusts and
-noise, also if a pilot or an autopilot feeds both back into the input.
+noise. This holds even if a pilot or autopilot feeds both back into the input.
 
 Sources: Söderström and Stoica (1983); Pintelon and Schoukens (2012), chapter 9; Stock and Yogo
 (2005) for weak instruments.
@@ -23,16 +23,16 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data
 
 PART = 0.05
-"""sd of the Gaussian that smooths the inputs' spectra, as a part of the frequency"""
+"""sd of the Gaussian that smooths the inputs' spectra, as a fraction of the frequency."""
 _ALONE = 1e-9
-"""of the instruments' power, below which two of them move as one"""
+"""Fraction of the instruments' power below which two of them are dependent."""
 STRONG = 16.4
-"""F of the inputs' regression on the instruments from which on intervals of 95 % cover the truth in
-at least 90 % of all cases"""
+"""F of the inputs' regression on the instruments above which 95 % intervals cover the truth in at
+least 90 % of all cases."""
 
 
 def instruments_of(problem: Problem) -> tuple[str, ...]:
-    """Return the inputs that are taken by instrument: the configured ones, or all that have one."""
+    """Return the inputs replaced by instruments: the configured ones, or all that have one."""
     if problem.instrument is not None:
         return tuple(problem.instrument)
     known = naming.names(problem.model.Inputs)
@@ -41,7 +41,7 @@ def instruments_of(problem: Problem) -> tuple[str, ...]:
 
 
 def _lacks(flights: Sequence[Flight], name: str) -> str | None:
-    """Return why flights have no instrument of an input; None if they have one."""
+    """Return the reason why flights have no instrument of an input, or None."""
     for flight in flights:
         if name not in flight.instruments:
             return f"{flight.name or 'a flight'} holds none (signals.instruments)"
@@ -51,7 +51,7 @@ def _lacks(flights: Sequence[Flight], name: str) -> str | None:
 
 
 def absent_instrument(problem: Problem) -> str | None:
-    """Return why a configured instrument cannot be used; None if all can."""
+    """Return the reason why a configured instrument cannot be used, or None."""
     known = naming.names(problem.model.Inputs)
     for name in problem.instrument or ():
         if name not in known:
@@ -69,8 +69,10 @@ def absent_instrument(problem: Problem) -> str | None:
 def instrumented_inputs(
     problem: Problem, flights: Sequence[Flight]
 ) -> tuple[dict[str, np.ndarray], ...] | None:
-    """Return by flight and input its part (N,) that follows the instruments, SI; the input itself
-    if it has none. None if no input has one."""
+    """Return, by flight and input, its part (N,) that follows the instruments, SI.
+
+    An input without an instrument is returned unchanged. The result is None if no input has one.
+    """
     names = instruments_of(problem)
     if not names or any(n not in f.instruments for f in flights for n in names):
         return None
@@ -81,7 +83,7 @@ def instrumented_inputs(
 def following(
     flights: Sequence[Flight], names: Sequence[str], signals: Sequence[Float[np.ndarray, "N r"]]
 ) -> tuple[dict[str, np.ndarray], ...]:
-    """Return by flight the inputs; of the named ones the part (N,) that follows signals."""
+    """Return the inputs by flight, with named ones reduced to the part that follows the signals."""
     made = _parts([np.stack([f.inputs[n] for n in names], axis=1) for f in flights], signals)
     return tuple(
         {**f.inputs, **dict(zip(names, columns.T, strict=True))}
@@ -90,10 +92,10 @@ def following(
 
 
 def as_instruments_have_it(data: Data) -> Data:
-    """Return the flights as if nothing but the instruments moved them: inputs by instrument, and
-    the part of the outputs that follows those, for a direct estimate.
+    """Return the flights as if only the instruments moved them, for a direct estimate.
 
-    Gusts and noise are in them by chance alone, and their effect through feedback is not.
+    Inputs are those by instrument; outputs are reduced to the part that follows them. Gusts and
+    noise are contained only by chance, without their effect through feedback.
     """
     inputs = [naming.asdict(f.by_instrument) for f in data.flights]
     moving = [n for n in inputs[0] if any(np.ptp(np.asarray(u[n])) > 0 for u in inputs)]
@@ -112,7 +114,7 @@ def as_instruments_have_it(data: Data) -> Data:
 
 
 def _filled(y: Any) -> Float[np.ndarray, " N"]:
-    """Return a signal with straight lines over missing samples."""
+    """Return a signal with missing samples interpolated linearly."""
     y = np.asarray(y)
     at, seen = np.arange(y.size), np.isfinite(y)
     return np.interp(at, at[seen], y[seen])
@@ -121,7 +123,7 @@ def _filled(y: Any) -> Float[np.ndarray, " N"]:
 def _parts(
     of: Sequence[Float[np.ndarray, "N u"]], signals: Sequence[Float[np.ndarray, "N r"]]
 ) -> list[Float[np.ndarray, "N u"]]:
-    """Return by flight the part of some columns that follows signals, about the columns' means."""
+    """Return, by flight, the part of the columns that follows the signals, around their means."""
     U, R = ([lines_of(v) for v in one] for one in (of, signals))
     u = U[0].shape[1]
 
@@ -129,9 +131,9 @@ def _parts(
         S, with_them = joint[:, u:, u:], joint[:, :u, u:]
         size = np.sqrt(np.real(np.einsum("kii->ki", S)))
         size = np.where(size > 0, size, 1.0)[:, None, :]
-        # In coherences, so that units do not count; two signals that move as one share an effect.
+        # Coherences are independent of units; two dependent signals share their effect.
         shared = S / (size.swapaxes(1, 2) * size) + _ALONE * np.eye(S.shape[1])
-        # From the right, which the transposes have on their left.
+        # The transposes turn a multiplication from the right into a solve.
         turned = np.linalg.solve(shared.swapaxes(1, 2), (with_them / size).swapaxes(1, 2))
         return turned.swapaxes(1, 2) / size
 
@@ -142,14 +144,14 @@ def _parts(
 
 
 def inputs_by_instrument(data: Data) -> tuple[str, ...]:
-    """Return the inputs that are taken by instrument."""
+    """Return the inputs replaced by their instruments."""
     first = data.flights[0]
     inputs, by = naming.asdict(first.inputs), naming.asdict(first.by_instrument)
     return tuple(n for n in inputs if np.any(np.asarray(inputs[n]) != np.asarray(by[n])))
 
 
 def instrument_notes(data: Data) -> list[Finding]:
-    """Return a note on what an estimate by instrument lacks."""
+    """Return notes on the limits of an estimate by instrument."""
     if data.flights[0].by_instrument is None:
         return []
     words = (

@@ -1,8 +1,8 @@
 """Fourier transforms of records, the response of linear models at their lines, and its errors.
 
-At $z = e^{i\\omega dt}$ of a record's own frequencies the model x[k+1] = Ad x[k] + B U[k] has the
-states $X = (zI - A_d)^{-1} [B U + z (x_0 - x_N)]$, exactly. The effect of the ends of a record
-($x_0 - x_N$) is found by linear least squares.
+At $z = e^{i\\omega dt}$ of a record's Fourier frequencies the model x[k+1] = Ad x[k] + B U[k] has
+exactly the states $X = (zI - A_d)^{-1} [B U + z (x_0 - x_N)]$. Linear least squares gives the
+effect of the record's ends ($x_0 - x_N$).
 
 Sources: Pintelon and Schoukens (2012), chapters 6 and 10; Golub and Pereyra (1973) and Kaufman
 (1975) for the projection.
@@ -36,28 +36,28 @@ from heli_jax.numerics.jitted import jitted
 from heli_jax.simulation.hold import between_samples
 from heli_jax.simulation.stepping import held_columns
 
-# Records: flights, cut where an output has a missing sample. Each has ends of its own.
+# Records are flights, cut where an output has a missing sample. Each has its own ends.
 
 
 class FlightFacts(NamedTuple):
-    """Facts of a flight that are fixed before anything is traced."""
+    """Facts of a flight that are fixed before tracing."""
 
     parts: tuple[tuple[int, int], ...]
-    """first sample, and the one after the last, of each part that is a record of its own"""
+    """First sample, and the one after the last, of each part that forms a record."""
     dt: float
-    """[s]"""
+    """Sample time [s]."""
     condition: Condition | None = None
-    """the steady flight about which a full helicopter is linearised"""
+    """Steady flight at which a full helicopter is linearised."""
 
 
 class Record(NamedTuple):
-    """A part of a flight without missing samples."""
+    """Part of a flight without missing samples."""
 
     flight: int
-    """index of the flight"""
+    """Index of the flight."""
     first: int
     last: int
-    """the sample after its last one"""
+    """Sample after the last one."""
 
     @property
     def samples(self) -> int:
@@ -76,11 +76,11 @@ class Record(NamedTuple):
 
 
 def lines_of[A: (np.ndarray, Array)](v: A) -> A:
-    """Return the Fourier transform (K, c) of signals (N, c) over the root of N, without zero and
+    """Return the Fourier transform (K, c) of signals (N, c) divided by sqrt(N), without zero and
     the Nyquist frequency."""
     xp = jnp if isinstance(v, jax.Array) else np
     N = len(v)
-    # The mean is taken off: rounding would carry it to the other lines.
+    # The mean is subtracted, because rounding would spread it to the other lines.
     return (
         xp.fft.rfft(v - v.mean(axis=0, keepdims=True), axis=0)[1 : 1 + (N - 1) // 2]
         / float(N) ** 0.5
@@ -95,12 +95,11 @@ def in_time_of(lines: Complex[np.ndarray, "K c"], samples: int) -> Float[np.ndar
 
 
 def parts_of(flight: Flight) -> tuple[tuple[int, int], ...]:
-    """Return first sample, and the one after the last, of each part that has all outputs and is
-    long enough for a record."""
+    """Return first sample, and the one after the last, of each long part with all outputs."""
     seen = spans(flight.outputs.values())
     if seen == [(0, flight.n_samples)]:
         return tuple(seen)
-    # As with the parts of `gaps: split`: short parts hardly determine their ends.
+    # As with `gaps: split`, short parts hardly determine their ends.
     least = max(FEWEST, int(np.ceil(SHORTEST / flight.dt)))
     return tuple((a, b) for a, b in seen if b - a >= least)
 
@@ -111,7 +110,7 @@ def records_of(layout: Layout) -> list[Record]:
 
 
 def without_parts(flights: Sequence[Flight]) -> str | None:
-    """Return why a flight leaves no record, and what to do; None where each leaves one."""
+    """Return which flight gives no record and the remedy, or None."""
     for flight in flights:
         if parts_of(flight):
             continue
@@ -127,8 +126,8 @@ def without_parts(flights: Sequence[Flight]) -> str | None:
 
 
 def other_outputs(flights: Sequence[Flight]) -> str | None:
-    """Return which flight lacks an output of others, and what to do; None where all have them."""
-    # The noise's spectrum is one matrix over the outputs.
+    """Return which flight lacks an output of others and the remedy, or None."""
+    # The noise's spectrum is one matrix over the outputs, so all flights need them.
     common = set.intersection(*(set(f.outputs) for f in flights))
     for flight in flights:
         more = sorted(set(flight.outputs) - common)
@@ -160,7 +159,7 @@ def cut_notes(layout: Layout, data: Data, names: Sequence[str]) -> list[Finding]
     return notes
 
 
-# Discretised models of groups of flights whose layouts are equal.
+# Discretised models of groups of flights with equal layouts.
 
 
 class Matrices(NamedTuple):
@@ -176,18 +175,18 @@ class Driving(NamedTuple):
     """Inputs of a discretised model."""
 
     U: Float[Array, "N r"]
-    """inputs of the states, multiplied by B"""
+    """Inputs of the states, multiplied by B."""
     held: Float[Array, "N m"]
-    """inputs at the samples, multiplied by D"""
+    """Inputs at the samples, multiplied by D."""
 
 
 def alike(layout: Layout, data: Data) -> list[list[int]]:
-    """Return the flights in groups that share one model and differ only in their signals."""
+    """Return groups of flights that share one model and differ only in their signals."""
     groups: dict[Any, list[int]] = {}
     for i, flight in enumerate(data.flights):
         n = next(iter(flight.outputs.values())).shape[0]
         key = (n, layout.outputs[i], layout.holds[i], layout.flight_facts[i : i + 1])
-        # An offset of its own moves the point about which a flight is linearised.
+        # A flight's own offset changes its point of linearisation.
         own = bool(flight.known) or not layout.model.linear
         groups.setdefault((i, *key) if own else key, []).append(i)
     return list(groups.values())
@@ -205,8 +204,8 @@ def discretised(
 
     def of_one(own: tuple[FlightData, Any, Any]) -> tuple[Matrices, Driving]:
         flight, state, offset = own
-        # With one sample time everything that does not depend on the signals is computed once. The
-        # point of linearisation depends on means alone, and inputs by instrument have the same.
+        # With one sample time, everything independent of the signals is computed once. The point of
+        # linearisation depends only on means, which inputs by instrument share.
         flight = flight._replace(
             dt=data.flights[first].dt,
             inputs=flight.by_instrument if by_instrument else flight.inputs,
@@ -227,7 +226,7 @@ def discretised(
 
     own = [(data.flights[i], u.states[i], u.offsets[i]) for i in members]
     if len(members) == 1:
-        # A model that depends on values of its flight would leave vmap with an axis.
+        # A model that depends on a flight's values would gain an axis in vmap.
         m, driving = of_one(own[0])
         return m, jax.tree.map(lambda v: v[None], driving)
     axes: Any = (None, 0)
@@ -247,7 +246,7 @@ def shared_of(layout: Layout, u: Unknowns) -> Float[Array, " q"]:
 
 def with_shared(layout: Layout, u: Unknowns, v: Float[Array, " q"]) -> Unknowns:
     """Return the unknowns with the shared ones replaced, in the order of `shared_of`."""
-    # By the layout's order: JAX sorts the keys of the dictionaries that it flattens.
+    # The layout's order is used because JAX sorts the keys of dictionaries.
     values = dict(zip((*layout.free, *layout.gains), v, strict=False))
     return u._replace(
         params={n: values[n] for n in layout.free},
@@ -256,7 +255,7 @@ def with_shared(layout: Layout, u: Unknowns, v: Float[Array, " q"]) -> Unknowns:
     )
 
 
-# Complex vectors are stored as real ones, [re, im]: products of real matrices are faster.
+# Complex vectors are stored as real ones, [re, im], because products of real matrices are faster.
 
 
 def stacked(v: Complex[Array, "K *c"]) -> Float[Array, "K 2 *c"]:
@@ -265,7 +264,7 @@ def stacked(v: Complex[Array, "K *c"]) -> Float[Array, "K 2 *c"]:
 
 
 def real(M: Complex[Array, "K a b"]) -> Float[Array, "K 2a 2b"]:
-    """Return the real matrix that multiplies stacked vectors as M multiplies complex ones."""
+    """Return the real matrix that acts on stacked vectors as M does on complex ones."""
     re, im = jnp.real(M), jnp.imag(M)
     parts = jnp.stack([jnp.stack([re, -im], axis=2), jnp.stack([im, re], axis=2)], axis=1)
     return parts.reshape(len(M), 2 * M.shape[1], 2 * M.shape[2])
@@ -278,20 +277,20 @@ def times(M: Float[Array, "K 2a 2b"], v: Float[Array, "K 2 b *f"]) -> Float[Arra
 
 
 _NO_END = 1e-10
-"""effect of a state over the largest one, below which it has none"""
+"""Effect of a state, relative to the largest one, below which it has none."""
 _ROUNDING = 1e-12
-"""power of a direction over the largest one, below which it is rounding"""
+"""Power of a direction, relative to the largest one, below which it is rounding."""
 
 
 def orthonormal(gram: Float[Array, "m m"]) -> Float[Array, "m m"]:
     """Return S with S^T G S the identity, but zero for directions without effect.
 
     Args:
-        gram: products G of columns, which are orthonormal if multiplied by S.
+        gram: products G of columns; the columns times S are orthonormal.
     """
     sizes = jnp.sqrt(jnp.maximum(jnp.diagonal(gram), 0.0))
-    # The column of a state without effect on the outputs is rounding. Its direction changes from
-    # step to step, and to project it out would make the sum of squares rough.
+    # The column of a state without effect on the outputs is rounding, and its direction changes at
+    # each step. Projecting it out would make the sum of squares rough.
     precision = float(jnp.finfo(gram.dtype).eps)
     seen = sizes > max(_NO_END, 10.0 * precision) * jnp.max(sizes)
     over = jnp.where(seen, 1.0 / jnp.where(seen, sizes, 1.0), 0.0)
@@ -305,32 +304,32 @@ def orthonormal(gram: Float[Array, "m m"]) -> Float[Array, "m m"]:
 
 
 _NUMBERS = 20_000
-"""largest product of outputs, states and lines in a block: 256 lines of a helicopter, or the whole
-record of a small vehicle"""
+"""Largest product of outputs, states and lines in a block: 256 lines of a helicopter, or the whole
+record of a small vehicle."""
 _SPARED = 0.1
-"""largest share of a record's degrees of freedom that its ends, and those of gusts, may take"""
+"""Largest fraction of a record's degrees of freedom for its ends and those of gusts."""
 
 
 class Resolved(NamedTuple):
-    """A model at the lines of a record, without a derivative, in b blocks of k lines that fit the
+    """Model at the lines of a record, without derivatives, in b blocks of k lines that fit the
     processor's caches."""
 
     record: Record
     W: Float[Array, "b k 2p 2p"]
-    """whitening to rows of variance 1; zero beyond the record's lines"""
+    """Whitening to rows of variance 1; zero beyond the record's lines."""
     R: Float[Array, "b k 2n 2n"]
-    """(zI - Ad)^-1"""
+    """(zI - Ad)^-1."""
     H: Float[Array, "b k 2p 2n"]
-    """W C (zI - Ad)^-1"""
+    """W C (zI - Ad)^-1."""
     effects: Float[Array, "b k 2 e"]
-    """spectrum of a jump between the ends of a state and, except in a very short record, of a slow
-    gust that acts on it"""
+    """Spectrum of a jump of a state between the ends and, except in a very short record, of a slow
+    gust on it."""
     S: Float[Array, "m m"]
-    """makes `basis_of` orthonormal; columns of zeros for states without effect"""
+    """Makes `basis_of` orthonormal; zero columns for states without effect."""
 
     def lines(self, v: Float[Array, "f N *c"]) -> Float[Array, "b k 2 *c f"]:
         """Return the transform of the record's part of signals over whole flights, by block."""
-        # Signals are delayed before they are cut: an input may be logged before it acts.
+        # Signals are delayed before they are cut, because an input may be logged before it acts.
         part = jnp.moveaxis(v[:, self.record.first : self.record.last], 0, -1)
         return by_block(stacked(lines_of(part)), len(self.W))
 
@@ -348,13 +347,14 @@ def resolved(m: Matrices, record: Record, whitening: Complex[Array, "K p p"]) ->
     # The real part of a complex normal error has half of its variance.
     W = by_block(2.0**0.5 * real(whitening).astype(m.C.dtype), -(-K * m.C.size // _NUMBERS))
     count, size = W.shape[:2]
-    # The padding continues the lines, so that nothing is singular there.
+    # The padding continues the lines to avoid singular matrices.
     k = np.arange(1, count * size + 1)
     z = np.exp(2j * np.pi * k / np.where(k <= K, record.samples, record.samples + 2 * size))
     z = z.astype(np.result_type(m.Ad.dtype, np.complex64))
-    # A gust that ends elsewhere than it began has a jump, which is in all lines. As noise of each
-    # line by itself it would move slow modes by several standard deviations. Above its corner
-    # frequency it is an integrated push; over the length it is no larger than the states' ends.
+    # A gust that does not end where it began has a jump, which affects all lines. Treated as
+    # independent noise of each line, it would shift slow modes by several standard deviations.
+    # Above its corner frequency it is an integrated push; dividing by the length keeps it
+    # comparable to the states' ends.
     effects = np.stack([z, z / (z - 1.0) / record.samples], axis=1)
     if 2 * n > _SPARED * 2 * p * K:
         effects = effects[:, :1]
@@ -373,8 +373,7 @@ def resolved(m: Matrices, record: Record, whitening: Complex[Array, "K p p"]) ->
 
 
 def basis_of(H: Float[Array, "k 2p 2n"], effects: Float[Array, "k 2 e"]) -> Float[Array, "s m"]:
-    """Return the effects of the ends of the states, and then of the gusts, on the rows of a
-    block."""
+    """Return the effects of the states' ends, then of the gusts' ends, on the rows of a block."""
     n = H.shape[2] // 2
     re, im = H[:, :, None, :n], H[:, :, None, n:]
     made = re * effects[:, None, 0, :, None] + im * effects[:, None, 1, :, None]
@@ -385,11 +384,11 @@ class Errors(NamedTuple):
     """Errors of one record of each flight of a group, by block."""
 
     rows: Float[Array, "b s f"]
-    """measured less modelled, whitened, without the effects of the ends; zero in the padding"""
+    """Measured less modelled, whitened, without the effects of the ends; zero in the padding."""
     X: Float[Array, "b k 2 n f"]
-    """the states"""
+    """States."""
     y: Float[Array, "b k 2 p f"]
-    """measured less the direct feedthrough of the inputs"""
+    """Measured outputs less the direct feedthrough of the inputs."""
 
 
 def errors_of_record(
@@ -398,7 +397,7 @@ def errors_of_record(
     """Return the errors of one record of each flight of a group.
 
     Args:
-        driving: over the whole flights, as `outputs`.
+        driving: inputs over the whole flights, like `outputs`.
     """
     inputs = jnp.einsum("nr,bkcrf->bkcnf", m.B, at.lines(driving.U))
     y = at.lines(outputs - driving.held @ m.D.T)
@@ -409,7 +408,7 @@ def errors_of_record(
         return rows, basis_of(H, effects).T @ rows
 
     rows, along = jax.lax.map(unprojected, (at.W, at.H, at.effects, inputs, y))
-    # The ends' states of each flight, by linear least squares.
+    # Linear least squares gives the states' ends of each flight.
     ends = at.S @ (at.S.T @ jnp.sum(along, axis=0))
 
     def without_ends(of: Any) -> tuple[Array, Array]:
@@ -424,7 +423,7 @@ def errors_of_record(
 
 def parts_of_group(layout: Layout, noise: Noise, members: list[int]) -> list[tuple[Record, Array]]:
     """Return the records of each flight of a group, with their whitening."""
-    # Records of one length have one spectrum (`smoothed`): that of the first flight.
+    # Records of equal length share one spectrum (`smoothed`), that of the first flight.
     pairs = zip(records_of(layout), noise.whitening, strict=True)
     return [(record, W) for record, W in pairs if record.flight == members[0]]
 
@@ -440,9 +439,9 @@ class LineErrors(NamedTuple):
     """Errors of all records."""
 
     errors: list[Complex[Array, "K p"]]
-    """by record, without the effects of its ends, not whitened"""
+    """Errors by record, without the effects of its ends, not whitened."""
     model: Matrices
-    """of the first flight"""
+    """Model of the first flight."""
 
 
 @jitted

@@ -18,40 +18,40 @@ from heli_jax.identification.estimation.frequency_lines import (
 )
 from heli_jax.identification.unknowns.layout import Data, Layout, unpack
 
-# Spectra of records at their own frequencies, smoothed over frequency and over records.
+# Spectra of records at their own frequencies, smoothed over frequency and records.
 #
 # Source: Brillinger, Time Series (1981), chapter 7; Pintelon and Schoukens (2012), chapter 10.
 
 
 LEAST, PART = 6.0, 0.08
-"""least sd of the Gaussian that smooths the noise's spectrum over frequency, in lines and as a part
-of the frequency. Narrower ones overfit the noise: intervals are then too narrow"""
+"""Least sd of the Gaussian that smooths the noise's spectrum, in lines and as a fraction of the
+frequency. Narrower ones overfit the noise and make intervals too narrow."""
 AVERAGES = 2.0 * np.pi**0.5 * LEAST
-"""least number of independent lines of one record in a smoothed spectrum: (sum w)^2 / sum w^2"""
+"""Least number of independent lines of one record in a smoothed spectrum: (sum w)^2 / sum w^2."""
 _ROUNDING = 1e-10
-"""least spectrum, as a part of the mean over all frequencies"""
+"""Least spectrum, as a fraction of the mean over all frequencies."""
 _KNOTS = 4.0
-"""knots in one sd of the Gaussian; between them a smoothed spectrum is linear to a hundredth"""
+"""Knots in one sd of the Gaussian; linear interpolation between them is accurate to 1 %."""
 
 
 def smoothed(
     lines: Sequence[Complex[np.ndarray, "K p"]], part: float = PART, *, least: float = LEAST
 ) -> list[Complex[np.ndarray, "K p p"]]:
-    """Return by record the spectrum E e e^H (K, p, p) of all records, smoothed over frequency.
+    """Return for each record the spectrum E e e^H (K, p, p) of all, smoothed over frequency.
 
     Args:
-        lines: by record at its own frequencies, those of N samples K = (N - 1) // 2.
-        part: sd of the Gaussian as a part of the frequency.
+        lines: by record at its own frequencies; N samples give K = (N - 1) // 2.
+        part: sd of the Gaussian as a fraction of the frequency.
         least: least sd in lines.
     """
     p, counts = lines[0].shape[1], Counter(len(v) for v in lines)
-    # Records of one length have one spectrum and one kernel: their powers are added first. A
-    # spectrum is Hermitian: the half below the diagonal is enough.
+    # Records of equal length share spectrum and kernel, so their powers are added first. A spectrum
+    # is Hermitian, so the lower half is enough.
     below = np.tril_indices(p)
     sums = {}
     for K in counts:
         power = summed_powers(np.stack([v for v in lines if len(v) == K]))[:, below[0], below[1]]
-        # Complex in double precision, whatever the lines are: the view is of doubles.
+        # The view as doubles needs complex numbers in double precision.
         sums[K] = np.ascontiguousarray(power, dtype=complex).view(float)
     spectra = {}
     for K in counts:
@@ -68,7 +68,7 @@ def smoothed(
 
 
 def once_a_length(make: Callable[..., Any], *records: Sequence[Any]) -> list[Any]:
-    """Return by record the result of arrays that records of one length share, like spectra."""
+    """Return an array by record, computed once for records of equal length."""
     made: dict[int, Any] = {}
     each = list(zip(*records, strict=True))
     for v in each:
@@ -86,7 +86,7 @@ def summed_powers(v: Complex[np.ndarray, "f K p"]) -> Complex[np.ndarray, "K p p
 def whitening_alone(
     lines: Sequence[Complex[np.ndarray, "K p"]],
 ) -> tuple[Complex[np.ndarray, "K p p"], ...]:
-    """Return by record the whitening of each signal by itself, without their correlations.
+    """Return, by record, the whitening of each signal alone, without correlations.
 
     Raises:
         numpy.linalg.LinAlgError: a signal is zero throughout.
@@ -107,8 +107,11 @@ def whitening_alone(
 def knots_of(
     K: int, part: float = PART, least: float = LEAST
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Return the knots, lines (from 0) at which a spectrum of K lines is computed, and for each
-    line the knot below and the weight of the next."""
+    """Return the knots for K lines, and their weights for interpolation.
+
+    A spectrum is computed at the knots (lines from 0). Each line gets the knot below and the weight
+    of the next one.
+    """
     knots = [0]
     while knots[-1] < K - 1:
         width = max(least, part * (knots[-1] + 1))
@@ -130,9 +133,8 @@ def _between_knots(at_knots: np.ndarray, K: int, part: float, least: float) -> n
 def _kernel(
     K: int, other: int, part: float, least: float
 ) -> tuple[Float[np.ndarray, "knots other"], Float[np.ndarray, " knots"]]:
-    """Return the weights of the lines of a record of `other` lines at the knots of one of K lines,
-    and their sums."""
-    # Frequencies over the rate, which all records have in common.
+    """Return the weights of a record of `other` lines at the knots of K lines, and their sums."""
+    # Frequencies are relative to the sampling rate, which all records share.
     f, first = (knots_of(K, part, least)[0] + 1) / (2 * K + 1), 1 / (2 * other + 1)
     g = first * np.arange(1, other + 1)
     width = np.maximum(least * first, part * f)
@@ -144,10 +146,10 @@ def _kernel(
 def averages(
     K: int, counts: tuple[tuple[int, int], ...], part: float = PART, least: float = LEAST
 ) -> Float[np.ndarray, " K"]:
-    """Return the independent lines (K,) in a smoothed spectrum, (sum w)^2 / sum w^2.
+    """Return the number of independent lines (K,) in a smoothed spectrum, (sum w)^2 / sum w^2.
 
     Args:
-        counts: for each length, lines of a record and number of records.
+        counts: for each length, the lines of a record and the number of records.
     """
     at, _ = knots_of(K, part, least)
     kernels = [(n, *_kernel(K, other, part, least)) for other, n in counts]
@@ -157,10 +159,10 @@ def averages(
 
 
 def inverse_roots(S: Complex[np.ndarray, "K p p"]) -> Complex[np.ndarray, "K p p"]:
-    """Return L^-1, where S = L L^H.
+    """Return L^-1 with S = L L^H.
 
     Raises:
-        numpy.linalg.LinAlgError: one is not positive definite.
+        numpy.linalg.LinAlgError: a matrix is not positive definite.
     """
     return np.linalg.inv(np.linalg.cholesky(S))
 
@@ -170,39 +172,39 @@ def log_determinants(W: Complex[np.ndarray, "K p p"]) -> Float[np.ndarray, " K"]
     return np.sum(np.log(np.abs(np.diagonal(np.asarray(W), axis1=1, axis2=2))), axis=1)
 
 
-# The noise's spectrum as that of gusts through the vehicle, times a mean over lines of the rest.
+# The noise's spectrum is that of gusts through the vehicle, times a mean over lines of the rest.
 #
-# Gusts pass the integrations and modes of a vehicle: the outputs are coherent, with a gain that
-# changes from line to line. A mean over lines loses that coherence; estimates are then inaccurate,
-# and intervals too narrow. So the spectrum is first described as
+# Gusts pass through integrations and modes of the vehicle: the outputs are coherent, with a gain
+# that changes from line to line. A mean over lines loses that coherence, which makes estimates
+# inaccurate and intervals too narrow. So the spectrum is first modelled as
 #
 # $$S_0 = \sum_i h_i\, q_i\, h_i^H + R, \qquad [h_1 \ldots h_n] = C (zI - A_d)^{-1}$$
 #
 # with a gust at every state whose spectrum $q_i \ge 0$ falls with frequency, and white noise of
-# each output in R. The errors, whitened by $S_0$, have a nearly flat spectrum. The mean over lines
-# is taken of that: it may be wide, and corrects errors of the description.
+# each output in R. The errors, whitened by $S_0$, have a nearly flat spectrum, whose mean over
+# lines corrects errors of this model.
 #
 # Weights by a spectrum from n averages of p outputs are too large by $n / (n - p)$, and the
-# variance of the estimate is larger by about the same factor: both are allowed for.
+# variance of the estimate grows by about the same factor: both are corrected.
 #
 # Sources: Blackman and Tukey (1958) for prewhitening; Sawada, Kameoka, Araki and Ueda (2013) for
-# the multiplicative steps to the largest likelihood; Brillinger (1981), chapter 8, for weights that
-# are estimated.
+# the multiplicative steps to the largest likelihood; Brillinger (1981), chapter 8, for estimated
+# weights.
 
 
 GUST_LEAST, GUST_PART = 12.0, 0.12
-"""least sd of the Gaussian that smooths the rest, in lines and as a part of the frequency"""
+"""Least sd of the Gaussian that smooths the rest, in lines and as a fraction of the frequency."""
 _CELLS = 0.16, 6.0
-"""part and least sd for the cells of the description: single lines up to the fiftieth, since slow
-modes are no wider, and above that 4 % of the frequency"""
+"""`part` and `least` of the spectral cells, see `knots_of`. Up to the fiftieth line cells are
+single lines, because slow modes are narrow; above they span 4 % of the frequency."""
 _OCTAVES = 2
-"""from one corner of the gusts' spectra to the next"""
+"""Octaves between the corners of the gusts' spectra."""
 _STEPS = 24
-"""multiplicative steps towards the largest likelihood; the mean over lines corrects the rest"""
+"""Multiplicative steps towards the largest likelihood; the mean over lines corrects the rest."""
 _NOTHING = 1e-9
-"""least noise, as a part of an output's power"""
+"""Least noise, as a fraction of an output's power."""
 _UNSEEN = 1e-20
-"""power of a state's effect over the largest one, below which it is rounding"""
+"""Power of a state's effect, relative to the largest one, below which it is rounding."""
 
 
 @eqx.filter_jit
@@ -214,7 +216,7 @@ def first_model(layout: Layout, data: Data, z: Float[Array, " q"]) -> Matrices:
 def whitening_by(
     vehicle: Matrices, errors: Sequence[Complex[np.ndarray, "K p"]]
 ) -> tuple[Complex[np.ndarray, "K p p"], ...]:
-    """Return by record the whitening of its errors; the same array for records of one length."""
+    """Return the whitening of each record's errors; records of equal length share an array."""
     counts = Counter(len(e) for e in errors)
     before = _prewhitening(vehicle, errors, list(counts))
     left = smoothed(
@@ -233,7 +235,7 @@ def whitening_by(
 def _prewhitening(
     vehicle: Matrices, errors: Sequence[Complex[np.ndarray, "K p"]], lengths: list[int]
 ) -> dict[int, Complex[np.ndarray, "K p p"]]:
-    """Return S0^(-1/2) by length of the record; the identity if the description fails."""
+    """Return S0^(-1/2) by length of the record; the identity if the gust model fails."""
     Ad, C = np.asarray(vehicle.Ad, float), np.asarray(vehicle.C, float)
     cells = []
     for K in lengths:
@@ -264,14 +266,13 @@ def gust_spectrum(
     power: Complex[np.ndarray, "c p p"],
     lines: Float[np.ndarray, " c"],
 ) -> Complex[np.ndarray, "c p p"] | None:
-    """Return the spectrum S0 of largest likelihood for complex normal errors; None if there is
-    none.
+    """Return the most likely spectrum S0 for complex normal errors, or None.
 
     Args:
-        ways: by cell and state the outputs' spectrum in a gust of power 1 at the state.
+        ways: by cell and state, the outputs' spectrum for a gust of power 1 at the state.
         f: frequencies of the cells, in cycles per sample.
         power: mean of e e^H over the lines of a cell.
-        lines: of each cell.
+        lines: number of lines in each cell.
     """
     size = np.sqrt(np.average(np.real(np.einsum("cii->ci", power)), axis=0, weights=lines))
     # The response at the frequency of an undamped mode is infinite.
@@ -280,11 +281,11 @@ def gust_spectrum(
         return None
     scale = size[:, None] * size[None, :]
     corners = 0.5 * 0.5 ** np.arange(1.0, np.log2(0.5 / np.min(f)), _OCTAVES)
-    # A gust's spectrum is a sum of a white one and first-order lags.
+    # A gust's spectrum is a sum of white noise and first-order lags.
     shapes = [np.ones((1, fine.size)), 1.0 / (1.0 + (f[fine] / corners[:, None]) ** 2)]
     shapes, ways = np.concatenate(shapes), ways[fine] / scale
-    # A state without effect on the outputs has a rounding error for its effect. It would be taken
-    # for a huge gust, and the spectrum would depend on the last digit of the parameters.
+    # The effect of a state that does not reach the outputs is a rounding error. It would look like
+    # a huge gust, and the spectrum would depend on the parameters' last digit.
     effects = np.max(np.real(np.einsum("cnii->cni", ways)), axis=(0, 2))
     ways = np.where((effects > _UNSEEN * np.max(effects))[:, None, None], ways, 0.0)
     q, r = _powers_of_gusts(ways, shapes, power[fine] / scale, lines[fine])
@@ -303,28 +304,28 @@ def _powers_of_gusts(
     """Return the powers of gusts, by state and shape, and of the outputs' own white noise."""
     own, gains = (np.real(np.einsum("...ii->...i", v)) for v in (power, ways))
     gains = np.swapaxes(gains, 1, 2)
-    # Initially as much as the output with the least effect of a state allows.
+    # Start from the largest power that every output allows for a state.
     room = np.median(np.min(own[:, :, None] / np.maximum(gains, 1e-300), axis=1), axis=0)
     room = np.where(np.max(gains, axis=(0, 1)) > 0, room, 0.0)
     c, n, p, _ = ways.shape
-    # An output's own noise has an effect on it alone, and is white: the first shape.
+    # An output's own noise affects only that output and is white: the first shape.
     powers = np.zeros((len(shapes), n + p))
     powers[:, :n], least = room / len(shapes), np.zeros_like(powers)
     powers[0, n:], least[0, n:] = np.maximum(0.3 * np.median(own, axis=0), _NOTHING), _NOTHING
     alone = np.eye(p)[:, :, None] * np.eye(p)[:, None, :]
     ways = np.concatenate([ways, np.broadcast_to(alone, (c, p, p, p))], axis=1)
-    # Matrices as rows of real numbers, so that sums over effects are products of real matrices.
+    # Matrices become rows of real numbers, so that sums over effects are products of real matrices.
     ways = np.ascontiguousarray(ways.reshape(c, n + p, -1), complex).view(float)
     by_way, matrices = np.swapaxes(ways, 1, 2).copy(), np.empty((c, 2, p, p), complex)
     by_shape = shapes * lines
-    # With a quarter of these steps a false peak of gusts stayed at the flybar's mode, and the
+    # With a quarter of these steps a false gust peak remained at the flybar's mode, and the
     # interval of If was a third wider.
     for _ in range(_STEPS):
         S = ((shapes.T @ powers)[:, None, :] @ ways).view(complex).reshape(c, p, p)
         matrices[:, 1] = np.linalg.inv(S)
         matrices[:, 0] = matrices[:, 1] @ power @ matrices[:, 1]
-        # By shape and effect, its power in the errors and the expected one. The root that
-        # guarantees an increase in each step is left out: half as many steps are enough.
+        # Power in the errors and expected power, by shape and effect. The square root that
+        # guarantees an increase in each step is omitted, which halves the number of steps.
         told = (matrices.view(float).reshape(c, 2, -1) @ by_way).reshape(c, -1)
         shown, due = np.moveaxis((by_shape @ told).reshape(-1, 2, n + p), 1, 0)
         powers = np.maximum(powers * (shown / np.where(due > 0, due, 1.0)), least)
@@ -332,22 +333,23 @@ def _powers_of_gusts(
 
 
 _ALONE = 1e-9
-"""part of the inputs' power below which two of them move as one, and of the outputs' below which
-there is no residual"""
+"""Fraction of the inputs' power below which two of them are dependent, and of the outputs' power
+below which there is no residual."""
 
 
-# The noise's spectrum without a model: the residual of local regressions of the outputs on inputs.
+# The noise's spectrum without a model: residual of local regressions of the outputs on inputs.
 #
 # Source: Brillinger, Time Series (1981), chapter 8, for regression of spectra; Pintelon and
-# Schoukens (2012), chapter 7, for the ends of a record as a smooth function of the frequency beside
-# them.
+# Schoukens (2012), chapter 7, for the ends of a record as an added smooth function of the
+# frequency.
 
 
 def whitening_without_model(layout: Layout, data: Data) -> tuple[np.ndarray, ...] | None:
-    """Return by record the whitening (K, p, p) of the part of the outputs that no response to the
+    """Return, by record, the whitening (K, p, p) of the outputs' part that no response to the
     inputs explains; None with too few lines.
 
-    In a closed loop it is too small where feedback moves the inputs more than the excitation does.
+    In closed loop that part is too small where feedback moves the inputs more than the excitation
+    does.
     """
     flights = jax.device_get(data.flights)
     lines = []
@@ -359,9 +361,10 @@ def whitening_without_model(layout: Layout, data: Data) -> tuple[np.ndarray, ...
     p = len(layout.outputs[0])
     powers = np.sum([np.sum(np.abs(v) ** 2, axis=0) for v in lines], axis=0)
     moving = p + np.flatnonzero(powers[p:] > 0)
-    # A response varies over the lines of a smoothed spectrum, near a mode by much.
+    # A response varies over the lines of a smoothed spectrum, strongly near a mode.
     order = next((q for q in (2, 1) if (q + 1) * (moving.size + 1) <= 0.5 * AVERAGES), 0)
-    # The effects of the ends of a record are smooth over the lines: a constant beside the inputs.
+    # The effects of a record's ends are smooth over the lines, so a constant is added to the
+    # inputs.
     size = np.sqrt(np.mean(powers[:p]) / sum(len(v) for v in lines))
     lines = [np.column_stack([v[:, :p], *_powers(v[:, moving], size, order)]) for v in lines]
     counts, spectra = tuple(Counter(len(v) for v in lines).items()), smoothed(lines)
@@ -377,16 +380,17 @@ def whitening_without_model(layout: Layout, data: Data) -> tuple[np.ndarray, ...
 
 
 def _powers(inputs: np.ndarray, size: float, order: int) -> list[np.ndarray]:
-    """Return inputs (K, m) and a constant, times powers of the frequency up to an order: regressors
-    of a response that is locally a polynomial."""
+    """Return inputs (K, m) and a constant, times powers of the frequency up to an order.
+
+    They are regressors of a response that is locally a polynomial.
+    """
     beside = np.column_stack([inputs, np.full(len(inputs), size)])
     f = np.arange(1, len(inputs) + 1)[:, None] / len(inputs)
     return [beside * f**q for q in range(order + 1)]
 
 
 def _left(S: np.ndarray, p: int) -> np.ndarray:
-    """Return the spectra (K, p, p) of the first p signals without the part that the others
-    explain."""
+    """Return the spectra (K, p, p) of the first p signals, less the part due to the others."""
     size = np.sqrt(np.real(np.einsum("kii->ki", S)))
     R = S / (size[:, :, None] * size[:, None, :])
     others = R[:, p:, p:] + _ALONE * np.eye(S.shape[1] - p)

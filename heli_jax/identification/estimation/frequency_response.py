@@ -5,15 +5,15 @@ in Hann windows, the error of the model's responses is
 
 $$\Delta H = \overline{E Z^*}\; \overline{U Z^*}^{-1}.$$
 
-The model goes through the same windows as the record, so that windows bias nothing. Its bounded
-solution replaces a simulation, so that it may be unstable, and the effects of the ends of the
-record are projected out. Errors are complex and linear. They are whitened between outputs and
-inputs by the noise's spectral matrix, which is that of the part of the errors that no response
-explains. Lines of a window are weighted by how independent they are.
+The model passes through the same windows as the record, so that windows cause no bias. Its bounded
+solution replaces a simulation, so that it may be unstable. The effects of the record's ends are
+projected out. Errors are complex and linear. The spectral matrix of the noise whitens them between
+outputs and inputs; it is that of the errors' part that no response explains. Lines of a window are
+weighted by their independence.
 
 Sources: Pintelon and Schoukens (2012), chapters 2 and 9; Bendat and Piersol (2010), chapter 9;
-Tischler and Remple (2012), chapters 7 to 12, for the approach, whose logarithmic errors and weights
-by coherence are not used: they lose a factor of 2 to 10 in precision.
+Tischler and Remple (2012), chapters 7 to 12, for the approach. Their logarithmic errors and
+coherence weights are not used, because they lose a factor of 2 to 10 in precision.
 """
 
 import dataclasses
@@ -95,15 +95,15 @@ def bounded_outputs(
     """Return the outputs over a record by the bounded solution.
 
     Args:
-        R: of `inverses`.
-        ends: factors of `effects_of_ends`; zero unless given.
+        R: result of `inverses`.
+        ends: factors of `effects_of_ends`; default zero.
     """
     z, turns = _lines(len(driving.U))
     U = _at_lines(driving.U, turns) @ m.B.T.astype(z.dtype)
     if ends is not None:
         U = U + z[:, None] * ends.astype(z.dtype)[None]
-    # Products in place of the derivative of an inverse: dY = H (dAd X + dU) + dC X. The differences
-    # are zero but for their derivatives.
+    # Products replace the derivative of an inverse: dY = H (dAd X + dU) + dC X. The differences are
+    # zero, but their derivatives are not.
     X = jax.lax.stop_gradient(jnp.einsum("kij,kj->ki", R, U))
     C = jax.lax.stop_gradient(m.C).astype(z.dtype)
     dA, dC = ((v - jax.lax.stop_gradient(v)).astype(z.dtype) for v in (m.Ad, m.C))
@@ -112,7 +112,7 @@ def bounded_outputs(
 
 
 def inverses(m: Matrices, samples: int) -> Complex[Array, "K n n"]:
-    """(zI - Ad)^-1 at the lines of a record, without a derivative."""
+    """Return (zI - Ad)^-1 at the lines of a record, without a derivative."""
     z, _ = _lines(samples)
     Ad = jax.lax.stop_gradient(m.Ad).astype(z.dtype)
     return jnp.linalg.inv(z[:, None, None] * jnp.eye(len(Ad), dtype=z.dtype)[None] - Ad[None])
@@ -126,7 +126,7 @@ def effects_of_ends(m: Matrices, R: Complex[Array, "K n n"], samples: int) -> Ar
 
 
 def _lines(N: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return half of the lines z (K,), the others being conjugate, and exp(i pi t / N) (N,)."""
+    """Return half of the lines z (K,) (the rest are conjugates), and exp(i pi t / N) (N,)."""
     # With odd N the line at the Nyquist frequency is its own conjugate.
     k = np.arange((N + 1) // 2)
     return np.exp(1j * np.pi * (2 * k + 1) / N), np.exp(1j * np.pi * np.arange(N) / N)
@@ -154,14 +154,14 @@ def _groups(layout: Layout, data: Data, weights: ResponseWeights) -> list[list[i
 
 
 class _Measured(NamedTuple):
-    """The windows of a flight."""
+    """Windows of a flight."""
 
     y: Float[Array, "p N"]
-    """zero where nothing is measured"""
+    """Measured outputs; zero without measurement."""
     Z: Array | np.ndarray
-    """(W, k, m), see `Windowed`"""
+    """Instruments in windows (W, k, m), see `Windowed`."""
     seen: Array | np.ndarray
-    """(W, p)"""
+    """Measured outputs of each window (W, p)."""
 
 
 def _measured(data: Data, w: Windowed, members: list[int]) -> _Measured:
@@ -184,11 +184,13 @@ def _by_flight(
     ends: Float[Array, "f n"] | None,
     body: Callable[[Array, Array, _Measured], Any],
 ) -> Any:
-    """Return `body(E, effects, measured)` of each flight of a group, with a leading axis: E (p, W,
-    k) are the errors of the outputs in windows, effects (p, n, W, k) those of the record's ends.
+    """Return `body(E, effects, measured)` of each flight of a group, with a leading axis.
+
+    E (p, W, k) are the errors of the outputs in windows, effects (p, n, W, k) those of the record's
+    ends.
 
     Args:
-        ends: factors of the effects, of each flight; zero unless given.
+        ends: factors of the effects, by flight; default zero.
     """
     w = weights.windows
     N = next(iter(data.flights[group[0]].outputs.values())).shape[0]
@@ -207,7 +209,7 @@ def _by_flight(
         left = measured.y - bounded_outputs(m, driving, R, ends)
         return body(windows(left), effects, measured)
 
-    # One flight at a time: derivatives of its windows fill the caches.
+    # Flights are processed one at a time, because the derivatives of one fill the caches.
     return jax.lax.map(of_one, (driving, _measured(data, w, group), ends))
 
 
@@ -248,13 +250,13 @@ def rows_of_responses(
 
     made = sums(at, [None] * len(groups), with_effects)
     rows = _whitened(weights, _summed(S for S, _ in made))[:, 0]
-    # Effects of the ends as columns: the states of each flight in turn.
+    # Each state of each flight gives one column of end effects.
     columns = [jnp.moveaxis(e, 0, 3).reshape(*e.shape[1:4], -1) for _, e in made]
     basis = _whitened(weights, jnp.concatenate(columns, axis=3))
     S = orthonormal(basis.T @ basis)
     Q = basis @ S
     along = Q.T @ rows
-    # By group the factors of the effects, by least squares.
+    # Least squares gives the factors of the effects by group.
     each = jnp.split(S @ along, np.cumsum([c.shape[3] for c in columns])[:-1])
     ends = [v.reshape(len(e), -1) for v, (_, e) in zip(each, made, strict=True)]
 
@@ -263,8 +265,8 @@ def rows_of_responses(
             weights, _summed(sums(v, ends, lambda E, _, own: _cross(own, E[:, None])))
         )[:, 0]
 
-    # Variable projection (Kaufman): derivatives with these factors fixed. Only by the unknowns that
-    # all flights share: nuisances have no effect here.
+    # Variable projection (Kaufman): derivatives keep these factors fixed. Only unknowns shared by
+    # all flights count, because nuisances have no effect here.
     J = jax.jacfwd(errors)(at)
     rows, J = jax.lax.stop_gradient((rows - Q @ along, J - Q @ (Q.T @ J)))
     return rows + J @ (v - at)
@@ -274,10 +276,10 @@ def rows_of_responses(
 def errors_in_windows(
     layout: Layout, data: Data, weights: ResponseWeights, z: Array
 ) -> Complex[Array, "W k p"]:
-    """Return the transforms of measured less modelled outputs; zero where an output is not
-    seen."""
+    """Return the transforms of measured less modelled outputs; zero for unmeasured outputs."""
     u, of_flight = unpack(layout, data, z), dict[int, Array]()
-    # The ends are fitted to all windows, each output by its noise, and not to the responses alone.
+    # The ends are fitted to all windows, each output weighted by its noise, not only to the
+    # responses.
     power = jnp.real(jnp.einsum("kii->ki", weights.density))
 
     def left(E: Array, effects: Array, own: _Measured) -> Array:
@@ -306,7 +308,7 @@ class FrequencyResponse(Objective):
     fits_responses = True
 
     def tags(self, layout: Layout, data: Data, count: int) -> RowTags:
-        """Return empty tags: rows are responses of all flights together."""
+        """Return empty tags, because rows are responses of all flights together."""
         return untagged(count)
 
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
@@ -314,7 +316,7 @@ class FrequencyResponse(Objective):
         return Residuals(rows_of_responses(layout, data, noise.whitening, u), None)
 
     def refusal(self, problem: Problem) -> str | None:
-        """Return a reason for nonlinear models, and for flights with too few windows."""
+        """Return the reason for nonlinear models, and for flights with too few windows."""
         if not problem.model.linear:
             return (
                 f"model {problem.model.name} is not linear; expected frequency-error, which "
@@ -336,7 +338,7 @@ class FrequencyResponse(Objective):
     def relax(
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
     ) -> tuple[Float[Array, " q"], Noise]:
-        """Estimate the spectrum of the part of the errors that no response explains."""
+        """Estimate the spectrum of the errors' part that no response explains."""
         z = in_time(layout, data, noise, z)
         weights = back(noise.whitening)
         errors = np.asarray(errors_in_windows(layout, data, noise.whitening, z))
@@ -351,7 +353,7 @@ class FrequencyResponse(Objective):
         output over input.
 
         Args:
-            noise: that `e` was evaluated with.
+            noise: the noise that `e` was evaluated with.
         """
         weights: ResponseWeights = noise.whitening
         squares = float(np.sum(np.square(np.asarray(e.r)[: 2 * weights.used.size])))
@@ -359,19 +361,18 @@ class FrequencyResponse(Objective):
         return 2.0 * weights.log_determinant - 0.5 * squares - constant
 
     def numbers(self, layout: Layout, data: Data, noise: Noise) -> int:
-        """Return the number of values that the noise's spectrum is estimated from."""
-        # They do not determine the nuisances.
+        """Return the number of values from which the noise's spectrum is estimated."""
+        # The responses do not determine the nuisances, so only the other unknowns are added.
         return int(noise.whitening.numbers_of_noise) + layout.determined
 
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
-        """Return the simulated flights: disturbances are in the noise."""
+        """Return the simulated flights; the noise includes the disturbances."""
         return OUTPUT_ERROR.records(reached, u, runs, seed)
 
     def errors_in_windows(
         self, layout: Layout, data: Data, noise: Noise, z: Array
     ) -> Complex[Array, "W k p"]:
-        """Return the transforms of measured less modelled outputs; zero where an output is not
-        seen."""
+        """Return the transforms of measured less modelled outputs; zero for unmeasured outputs."""
         return errors_in_windows(layout, data, noise.whitening, z)
 
     def response_agreement(
@@ -405,8 +406,10 @@ class FrequencyResponse(Objective):
 
 
 def _sd(layout: Layout, data: Data, weights: ResponseWeights, z: Array) -> tuple[dict, ...]:
-    """Return by flight and output the sd of the residual in time, or of the noise in the band where
-    the simulation diverges."""
+    """Return, by flight and output, the sd of the residual in time.
+
+    If the simulation diverges, it is the sd of the noise in the band.
+    """
     runs = by_output(layout, jax.device_get(simulated_at(layout, data, z)))
     w, sd = weights.windows, [dict[str, Any]() for _ in data.flights]
     in_band = np.mean(np.real(np.einsum("kpp->kp", weights.density)), axis=0)
@@ -414,7 +417,7 @@ def _sd(layout: Layout, data: Data, weights: ResponseWeights, z: Array) -> tuple
     for i, name in signals(layout):
         y = np.asarray(data.flights[i].outputs[name])
         left = (y - runs[i][name])[np.isfinite(y)]
-        # A simulation that diverges overflows in its square.
+        # The square of a diverged simulation overflows.
         with np.errstate(all="ignore"):
             size = float(np.sqrt(np.mean(left**2)))
         if name in w.outputs and not size < np.nanstd(y):

@@ -1,11 +1,11 @@
 """Kalman filters: one-step predictions of the measurements, and their errors.
 
-Linear models get the exact discrete filter. Others get the extended one: the model is linearised
-anew in every step and the linearised one is followed exactly (Ozaki's local linearisation), so
-that on a linear model both are the same; models without fast modes go by explicit steps
-(`_moments_after`). The process noise is the exact discrete one, the measurement noise white and
-independent between outputs; outputs of one sample are taken one after another, so no matrix
-is inverted. A measurement that is NaN is skipped.
+Linear models get the exact discrete filter, others the extended one. It linearises the model in
+every step and integrates the linear model exactly (Ozaki's local linearisation), so both filters
+agree on a linear model. Models without fast modes use explicit steps (`_moments_after`). The
+process noise is the exact discrete one. The measurement noise is white and independent between
+outputs, which are processed one after another without inverting a matrix. NaN measurements are
+skipped.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -27,24 +27,24 @@ from heli_jax.simulation.hold import Segment, between_samples, delayed, delays_o
 from heli_jax.simulation.options import DEFAULT, SimulationOptions
 from heli_jax.simulation.stepping import held_columns
 
-# Params and Inputs are a model's own classes: they are annotated Any.
+# Params and Inputs are Any, because they are a model's own classes.
 
 type Estimate = tuple[Float[Array, " n"], Float[Array, "n n"]]
-"""a state and its covariance"""
+"""A state and its covariance."""
 
 
 class Drive(NamedTuple):
-    """A model, its inputs along one record, and the outputs that are measured."""
+    """A model, its inputs along one record, and the measured outputs."""
 
     model: Model
     params: Any
     inputs: Any
-    """the model's Inputs, arrays (N,)"""
+    """The model's Inputs, arrays (N,)."""
     options: SimulationOptions
     linear: tuple[bool, ...]
-    """by input True if it moves between samples; () if none does"""
+    """For each input True if it changes between samples; () if none does."""
     rows: Array
-    """(p,) numbers of the measured outputs among the model's"""
+    """Indices of the measured outputs among the model's outputs (p,)."""
 
 
 class Filter(NamedTuple):
@@ -52,17 +52,17 @@ class Filter(NamedTuple):
 
     samples: Any
     measure: Callable[[Array, Any], tuple[Array, Array]]
-    """(state, sample) -> C (p, n), and the predicted outputs less C x (p,)"""
+    """(state, sample) -> C (p, n), and the predicted outputs less C x (p,)."""
     move: Callable[[Array, Array, Any], Estimate]
-    """(state, its covariance, sample) -> both at the next sample"""
+    """(state, its covariance, sample) -> both at the next sample."""
 
 
 # Mean and covariance of a state between samples by explicit steps, for models without fast modes.
 #
-# A local linearisation takes a matrix exponential in every step and is stable for any mode, but
-# keeps the equations of the step's begin: an error of second order where inputs move. The classical
-# Runge-Kutta method integrates the same moments to fourth order at a twentieth of the cost; with a
-# mode that is fast against the step it diverges.
+# Local linearisation takes a matrix exponential in every step. It is stable for any mode, but keeps
+# the equations of the step's start: a second-order error if inputs change. The classical
+# Runge-Kutta method integrates the same moments to fourth order at a twentieth of the cost. It
+# diverges if a mode is fast relative to the step.
 
 
 def _moments_after(
@@ -74,12 +74,12 @@ def _moments_after(
     """Return the moments after one step: x' = f(x, u), P' = A P + P A' + diag(g^2), A = df/dx at x.
 
     Args:
-        rates: f, of a state (n,) and Inputs, per second.
+        rates: f, a function of a state (n,) and Inputs, per second.
         intensity: g, of the process noise, see `Model.noise_intensity`.
-        part: the step, with the inputs at its begin and their slopes (None: they stay).
+        part: the step, with the inputs at its start and their slopes (None: constant inputs).
 
-    Source: Jategaonkar (2006), chapter 5, of the extended filter's prediction; Runge and Kutta's
-    method of order 4.
+    Source: Jategaonkar (2006), chapter 5, for the extended filter's prediction; Runge-Kutta method
+    of order 4.
     """
     spread, h = jnp.diag(jnp.square(intensity)), part.length
 
@@ -88,7 +88,7 @@ def _moments_after(
         if part.slope is not None:
             u = jax.tree.map(lambda v, slope: v + slope * (share * h), u, part.slope)
         f, along = jax.linearize(lambda x: rates(x, u), x)
-        # A P column by column: A itself, mostly zeros, is not needed.
+        # A P is computed column by column, because A itself is mostly zeros and not needed.
         AP = jax.vmap(along, in_axes=1, out_axes=1)(P)
         return f, AP + AP.T + spread
 
@@ -105,20 +105,20 @@ def _moments_after(
     return moved(mean, 1.0)
 
 
-# The extended filter: a model linearised anew at every estimate (Ozaki's local linearisation).
+# The extended filter: the model is linearised at every estimate (Ozaki's local linearisation).
 
 
 def _local(drive: Drive) -> Filter:
-    """Return the extended filter: the model linearised at every estimate (Ozaki, 1985)."""
+    """Return the extended filter: the model is linearised at every estimate (Ozaki, 1985)."""
     model, params, inputs, options, linear, measured = drive
     k = jnp.arange(jax.tree.leaves(inputs)[0].shape[0])
     dtype = jax.tree.leaves(inputs)[0].dtype
     dt = jnp.asarray(options.dt, dtype)
     delays = delays_of(model, params, options.delay, dt)
-    # Outputs are measured with the inputs that act at the samples themselves.
+    # Outputs depend on the inputs that act at the samples.
     acting = inputs if delays is None else delayed(inputs, delays, k, linear)
-    # A delayed sample takes effect within an interval, before which the previous one acts. The
-    # lengths of the parts are the same in all intervals, so they are no part of a sample.
+    # A delayed sample takes effect within an interval; the previous one acts before. The lengths of
+    # the parts are equal in all intervals, so they are not part of a sample.
     lengths, held, slopes = zip(*segments(inputs, dt, delays, k, linear), strict=True)
 
     def rates(x: Array, u: Any) -> Array:
@@ -166,17 +166,19 @@ def _linearised_after(
     moments: Estimate,
     part: Segment,
 ) -> Estimate:
-    """Return the moments after one step of the model linearised at its begin; arguments as of
-    `_moments_after`."""
+    """Return the moments after one step of the model linearised at its start.
+
+    The arguments are those of `_moments_after`.
+    """
     x, P = moments
     n, A, f = x.shape[0], jax.jacfwd(rates)(x, part.inputs), rates(x, part.inputs)
     if part.slope is not None:
-        # Time is one more state, of rate 1 and without variance: its column of derivatives makes
-        # the step of a linear model exact.
+        # Time is an additional state of rate 1 without variance. Its derivatives make the step of a
+        # linear model exact.
         _, by_time = jax.jvp(lambda u: rates(x, u), (part.inputs,), (part.slope,))
         A = jnp.pad(A, (0, 1)).at[:n, n].set(by_time)
         f, intensity = jnp.pad(f, (0, 1), constant_values=1.0), jnp.pad(intensity, (0, 1))
-    # With A and f at x itself: shift is the whole step of the linearised equation from there.
+    # A and f are evaluated at x, so the shift is the full step of the linearised equation.
     step = van_loan(A, f, intensity, part.length)
     Phi = step.Phi[:n, :n]
     return x + step.shift[:n], product(product(Phi, P), Phi.T) + step.Q[:n, :n]
@@ -185,16 +187,19 @@ def _linearised_after(
 _ONLY_SIMULATE = (
     "solver", "controller", "adjoint", "max_steps", "key", "block", "feedback", "events",
 )  # fmt: skip
-"""options of a simulation that a filter does not have"""
+"""Options of a simulation that a filter lacks."""
 
 
 class Innovations(NamedTuple):
-    """One-step predictions against measurements, by output; arrays (N,), NaN where none is."""
+    """One-step predictions against measurements, by output.
+
+    Arrays are (N,), NaN without measurement.
+    """
 
     error: dict[str, Float[Array, " N"] | np.ndarray]
-    """measured - predicted from all samples before, SI"""
+    """Measured less predicted from all earlier samples, SI."""
     variance: dict[str, Float[Array, " N"] | np.ndarray]
-    """of that error, by the filter"""
+    """Variance of the error according to the filter."""
 
 
 def innovations(
@@ -209,15 +214,15 @@ def innovations(
     """Run the (extended) Kalman filter of a model over one record.
 
     Args:
-        model: of n states; those that `model.initial_sd` names are uncertain at the first sample by
-            that standard deviation (and `model.correlation`), the others not at all.
+        model: model of n states; those in `model.initial_sd` are uncertain at the first sample by
+            that standard deviation (and `model.correlation`), the others are exact.
         params: the model's Params, SI.
         inputs: the model's Inputs, arrays (N,).
-        measured: outputs (N,), SI; NaN where there is none.
+        measured: outputs (N,), SI; NaN without measurement.
         sd: standard deviation of the white measurement noise, by output, SI.
-        options: of which dt [s], initial_state, delay [s], hold and substeps (linearisations a
-            sample, for models that are not linear) count.
-        **keywords: these fields, in place of those of `options`.
+        options: dt [s], initial_state, delay [s], hold and substeps are used; substeps are
+            linearisations of each sample in nonlinear models.
+        **keywords: fields that replace those of `options`.
 
     Raises:
         TypeError: dt is missing, or an option that only `simulate` has.
@@ -232,7 +237,7 @@ def innovations(
         y, now = sample
         estimate, innovation = corrected(filter_, carry, R, y, now)
         x, P = filter_.move(*estimate, now)
-        # Phi P Phi' is symmetric but for rounding, which the corrections would keep.
+        # Phi P Phi' is symmetric except for rounding, which the corrections would keep.
         return (x, 0.5 * (P + P.T)), innovation
 
     return by_name(measured, *jax.lax.scan(step, (x, P), (y, filter_.samples))[1])
@@ -246,8 +251,10 @@ def begun(
     sd: Mapping[str, Scalar],
     options: SimulationOptions,
 ) -> tuple[Drive, Estimate, Float[Array, "N p"], Float[Array, " p"]]:
-    """Return the drive of a filter, its first estimate, the measurements and the variances of their
-    noise; arguments as of `innovations`."""
+    """Return the drive of a filter, its first estimate, the measurements and their noise variances.
+
+    The arguments are those of `innovations`.
+    """
     if options.dt is None:
         raise TypeError("innovations: expected dt, the sample time in seconds, got None")
     for name in _ONLY_SIMULATE:
@@ -258,7 +265,7 @@ def begun(
     x0 = model.initial_state(params) if begin is None else begin
     dtype = jax.tree.leaves(inputs)[0].dtype
     estimate = naming.ravel(x0, dtype), first_covariance(model, params, dtype)
-    # Only measured outputs: each costs a correction a sample.
+    # Unmeasured outputs are dropped, because each output costs a correction per sample.
     rows = jnp.asarray([naming.names(model.Outputs).index(n) for n in measured])
     y = jnp.stack(list(measured.values()), axis=1)
     R = jnp.stack([jnp.asarray(sd[n], dtype) ** 2 for n in measured])
@@ -292,19 +299,21 @@ def filter_of(drive: Drive) -> Filter:
     Q = process_noise(model, params, options.dt)
 
     def move(x: Array, P: Array, now: tuple[Array, Array]) -> Estimate:
-        # A sum of products: the derivative of the matrix product Ad @ x costs ten times as much.
+        # A sum of products replaces Ad @ x, whose derivative costs ten times as much.
         x = jnp.sum(Ad * x[None, :], axis=1) + now[0]
         return x, product(product(Ad, P), Ad.T) + Q
 
-    # The inputs' part of all samples is one matrix product. C is constant.
+    # One matrix product gives the effect of the inputs at all samples. C is constant.
     return Filter((U @ B.T, acting @ D.T), lambda x, now: (C, now[1]), move)
 
 
 def corrected(
     filter_: Filter, estimate: Estimate, R: Array, y: Array, now: Any
 ) -> tuple[Estimate, tuple[Array, Array]]:
-    """Return an estimate after one sample's outputs (p,), taken one after another; errors and
-    variances (p,) of their innovations."""
+    """Return the estimate after one sample's outputs (p,), and their innovations.
+
+    The outputs are processed one after another. Errors and variances of the innovations are (p,).
+    """
 
     def correct(carry: Estimate, measured: tuple[Array, ...]) -> tuple[Any, Any]:
         (x, P), (c, rest, r, y) = carry, measured

@@ -1,11 +1,10 @@
 """Levenberg-Marquardt: the least squares of the residual vector, from one start.
 
-A step d minimises |r + J d|^2 + mu |D d|^2, with the sizes of J's columns in D (Marquardt, 1963).
-The damping mu falls after a step that did as predicted and grows after one that is refused. A
-refused step also sets a radius (More, 1978), which limits the next changes of the residuals.
+A step d minimises |r + J d|^2 + mu |D d|^2, with the norms of J's columns in D (Marquardt, 1963).
+The damping mu decreases after a step that did as predicted and increases after a rejected one. A
+rejected step also sets a radius (More, 1978), which limits the next changes of the residuals.
 
-A step takes of r and J only the triangle of the QR decomposition of [r J]: as many rows as
-unknowns, and one.
+A step uses only the triangle of the QR decomposition of [r J], with one row more than unknowns.
 """
 
 from typing import Any, NamedTuple
@@ -22,35 +21,38 @@ from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise
 
 CONVERGED = 1e-4
-"""squared distance from the optimum in joint standard deviations: a hundredth of one shows in no
-interval, and steps that shrink by a fifth each take ten more to come to a thousandth"""
+"""Squared distance from the optimum in joint standard deviations. A hundredth of one is invisible
+in intervals, and steps that shrink by a fifth need ten more for a thousandth."""
 _SHORT = 1e-3
-"""change of the residuals by a step, for each unknown, below which no further step is tried"""
+"""Change of the residuals by a step, for each unknown, below which the search ends."""
 _RELATIVE = 1e-9
-"""the same in proportion to the way from the start"""
+"""The same limit relative to the distance from the start."""
 _STUCK = 0.1
-"""part of the sum of squares which a short step may leave to be gained: more is no optimum"""
+"""Fraction of the sum of squares that a short step may leave as predicted gain; more is no
+optimum."""
 _ROUNDING = 1e-12
-"""part of the sum of squares below which a change is rounding, and part of the largest column below
-which the column of a logarithm is"""
+"""Fraction of the sum of squares below which a change is rounding, and of the largest column below
+which a logarithm's column is rounding."""
 _RANK = 1e-10
-"""part of a column of size 1 that the other columns leave, below which it depends on them"""
+"""Remainder of a unit column, after projection on the others, below which it depends on them."""
 
 _DAMPING, _LEAST_DAMPING = 1.1e-5, 1.1e-12
-"""mu of the first step, and the least: along a direction without effect rounding over less would be
-a step of any length"""
+"""mu of the first step, and its least value: below it, rounding in a direction without effect would
+cause steps of any length."""
 _ACCEPTED, _AS_PREDICTED = 0.1, 0.75
-"""parts of the predicted gain from which on a step is accepted, and is said to do as predicted"""
+"""Fractions of the predicted gain above which a step is accepted, and above which it did as
+predicted."""
 _LESS, _MORE = 0.01, 10.0
-"""factors of mu after a step that did as predicted, and after one that was refused"""
+"""Factors of mu after a step that did as predicted, and after a rejected one."""
 _GROWTH = 3.0
-"""times the change of the residuals by a step that did as predicted may the next one make"""
+"""Largest ratio of the residuals' change in the next step to that of a step that did as
+predicted."""
 
 _NUISANCE_STEPS = 60
-"""at most, to initial states and biases"""
+"""Most steps for initial states and biases."""
 _TIE_SD = 100.0
-"""sd, in logarithms or logits of the free parameters, of their tie to the start: a factor of e^100
-is no prior, but it gives an end to a parameter that runs to its bound or to zero"""
+"""sd that ties free parameters to the start, in logarithms or logits. A factor of e^100 is no
+prior, but stops a parameter that runs to its bound or to zero."""
 
 
 class Optimum(NamedTuple):
@@ -58,16 +60,16 @@ class Optimum(NamedTuple):
 
     z: Float[Array, " q"]
     cost: float
-    """sum of squares of all rows, priors included, over the number of measured numbers"""
+    """Sum of squares of all rows, priors included, over the number of measured values."""
     steps: int
-    """evaluations of the residuals"""
+    """Evaluations of the residuals."""
     converged: bool
     moved: float = np.inf
-    """squared distance from the start in joint standard deviations"""
+    """Squared distance from the start in joint standard deviations."""
 
 
 class Point(NamedTuple):
-    """Unknowns, and the residuals r + J d about them: the rows of the triangle, then the ties."""
+    """Unknowns, and the residuals r + J d around them: the rows of the triangle, then the ties."""
 
     z: Float[np.ndarray, " q"]
     r: Float[np.ndarray, " k"]
@@ -83,11 +85,11 @@ class Region(NamedTuple):
 
     damping: float
     radius: float
-    """of the change of the residuals; inf until a step is refused"""
+    """Limit on the change of the residuals; inf until a step is rejected."""
 
 
 def without_size(layout: Layout) -> np.ndarray:
-    """Return (q,) True for the unknowns that are no logarithms and so have no size of their own."""
+    """Return (q,) True for the unknowns that are no logarithms and so have no natural size."""
     linear = [kind == "linear" for kind in layout.kinds] + [True] * len(layout.gains)
     return np.array(linear + [False] * (layout.size - len(linear)), bool)
 
@@ -106,9 +108,9 @@ def optimise(
     """Return the least-squares optimum from z0.
 
     Args:
-        held: (q,) True for an unknown that stays at its start; none unless given.
-        damping: of the first step.
-        known: residuals and Jacobian at z0, where they are at hand.
+        held: (q,) True for an unknown fixed at its start; default none.
+        damping: mu of the first step.
+        known: residuals and Jacobian at z0, if already computed.
     """
     start, logarithms = np.asarray(z0, np.float64), ~without_size(layout)
     moving = np.ones(layout.size, bool) if held is None else ~held
@@ -118,22 +120,22 @@ def optimise(
 
     def linearise(z: np.ndarray, rows: Any = None) -> Point:
         r, J = rows or residual_and_jacobian(layout, data, noise, jnp.asarray(z))[:2]
-        # A derivative that overflowed shows no direction.
+        # An overflowed derivative gives no direction.
         J = np.where(moving & np.isfinite(J).all(axis=0), J, 0.0)
         R = np.linalg.qr(np.column_stack([r, J]), mode="r")
         return Point(z, np.append(R[:, 0], ties @ (z - start)), np.vstack([R[:, 1:], ties]))
 
-    with np.errstate(all="ignore"):  # simulations overflow on the way
+    with np.errstate(all="ignore"):  # simulations may overflow on the way
         at, region = linearise(start, known), Region(damping, np.inf)
         sizes, count = np.zeros(layout.size), measured_count(data)
         short, steps = not np.isfinite(at.squares), 1
         while True:
-            # An unknown that has no effect stays put until it has one: the time constant behind a
-            # gain that begins at zero.
+            # An unknown without effect stays until it has one, like a time constant behind a gain
+            # of zero.
             columns = np.linalg.norm(at.J, axis=0)
             least = np.where(logarithms, _ROUNDING * columns.max(initial=0.0), 0.0)
             sizes = np.where((sizes == 0) & (columns > least), columns, sizes)
-            # An unknown at a bound stays while the misfit falls beyond it.
+            # An unknown at a bound stays if the misfit decreases beyond it.
             slope = at.J.T @ at.r
             outwards = ((at.z <= low) & (slope > 0)) | ((at.z >= high) & (slope < 0))
             units = np.where(outwards, 0.0, sizes)
@@ -156,9 +158,9 @@ def optimise(
 
 
 def _bounds(layout: Layout, data: Data) -> tuple[np.ndarray, np.ndarray]:
-    """Return (q,) the lowest and the highest coordinates; infinite where there is no bound."""
+    """Return the lowest and highest coordinates (q,); infinite without a bound."""
     bounds = np.tile([-np.inf, np.inf], (layout.size, 1))
-    # Fetched once: entry by entry each would be a program of its own.
+    # All entries are fetched at once, because each would be a separate program.
     limits = zip(layout.kinds, *map(np.asarray, (data.sign, data.low, data.high)), strict=True)
     for i, of_one in enumerate(limits):
         bounds[i] = transforms.coordinate_limits(*of_one)
@@ -168,12 +170,14 @@ def _bounds(layout: Layout, data: Data) -> tuple[np.ndarray, np.ndarray]:
 def fit_nuisances(
     layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
 ) -> Float[Array, " q"]:
-    """Return z with the initial states, biases and offsets of the least squares, all else as it
-    is; z itself where the simulation is not finite."""
+    """Return z with initial states, biases and offsets by least squares, all else unchanged.
+
+    Return z itself if the simulation is not finite.
+    """
     held = np.arange(layout.size) < layout.first_nuisance
     if held.all():
         return z
-    # A nonlinear simulation may leave the record's motion by a long first step.
+    # In a nonlinear model a long first step may leave the record's range of motion.
     first = (_DAMPING,) if layout.model.linear else (_DAMPING, 0.01, 1.0)
     runs = [optimise(layout, data, noise, z, _NUISANCE_STEPS, held=held, damping=d) for d in first]
     return min(runs, key=lambda run: run.cost).z
@@ -185,10 +189,10 @@ def gain_ahead(
     """Return the decrease of the sum of squares that a full Gauss-Newton step predicts.
 
     This gain, g' F^-1 g, is the squared distance from the optimum in joint standard deviations. It
-    needs no unit of the unknowns, and a direction that the data leave all but open is not polished.
+    is independent of units, and ignores directions that the data hardly determine.
 
     Args:
-        sizes: of J's columns; 0 for an unknown that stays put.
+        sizes: norms of J's columns; 0 for a fixed unknown.
     """
     moves = sizes > 0
     J = J[:, moves] / sizes[moves]
@@ -196,7 +200,7 @@ def gain_ahead(
         return np.inf
     if not moves.any():
         return 0.0
-    # Any: the stubs know no economic factors.
+    # Any: the type stubs lack economic factors.
     factors: Any = scipy.linalg.qr(J, mode="economic", pivoting=True)
     Q, R, _ = factors
     sizes = np.abs(np.diag(R))
@@ -207,7 +211,7 @@ def _step(at: Point, sizes: np.ndarray, region: Region) -> np.ndarray:
     """Return the damped step, within the radius."""
     units = np.where(sizes > 0, 1.0 / np.where(sizes > 0, sizes, 1.0), 0.0)
     damped = np.vstack([at.J * units, np.sqrt(region.damping) * np.eye(units.size)])
-    # Not by J'J, which would square the condition number.
+    # J'J would square the condition number.
     Q, R = np.linalg.qr(damped)
     step = -units * scipy.linalg.solve_triangular(R, Q[: at.r.size].T @ at.r)
     change = float(np.linalg.norm(at.J @ step))
@@ -219,13 +223,14 @@ def judge_step(at: Point, trial: Point, region: Region) -> tuple[bool, Region]:
     along = at.J @ (trial.z - at.z)
     predicted = 0.5 * float(np.sum(np.square(at.r + along)) - at.squares)
     change, rest = 0.5 * (trial.squares - at.squares), 0.5 * _ROUNDING * at.squares
-    # A step whose gain is rounding, which is the last, would be refused at random.
+    # The gain of the last step is rounding, so it would be rejected at random.
     if change <= _ACCEPTED * predicted < 0.0 or (predicted > -rest and change < rest):
         if not change < _AS_PREDICTED * predicted:
             return True, region
         damping = max(_LESS * region.damping, _LEAST_DAMPING)
         return True, Region(damping, max(region.radius, _GROWTH * float(np.linalg.norm(along))))
-    # To where the parabola by slope and cost is lowest, within a tenth and a half.
+    # The radius goes to the minimum of the parabola through slope and cost, within a tenth and a
+    # half.
     slope = float(at.r @ along)
     part = -slope / (2.0 * (change - slope))
     part = float(np.clip(part, 0.1, 0.5)) if np.isfinite(part) else 0.1
@@ -233,9 +238,10 @@ def judge_step(at: Point, trial: Point, region: Region) -> tuple[bool, Region]:
 
 
 def _is_short(at: Point, trial: Point, sizes: np.ndarray, start: np.ndarray) -> bool:
-    """Return True if a step moved nothing that shows.
+    """True if the step had no visible effect.
 
-    An unknown that runs off, as the size of a disturbance that is none, has a gain ahead for ever.
+    An unknown that runs off, like the size of an absent disturbance, always predicts a further
+    gain.
     """
     steps = sizes * np.abs(trial.z - at.z)
     before, after = at.squares**0.5, trial.squares**0.5

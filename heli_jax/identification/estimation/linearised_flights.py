@@ -1,8 +1,8 @@
 """Linearisation of nonlinear models at the operating point of a flight, for fits in frequency.
 
-The operating point of a full helicopter is the trim at the flight's mean speed; that of other
-models is the equilibrium at the mean inputs, or the initial state where there is none. The point
-moves with the parameters: its derivative is that of an implicit function.
+The operating point of a full helicopter is the trim at the flight's mean speed. For other models it
+is the equilibrium at the mean inputs, or the initial state if there is none. The point depends on
+the parameters, with the derivative of an implicit function.
 """
 
 from typing import Any
@@ -22,10 +22,10 @@ from heli_jax.identification.estimation.simulated_flights import Drive
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Layout
 
-# Params, State and Inputs are a model's own classes: they are annotated Any.
+# Params, State and Inputs are Any, because they are a model's own classes.
 
 _STEADY = 1e-6
-"""of the rates at the initial state, below which those of an equilibrium are zero"""
+"""Largest rates of an equilibrium, relative to those at the initial state."""
 
 
 def condition_of(model: Model, flight: Flight) -> Condition | None:
@@ -33,12 +33,12 @@ def condition_of(model: Model, flight: Flight) -> Condition | None:
     if model.linear or not is_full_nonlinear(model):
         return None
     condition = mean_condition(flight.outputs, flight.dt)
-    # Positions and velocities along the ground's axes mix with the heading in hover too.
+    # The heading matters in hover too, because it mixes positions and velocities in ground axes.
     return condition._replace(heading=mean_heading(flight.outputs))
 
 
 def cannot_linearise(problem: Problem) -> str | None:
-    """Return why a flight has no trim to linearise the model at; None where each has one."""
+    """Return the reason why a flight has no trim to linearise the model at, or None."""
     for flight in problem.training:
         condition = condition_of(problem.model, flight)
         if condition is None:
@@ -54,7 +54,7 @@ def linear_drive(layout: Layout, drive: Drive, condition: Condition | None) -> t
     """Return a linear model of a flight, and its inputs and parameters.
 
     Args:
-        condition: of `condition_of`.
+        condition: result of `condition_of`.
     """
     model = layout.model
     if model.linear:
@@ -69,8 +69,7 @@ def linear_drive(layout: Layout, drive: Drive, condition: Condition | None) -> t
 
 
 def _equilibrium_at(model: Model, params: Any, inputs: Any) -> Any:
-    """Return the State at which constant inputs leave the model; the initial state where there is
-    none."""
+    """Return the equilibrium State for constant inputs, or the initial state if there is none."""
     start = naming.ravel(model.initial_state(params), jnp.result_type(float))
 
     def rates(x: Array, arguments: Any) -> Array:
@@ -78,7 +77,7 @@ def _equilibrium_at(model: Model, params: Any, inputs: Any) -> Any:
         return naming.ravel(model.vector_field(p, naming.unravel(model.State, x), u), x.dtype)
 
     still = jax.lax.stop_gradient((params, inputs))
-    # Damped: what has no place of its own, as a heading, stays where the model begins.
+    # The search is damped, so that states without an equilibrium, like a heading, keep their start.
     solution = optx.root_find(
         rates,
         optx.LevenbergMarquardt(1e-12, 1e-12),
@@ -91,6 +90,6 @@ def _equilibrium_at(model: Model, params: Any, inputs: Any) -> Any:
     size = 1.0 + jnp.max(jnp.abs(rates(start, still)))
     rest = jnp.max(jnp.abs(rates(x, still))) <= _STEADY * size
     inverse = jax.lax.stop_gradient(jnp.linalg.pinv(jax.jacfwd(rates)(x, still)))
-    # One more step of Newton's, which has the derivative of the root by the parameters.
+    # One more Newton step has the derivative of the root by the parameters.
     x = x - inverse @ rates(x, (params, inputs))
     return naming.unravel(model.State, jnp.where(rest, x, start))

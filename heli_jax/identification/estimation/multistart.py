@@ -28,28 +28,28 @@ class StartRow(NamedTuple):
     steps: int
     converged: bool
     optimum: int
-    """1 for the best optimum of that reason, 2 for the next, ...; 0 where it did not converge"""
+    """1 for the best optimum of that reason, 2 for the next, ...; 0 if not converged."""
     reason: str = "start"
-    """'start', 'starts' of several, or the name of a restart"""
+    """'start', 'starts' of several, or the name of a restart."""
     chosen: bool = False
-    """True if the fit is the end of this run"""
+    """True for the run that the fit uses."""
 
 
 class Run(NamedTuple):
     """One run of the optimiser."""
 
     reason: str
-    """as in `StartRow`"""
+    """As in `StartRow`."""
     start: Float[Array, " q"]
     optimum: Optimum
 
 
 _GOOD = 10.0
-"""cost below which a run counts as a fit, whatever the size of the outputs"""
+"""Cost below which a run counts as a fit, whatever the size of the outputs."""
 
 
 class Search:
-    """The optimiser over a problem."""
+    """The optimiser for a problem."""
 
     def __init__(self, problem: Problem, layout: Layout, data: Data, max_steps: int) -> None:
         self.problem, self.layout, self.data = problem, layout, data
@@ -67,10 +67,10 @@ class Search:
 
         Args:
             progress: called with a sentence after each of several starts.
-            known: residuals and Jacobian at the first start, where they are at hand.
+            known: residuals and Jacobian at the first start, if already computed.
         """
-        # One after another: on two cores a vmap over the starts, which goes on until the slowest
-        # has converged, took four times as long as this, and had to be compiled besides.
+        # Starts run in sequence: on two cores a vmap, which waits for the slowest, took four times
+        # as long and needed its own compilation.
         runs = []
         for i, z in enumerate(np.asarray(points)):
             run = optimise(
@@ -82,8 +82,8 @@ class Search:
                 held=self._held,
                 known=known if i == 0 else None,
             )
-            # An optimiser can converge where the model explains nothing: its gradient is zero
-            # there. The cost is a mean over the measured numbers, as that of no model is.
+            # An optimiser may converge where the model explains nothing, because its gradient is
+            # zero there. Both costs are means over the measured values.
             if not run.cost <= _GOOD:
                 nothing = self.misfit_of_nothing(noise) / measured_count(self.data)
                 run = run._replace(converged=run.converged and run.cost <= 1.5 * nothing + _GOOD)
@@ -94,10 +94,10 @@ class Search:
 
     @property
     def _held(self) -> np.ndarray | None:
-        """Return (q,) True for the unknowns that stay at their start; None if all move."""
+        """Return (q,) True for the unknowns fixed at their start; None if all are free."""
         layout = self.layout
-        # No row of a spectrum has initial states: their weak priors would lead them to zero, a
-        # rotor that stands still, from where no search in time comes back.
+        # Rows of a spectrum do not depend on initial states. Their weak priors would move them to
+        # zero, a stopped rotor, from which no search in time recovers.
         if layout.model.linear or layout.noise_model != "spectrum":
             return None
         return np.arange(layout.size) >= layout.first_nuisance
@@ -129,15 +129,18 @@ def named_values(
 
 
 def table(layout: Layout, data: Data, runs: list[Run], chosen: Run) -> tuple[StartRow, ...]:
-    """Return a row for each run: the chosen one first, then by reason, best first; equal optima of
-    one reason share a number."""
+    """Return a row for each run: the chosen one first, then by reason, best first.
+
+    Equal optima of one reason share a number.
+    """
     reasons = list(dict.fromkeys(run.reason for run in runs))
     rows, optimum, last = [], 0, None
     for run in sorted(runs, key=lambda run: (reasons.index(run.reason), rank(run.optimum))):
         cost, converged = _cost(run.optimum), run.optimum.converged
         if rows and rows[-1].reason != run.reason:
             optimum, last = 0, None
-        # By their costs: along a direction that the data leave open, equal optima differ in place.
+        # Costs are compared, because equal optima may lie apart in directions that the data leave
+        # open.
         if converged and (last is None or cost > last * (1.0 + 1e-6) + 1e-300):
             optimum, last = optimum + 1, cost
         rows.append(
@@ -156,13 +159,13 @@ def table(layout: Layout, data: Data, runs: list[Run], chosen: Run) -> tuple[Sta
 
 
 def rank(run: Optimum) -> tuple[bool, float]:
-    """Return the sort key of a run: those that converged first, then the lowest cost."""
+    """Return the sort key of a run: converged runs first, then the lowest cost."""
     # False sorts before True.
     return not run.converged, _cost(run)
 
 
 def _cost(run: Optimum) -> float:
-    # NaN would compare as neither better nor worse, and sort at random.
+    # NaN compares as neither better nor worse and would sort at random.
     cost = run.cost
     return cost if np.isfinite(cost) else float("inf")
 
@@ -176,4 +179,4 @@ class FirstGuess(NamedTuple):
     z: Float[Array, " q"]
     e: Evaluation
     begun: Data
-    """data of the first search"""
+    """Data of the first search."""

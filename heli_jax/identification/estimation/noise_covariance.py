@@ -19,11 +19,11 @@ from heli_jax.identification.unknowns.layout import Noise
 from heli_jax.numerics.white_noise import noise_guess
 
 _ROUNDS = 30
-"""of the optimiser at most: in slow gusts a spectrum settles by a fifth a round"""
+"""Most rounds of the optimiser; in slow gusts a spectrum changes by a fifth each round."""
 _UNCHANGED = 1e-3
-"""change in the logarithm of every sd below which the relaxation has ended"""
+"""Change of every log sd below which the relaxation has converged."""
 _SETTLED = 0.01
-"""move of the optimum, in joint standard deviations, below which it has ended too"""
+"""Move of the optimum, in joint standard deviations, below which the relaxation has converged."""
 
 
 class RelaxedOptimum(NamedTuple):
@@ -32,13 +32,13 @@ class RelaxedOptimum(NamedTuple):
     best: Optimum
     noise: Noise
     trace: tuple[tuple[int, float], ...]
-    """(steps, cost) of every round of the optimiser"""
+    """Steps and cost of each round of the optimiser."""
     ratio: float | None = None
-    """twice the log-likelihood that the one disturbance gains; None where it is determined"""
+    """Twice the log-likelihood that a single disturbance gains; None if it is determined."""
     notes: tuple[Finding, ...] = ()
-    """on how the optimum was reached"""
+    """Notes on how the optimum was reached."""
     absent: tuple[str, ...] = ()
-    """of several disturbances the parameters of those that are not significant"""
+    """Parameters of those among several disturbances that are not significant."""
 
     def after(self, earlier: "RelaxedOptimum", *notes: Finding) -> "RelaxedOptimum":
         """Return this optimum with the rounds and notes of an earlier one before its own."""
@@ -48,24 +48,24 @@ class RelaxedOptimum(NamedTuple):
 
 
 def first_noise(problem: Problem, flights: Sequence[Flight]) -> Noise:
-    """Return the first guess of the noise, by flight and output: as stated, else guessed.
+    """Return the first guess of the noise by flight and output: as stated, else guessed.
 
-    Where an output has one noise in all flights, what is not stated is guessed from all of them.
+    If an output has one noise in all flights, they all contribute to the guess.
     """
     noise = first_noise_sizes(problem, flights)
     return objective_of(problem.method).first_noise(problem, noise, flights)
 
 
 def first_noise_sizes(problem: Problem, flights: Sequence[Flight]) -> Noise:
-    """Return the first guess without what the method adds, such as a spectrum."""
+    """Return the first guess without additions of the method, such as a spectrum."""
     dtype = np.dtype(jnp.result_type(float))
     guesses = [{n: noise_guess(y) for n, y in f.outputs.items()} for f in flights]
-    # The median: one flight in which an output hardly moves, or jumps, does not count.
+    # The median ignores single flights in which an output hardly moves, or jumps.
     if problem.noise_model == "disturbance":
         outputs = {n for guess in guesses for n in guess}
         pooled = {n: float(np.median([g[n] for g in guesses if n in g])) for n in outputs}
         guesses = [{n: pooled[n] for n in guess} for guess in guesses]
-    # Sorted, as `data_of` has the outputs: JAX sorts the names in what it compiles.
+    # The order is that of `data_of`, because JAX sorts names in compiled programs.
     sd = tuple(
         {n: np.asarray(flight.sd.get(n) or guess[n], dtype) for n in sorted(flight.outputs)}
         for flight, guess in zip(flights, guesses, strict=True)
@@ -74,7 +74,7 @@ def first_noise_sizes(problem: Problem, flights: Sequence[Flight]) -> Noise:
 
 
 def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> RelaxedOptimum:
-    """Alternate between the optimum and the noise until one of them stays the same.
+    """Alternate between optimum and noise until one of them stays the same.
 
     Source: relaxation of the noise covariance, Jategaonkar (2006), section 4.4.
     """
@@ -84,20 +84,20 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
     for _ in range(_ROUNDS):
         z, new = objective.relax(layout, search.data, noise, best.z)
         change = _changed(noise, new)
-        # Residuals that overflowed show no noise, and where they do is no optimum.
+        # Overflowed residuals show no noise, and such a point is no optimum.
         if not np.isfinite(change):
             best = best._replace(converged=False)
             break
         moves = objective.noise_matters(search.problem, layout, noise, new)
-        # The noise first and the parameters after it: the parameters of one round are the best for
-        # the noise of the round before, and where one stays so does the other.
+        # The parameters of a round are optimal for the previous round's noise. If one stays the
+        # same, so does the other.
         best, noise = best._replace(z=z), new
         # A search that failed with one noise is not repeated with another.
         if change < _UNCHANGED or moved < _SETTLED or not (moves and best.converged):
             break
         begin = np.array(best.z)
-        # Nuisances have no part in the rows of a spectrum: their weak priors alone would be a
-        # misfit. A model that is not linear is linearised where they put it.
+        # Rows of a spectrum do not depend on nuisances, whose weak priors alone would add misfit. A
+        # nonlinear model is linearised at the point that they define.
         if layout.noise_model == "spectrum" and layout.model.linear:
             begin[layout.first_nuisance :] = 0.0
         [best] = search.run(noise, begin[None])

@@ -1,20 +1,19 @@
 r"""Corrections of a filter's likelihood where the model integrates a noisy sensor.
 
-Each is a term slope * (g - g0) in minus twice the log-likelihood, by parameter: the slope is that
-of the last relaxation, and g is the parameter itself or its logarithm.
+Each is a term slope * (g - g0) in minus twice the log-likelihood, by parameter. The slope comes
+from the last relaxation, and g is the parameter itself or its logarithm.
 
-Scale errors. A reading $z = (1 + \lambda) y + b + n$ drives a model by $(z - b)/(1 + \lambda)$, and
-outputs regressed on noisy readings have too small a slope (errors in variables). The noise makes
-the process noise $n/(1 + \lambda)$; with it the sum of $e^2/s$ has its least mean at the true
-$\lambda$, as where the unknown motion is a nuisance of the likelihood (Fuller, 1987, section 2.3).
-The sum of $\log s$, which a larger $\lambda$ makes smaller, is what attenuates: its derivative by
-the scales is taken off.
+Scale errors. A reading $z = (1 + \lambda) y + b + n$ drives a model by $(z - b)/(1 + \lambda)$.
+Outputs regressed on noisy readings have too small a slope (errors in variables). The noise adds
+process noise $n/(1 + \lambda)$. With it the mean of $e^2/s$ is least at the true $\lambda$, as if
+the unknown motion were a nuisance of the likelihood (Fuller, 1987, section 2.3). The attenuation
+comes from the sum of $\log s$, which decreases with $\lambda$. Its derivative by the scales is
+therefore subtracted.
 
-Process noise of the model's own. What drifts by the noise of a gyro looks like a bias, a scale or
-an initial state: the likelihood makes the noise too small by what these took up. The restricted
-likelihood (Patterson and Thompson, 1971; Harville, 1977) adds $\log\det J'J$, with J the
-derivatives of the whitened innovations by the parameters of the mean; its derivative by the noise's
-logarithm is added here.
+Process noise of the model's own. Drift due to gyro noise looks like a bias, a scale or an initial
+state, so the likelihood makes the noise too small. The restricted likelihood (Patterson and
+Thompson, 1971; Harville, 1977) adds $\log\det J'J$, with J the derivatives of the whitened
+innovations by the parameters of the mean. Its derivative by the noise's logarithm is added here.
 """
 
 from typing import Any
@@ -30,11 +29,11 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns
 
 _STEP = 0.05
-"""of a noise's logarithm, for a difference"""
+"""Step of a noise's logarithm for a finite difference."""
 
 
 def first_corrections(problem: Problem) -> dict[str, np.ndarray] | tuple[()]:
-    """Return by parameter the slope, zero, and its g; () where the model integrates no sensor."""
+    """Return the slope (zero) and its g by parameter; () if the model integrates no sensor."""
     scales = [n for n in problem.model.input_scales if n in problem.free]
     names = [*scales, *(_own_noise(problem) if problem.model.input_scales else ())]
     dtype = np.dtype(jnp.result_type(float))
@@ -68,7 +67,7 @@ def _own_noise(problem: Problem) -> tuple[str, ...]:
 
 
 def correction(layout: Layout, noise: Noise, u: Unknowns) -> Array | float:
-    """Return what is added to minus twice the log-likelihood."""
+    """Return the term added to minus twice the log-likelihood."""
     if not noise.corrections:
         return 0.0
     return sum(
@@ -83,7 +82,7 @@ def corrections_at(
     """Return the corrections at an evaluation.
 
     Args:
-        measured: the number of innovations; the row behind them is that of the variances.
+        measured: number of innovations; the row after them is that of the variances.
     """
     if not noise.corrections:
         return ()
@@ -91,7 +90,7 @@ def corrections_at(
     for name, before in noise.corrections.items():
         i = layout.of_interest.index(name)
         if name in layout.model.input_scales:
-            # The square of this row is the sum of log s and of the corrections, but for a constant.
+            # The square of this row is the sum of log s and of the corrections, up to a constant.
             slope = float(before[0]) - 2.0 * e.r[measured] * e.J[measured, i] / e.slopes[i]
         else:
             there = evaluate(layout, data, noise, z.at[i].add(_STEP))
@@ -104,11 +103,11 @@ def corrections_at(
 
 
 def _log_det(layout: Layout, noise: Noise, J: np.ndarray, measured: int) -> float:
-    """Return log det J'J of the parameters of the mean, but for a constant."""
+    """Return log det J'J of the parameters of the mean, up to a constant."""
     own = set(noise.corrections) - set(layout.model.input_scales)
     means = [i for i, n in enumerate(layout.of_interest) if n not in own]
     columns = [*means, *range(layout.first_nuisance, layout.size)]
-    # The innovations and the priors, without the rows of the variances between them.
+    # These are the innovations and the priors, without the rows of variances between them.
     rows = np.r_[0:measured, 2 * measured + 1 : J.shape[0]]
     R = np.linalg.qr(np.asarray(J, np.float64)[np.ix_(rows, columns)], mode="r")
     with np.errstate(divide="ignore"):
@@ -116,7 +115,7 @@ def _log_det(layout: Layout, noise: Noise, J: np.ndarray, measured: int) -> floa
 
 
 def corrections_changed(before: Noise, after: Noise) -> float:
-    """Return the largest change of a slope over the slope itself."""
+    """Return the largest relative change of a slope."""
     if not after.corrections:
         return 0.0
     slopes = [

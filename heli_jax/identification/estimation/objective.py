@@ -1,9 +1,9 @@
-"""The objective that a method of estimation minimises, and what follows from it.
+"""The objective that an estimation method minimises, and what depends on it.
 
 A method is one class: its rows and their tags, the noise and its relaxation, the likelihood, and
-the records of a bootstrap. The optimiser sums the squares of the rows; identifiability and
-intervals come from their Jacobian. The defaults are those of a simulation against samples with
-white noise. Methods are entered in `heli_jax.identification.methods`.
+the records of a bootstrap. The optimiser minimises the sum of squared rows. Their Jacobian gives
+identifiability and intervals. The defaults suit a simulation compared with samples in white noise.
+Methods are listed in `heli_jax.identification.methods`.
 """
 
 import abc
@@ -32,58 +32,63 @@ NoiseModel = Literal["white", "disturbance", "spectrum"]
 
 
 class RowTags(NamedTuple):
-    """Meaning of each row of the measurements, (n,) each; -1 where it belongs to no single one."""
+    """Meaning of each row of the measurements, (n,) each; -1 if it belongs to no single one."""
 
     flight: np.ndarray
     signal: np.ndarray
-    """(flight, output), numbered as `signals` lists them"""
+    """Index of (flight, output) in `signals`."""
     sample: np.ndarray
-    """of its flight"""
+    """Sample within its flight."""
     residual: np.ndarray
-    """True for a residual; False for what follows them: variances, defects"""
+    """True for a residual, False for the rows after them: variances, defects."""
 
 
 def untagged(count: int) -> RowTags:
-    """Tags of rows that belong to no single flight."""
+    """Return tags of rows that belong to no single flight."""
     none = np.full(count, -1)
     return RowTags(none, none, none, np.ones(count, bool))
 
 
 class Objective(abc.ABC):
-    """A method of estimation. It has no state: there is one object of each."""
+    """An estimation method, without state: there is one object of each."""
 
     noise_model: ClassVar[NoiseModel] = "white"
-    """the noise of the likelihood. 'white': a simulation against samples, white noise of each
-    signal. 'disturbance': one-step predictions, with a disturbance that is estimated and one white
-    noise of each output. 'spectrum': numbers at frequencies over a spectrum that is estimated,
-    without initial states and biases"""
+    """Noise of the likelihood. 'white': a simulation against samples, with white noise of each
+    signal. 'disturbance': one-step predictions, with an estimated disturbance and one white noise
+    of each output. 'spectrum': values at frequencies over an estimated spectrum, without initial
+    states and biases."""
     fits_responses: ClassVar[bool] = False
-    """True if frequency responses are fitted, as `Problem.frequency` states them"""
+    """True if frequency responses are fitted, with the settings in `Problem.frequency`."""
 
     def refusal(self, problem: Problem) -> str | None:
-        """Return why the method cannot solve a problem and what can; None where it can."""
+        """Return why the method cannot solve a problem and which one can, or None."""
         return None
 
     def flight_facts(self, problem: Problem, flights: Sequence[Flight]) -> tuple[Any, ...]:
-        """Return by flight, hashable, what the method needs before a trace."""
+        """Return, by flight, hashable facts that the method needs before tracing."""
         return ()
 
     def instrumented(
         self, problem: Problem, flights: Sequence[Flight]
     ) -> tuple[dict[str, np.ndarray], ...] | None:
-        """Return by flight and input the part that follows the instruments (N,), SI; None without
-        any."""
+        """Return, by flight and input, the part (N,) that follows the instruments, SI.
+
+        The result is None without instruments.
+        """
         return None
 
     def scaled_outputs(self, problem: Problem) -> tuple[tuple[str, ...], bool]:
-        """Return the outputs whose noise is an unknown factor in z, and True if a common factor of
-        all noise is concentrated out of the likelihood instead."""
+        """Return the outputs whose noise factor is an unknown in z.
+
+        The flag is True if a common factor of all noise is concentrated out of the likelihood
+        instead.
+        """
         return (), False
 
     @abc.abstractmethod
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
-        """Return the rows of the measurements, divided by the noise; traced, and differentiated
-        forwards."""
+        """Return the rows of the measurements, divided by the noise; traced, and differentiated in
+        forward mode."""
 
     def tags(self, layout: Layout, data: Data, count: int) -> RowTags:
         """Return the tags of the `count` rows that `residuals` returns."""
@@ -99,21 +104,26 @@ class Objective(abc.ABC):
         return RowTags(tags[0], tags[1], tags[2], np.arange(count) < numbers.size)
 
     def first_noise(self, problem: Problem, noise: Noise, flights: Sequence[Flight]) -> Noise:
-        """Return the first guess of the noise as the method needs it, from sds by flight and
-        output."""
+        """Return the first guess of the noise in the method's form.
+
+        Args:
+            noise: sds by flight and output.
+        """
         return noise
 
     def noise_at_start(self, layout: Layout, data: Data, e: Evaluation, noise: Noise) -> Noise:
-        """Return the noise after an evaluation at a start; the same object if it is unchanged."""
+        """Return the noise after an evaluation at a start; the same object if unchanged."""
         return noise
 
     def data_at_start(self, data: Data) -> Data:
-        """Return the data of the first search, if others than those measured."""
+        """Return the data of the first search, if they differ from the measured data."""
         return data
 
     def noise_of_check(self, layout: Layout, data: Data, noise: Noise) -> Noise:
-        """Return the noise of a check at the start values; the same object unless the fit ends with
-        another."""
+        """Return the noise of a check at the start values.
+
+        It is the same object unless the fit ends with another.
+        """
         return noise
 
     def relax(
@@ -121,7 +131,7 @@ class Objective(abc.ABC):
     ) -> tuple[Float[Array, " q"], Noise]:
         """Return z, and the noise of the residuals there."""
         n = measured_count(data)
-        # The unknowns fit part of the noise of every signal.
+        # The unknowns absorb part of the noise of every signal.
         freedom = n / max(n - layout.determined, 1)
         e = evaluate(layout, data, noise, z)
         sd = [dict(by_output) for by_output in noise.sd]
@@ -136,18 +146,20 @@ class Objective(abc.ABC):
         return float(np.sqrt(np.mean(np.square(errors))))
 
     def noise_matters(self, problem: Problem, layout: Layout, before: Noise, after: Noise) -> bool:
-        """Return True if the optimum moves from one noise to another."""
+        """True if a change of the noise moves the optimum."""
         return True
 
     def finish(
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
     ) -> Float[Array, " q"]:
-        """Return z at the end of a search, with the unknowns that are in no row."""
+        """Return z at the end of a search, with the unknowns that affect no row."""
         return z
 
     def log_likelihood(self, layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
-        """Return the log-likelihood in SI units of the outputs, at the most likely noise where
-        that is estimated."""
+        """Return the log-likelihood in SI units of the outputs.
+
+        An estimated noise has its most likely value.
+        """
         total = 0.0
         for v in errors_of(layout, e):
             sd = self.scale(v)
@@ -155,10 +167,12 @@ class Objective(abc.ABC):
         return 0.5 * total
 
     def log_density(self, layout: Layout, data: Data, rows: Float[Array, " n"]) -> Array:
-        """Return the log density of the rows but for a constant; traced. Scales that are estimated
-        are integrated out under Jeffreys' prior."""
-        # The integral over sd of sd^-(n+1) exp(-S / (2 sd^2)) is proportional to S^(-n/2). Rows
-        # of missing samples are zero, and n does not count them.
+        """Return the log density of the rows up to a constant; traced.
+
+        Estimated scales are integrated out under Jeffreys' prior.
+        """
+        # The integral over sd of sd^-(n+1) exp(-S / (2 sd^2)) is proportional to S^(-n/2). Rows of
+        # missing samples are zero, and n excludes them.
         counts = [jnp.sum(jnp.isfinite(y)) for f in data.flights for y in f.outputs.values()]
         n = jnp.stack(counts).astype(rows.dtype)
         if self.noise_model == "white":
@@ -169,31 +183,36 @@ class Objective(abc.ABC):
         return -0.5 * (jnp.sum(n) * jnp.log(S) if layout.concentrated else S)
 
     def numbers(self, layout: Layout, data: Data, noise: Noise) -> int:
-        """Return how many independent numbers the noise is estimated from."""
+        """Return the number of independent values that the noise is estimated from."""
         return measured_count(data)
 
     @abc.abstractmethod
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
-        """Return by flight and output the signals without bias and noise at `reached`, where the
-        unknowns are u: (N,), or (runs, N) where a disturbance is drawn."""
+        """Return, by flight and output, the signals without bias and noise at `reached` with the
+        unknowns u.
+
+        They are (N,), or (runs, N) if a disturbance is drawn.
+        """
 
     def expected_error(
         self, layout: Layout, data: Data, noise: Noise, e: Evaluation, z: Array
     ) -> dict[str, float] | None:
-        """Return by output the power of the simulation's error over that which disturbance and
-        noise explain; None without a disturbance."""
+        """Return, by output, the ratio of the simulation error's power to that explained by
+        disturbance and noise; None without a disturbance."""
         return None
 
     def ill_conditioned(self, problem: Problem, e: Evaluation, sd: dict[str, float]) -> bool:
-        """Return True if the evaluation is rounding; sd: of the measurement noise, SI, by
-        'flight/output'."""
+        """True if the evaluation is dominated by rounding.
+
+        Args:
+            sd: sd of the measurement noise, SI, by 'flight/output'.
+        """
         return False
 
     def response_agreement(
         self, layout: Layout, data: Data, noise: Noise, z: Array
     ) -> ResponseAgreement | None:
-        """Return the agreement of modelled and measured frequency responses, if these are
-        fitted."""
+        """Return the agreement of modelled and measured frequency responses, if fitted."""
         return None
 
     def findings(
@@ -209,6 +228,7 @@ def errors_of(layout: Layout, e: Evaluation) -> list[Float[np.ndarray, " n"]]:
 
 
 def noise_unknowns(layout: Layout) -> int:
-    """Return the number of sds of measurement noise that are estimated beside z."""
-    # They count in AIC and BIC. A smooth spectrum does not, and each candidate model has its own.
+    """Return the number of measurement-noise sds that are estimated in addition to z."""
+    # They count in AIC and BIC. A smooth spectrum does not, because each candidate model has its
+    # own.
     return len(signals(layout)) if layout.noise_model == "white" else int(layout.concentrated)

@@ -1,8 +1,8 @@
-"""Output error: the simulation against what was measured, (measured - bias - simulated) / sd.
+"""Output error: the simulation against the measurement, (measured - bias - simulated) / sd.
 
-Maximum likelihood where the measurement noise is white and nothing disturbs the vehicle (Maine and
-Iliff, 1985; Jategaonkar, 2006, chapter 4). With windows (multiple shooting; Bock, 1983) also the
-defects between them.
+Maximum likelihood if the measurement noise is white and nothing disturbs the vehicle (Maine and
+Iliff, 1985; Jategaonkar, 2006, chapter 4). With windows (multiple shooting; Bock, 1983) the defects
+between them are added.
 """
 
 from collections.abc import Sequence
@@ -27,21 +27,21 @@ class OutputError(Objective):
     """The simulation, driven by the logged inputs alone, against the measured outputs."""
 
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
-        """Return the rows signal by signal; with windows the defects between them follow."""
-        # No measurement enters the simulation: that keeps the estimates free of a bias by output
-        # noise, which equation error has, and is why gusts are taken for noise.
+        """Return the rows signal by signal; with windows, the defects between them follow."""
+        # No measurement enters the simulation. So output noise causes no bias, unlike in equation
+        # error, but gusts are taken for noise.
         runs = predict(layout, data, u)
         y, sd = measured_signals(layout, data, noise)
         simulated = jnp.concatenate([run.outputs.reshape(-1) for run in runs])
         biases = jnp.stack([b for by_output in u.biases for b in by_output.values()])
         error = y - biases[signal_numbers(layout, data)] - simulated
-        # The row of a missing sample is zero: left out it would change the shapes, and with them
-        # the program, from record to record.
+        # The row of a missing sample is zero. Dropping it would change the shapes, and so the
+        # compiled program, from record to record.
         rows = jnp.where(jnp.isfinite(y), error, 0.0) / sd
         return Residuals(jnp.concatenate([rows, *_defects(layout, data, u, runs)]), runs)
 
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
-        """Return the simulated flights: without a disturbance all runs are the same."""
+        """Return the simulated flights; without a disturbance all runs are the same."""
         layout = reached.layout
         simulated = predict(layout, reached.data, u)
         return [
@@ -51,14 +51,14 @@ class OutputError(Objective):
 
 
 def _defects(layout: Layout, data: Data, u: Unknowns, runs: tuple[Run, ...]) -> list[Array]:
-    """Return by flight the defects of multiple shooting: the jumps of the states between windows
-    over their sd, window by window."""
+    """Return, by flight, the defects of multiple shooting: jumps of the states between windows over
+    their sd."""
     rows = []
     for flight, run, begun in zip(data.flights, runs, u.states, strict=True):
-        # Without continuity each window has an initial state that nothing ties to its neighbours.
+        # Without continuity, the initial states of neighbouring windows are independent.
         if layout.continuity is None or run.ends is None:
             continue
-        # The scale is ten times the motion of the state, and continuity a part of the motion.
+        # The scale is ten times the motion of the state; continuity is a fraction of the motion.
         jumps = [
             (getattr(run.ends, n)[:-1] - getattr(begun, n)[1:])
             / (0.1 * layout.continuity * flight.state_scale[n])
@@ -72,6 +72,8 @@ OBJECTIVE = OutputError()
 
 
 def in_time(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Float[Array, " q"]:
-    """Return z with the biases, offsets and initial states by which the simulation is nearest in
-    time: a method in frequency has them in no row."""
+    """Return z with the biases, offsets and initial states that fit best in time.
+
+    A method in frequency has them in no row.
+    """
     return fit_nuisances(replace(layout, objective=OBJECTIVE), data, noise, z)

@@ -1,4 +1,4 @@
-"""Weights of fits of frequency responses: covariance and whitening of the errors of responses.
+"""Weights of fits of frequency responses: covariance and whitening of the response errors.
 
 With Z, U, E the transforms of instruments, inputs and errors in each window, the response in the
 errors is dH = S_zu^-1 S_ze. Given the inputs, its covariance between outputs i and j is
@@ -6,8 +6,8 @@ errors is dH = S_zu^-1 S_ze. Given the inputs, its covariance between outputs i 
     P_i V_ij P_j^H S_ij,    P = S_zu^-1,
 
 with S the noise's spectral matrix and V_ij the sum of conj(Z) Z over windows that both outputs
-have, overlapping windows by their correlation. It is exact for a chirp too, whose power at one
-frequency is in one window.
+have, with overlapping windows weighted by their correlation. It is exact also for a chirp, whose
+power at one frequency lies in one window.
 
 Sources: Bendat and Piersol, Random Data (2010), chapter 9; Pintelon and Schoukens (2012), chapter
 2, for the estimate by instrument.
@@ -39,34 +39,35 @@ from heli_jax.identification.problem import Problem
 
 _WIDEST = 2.0
 """sd of the Gaussian that smooths the noise's spectrum over frequency, in lines of the window; half
-of it where there are enough averages"""
+of it if there are enough averages."""
 _PART = 0.04
-"""least sd of this Gaussian as a part of the frequency"""
+"""Least sd of this Gaussian as a fraction of the frequency."""
 _ENOUGH = 30.0
-"""independent averages per output for a spectral matrix"""
+"""Independent averages for each output that a spectral matrix needs."""
 _LINES = 2.0 * np.pi**0.5 / (STEPS / PER_AVERAGE)
-"""independent lines in a Gaussian of one line, of Hann windows"""
+"""Independent lines of Hann windows in a Gaussian of one line."""
 _NEIGHBOURS = 3
-"""lines to either side with which a line is correlated in Hann windows"""
+"""Lines on either side that are correlated with a line in Hann windows."""
 _ROUNDING = 1e-14
-"""least density of the noise, as a part of the signal's"""
+"""Least density of the noise, as a fraction of the signal's."""
 _SMALLEST = 1e-9
-"""least eigenvalue of the noise's coherence matrix, for outputs computed from one another"""
+"""Least eigenvalue of the noise's coherence matrix, for outputs computed from one another."""
 
 
 class Averages(NamedTuple):
     """Errors of responses as determined by the inputs; p outputs, m inputs, k lines."""
 
     P: np.ndarray
-    """(p, k, m, m) inverses of the cross-spectra from instruments to inputs, of the windows that
-    each output has; NaN where inputs move as one"""
+    """Inverse cross-spectra from instruments to inputs in each output's windows, (p, k, m, m); NaN
+    if inputs are dependent."""
     V: np.ndarray
-    """(p, p, k, m, m) covariance of the cross-spectra over the density of the noise"""
+    """Covariance of the cross-spectra over the density of the noise, (p, p, k, m, m)."""
     share: np.ndarray
-    """(p, k, m) share of an independent error: errors at neighbouring lines are correlated"""
+    """Independent share of an error, because errors at neighbouring lines are correlated, (p, k,
+    m)."""
     freedom: np.ndarray
-    """(k, p) expected sum over windows of the squares of white noise of density 1, without the part
-    that a response explains"""
+    """Expected sum over windows of the squares of white noise of density 1, less the part that a
+    response explains, (k, p)."""
 
 
 def averages(w: Windowed) -> Averages:
@@ -75,12 +76,12 @@ def averages(w: Windowed) -> Averages:
     g = hann(w.length) * np.exp(-2j * np.pi * turns)
     g = g - np.mean(g, axis=1, keepdims=True)
     near = [_correlations(g, d, w.step) for d in range(min(_NEIGHBOURS + 1, len(g)))]
-    # Most outputs lack the same windows or none: each case is computed once.
+    # Most outputs have the same missing windows, or none, so each case is computed once.
     cases, case = np.unique(w.seen, axis=1, return_inverse=True)
     masks, case = cases.T, case.reshape(-1)
     V = np.array([[_spread(w, a, b, near[0]) for b in masks] for a in masks])
     P, share, freedom = [], [], []
-    # The mean takes off a part of white noise at the first line.
+    # Subtracting the mean removes part of the white noise at the first line.
     power = np.real(near[0][0])
     for i, seen in enumerate(masks):
         S = _cross(seen, w.Z, w.U)
@@ -98,13 +99,13 @@ def averages(w: Windowed) -> Averages:
 
 
 def _cross(seen: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the mean (k, m, m) of conj(a) b over the windows seen."""
+    """Return the mean (k, m, m) of conj(a) b over the measured windows."""
     return np.einsum("w,wkx,wky->kxy", seen, np.conj(a), b, optimize=True) / np.sum(seen)
 
 
 def _correlations(g: np.ndarray, d: int, step: int) -> dict[int, np.ndarray]:
-    """Return the correlation (k - d,) of the transform of white noise at each line in a window with
-    that at the d-th line after it in a window j steps later, by j.
+    """Return the correlation (k - d,) of the transforms of white noise at lines d apart, in windows
+    j steps apart, by j.
 
     Args:
         g: window times complex exponential of each line (k, samples), less their means.
@@ -122,8 +123,10 @@ def _correlations(g: np.ndarray, d: int, step: int) -> dict[int, np.ndarray]:
 def _spread(
     w: Windowed, first: np.ndarray, second: np.ndarray, c: dict[int, np.ndarray]
 ) -> np.ndarray:
-    """Return the covariance (k - d, m, m) of two means of conj(Z) E, with white noise E of density
-    1, the second mean at the d-th line after the first."""
+    """Return the covariance (k - d, m, m) of two means of conj(Z) E.
+
+    E is white noise of density 1. The second mean is at the d-th line after the first.
+    """
     k = len(c[0])
     a = first[:, None, None] * w.Z[:, :k]
     b = second[:, None, None] * w.Z[:, len(w.numbers) - k :]
@@ -140,8 +143,7 @@ def _spread(
 def _share(
     w: Windowed, seen: np.ndarray, P: np.ndarray, near: list[dict[int, np.ndarray]]
 ) -> np.ndarray:
-    """Return one over the sum of the correlations of an error with those at lines around it, (k,
-    m)."""
+    """Return one over the sum of an error's correlations with the lines around it, (k, m)."""
     size, total = np.ones(P.shape[:2]), np.ones(P.shape[:2])
     for d, c in enumerate(near):
         k = len(c[0])
@@ -150,7 +152,7 @@ def _share(
         if d == 0:
             size = np.sqrt(np.maximum(C, 1e-300))
             continue
-        # A negative correlation is no gain: no response varies that fast.
+        # Negative correlations are ignored, because no response varies that fast.
         rho = np.maximum(C / (size[:k] * size[d:]), 0.0)
         total[:k] += rho
         total[d:] += rho
@@ -160,7 +162,7 @@ def _share(
 def response_of(
     w: Windowed, at: Averages, E: Complex[np.ndarray, "W k p"]
 ) -> Complex[np.ndarray, "k p m"]:
-    """Return the response dH of errors to the inputs; NaN where inputs move as one.
+    """Return the response dH of errors to the inputs; NaN if inputs are dependent.
 
     Args:
         E: errors, or the outputs themselves; zero in windows that an output does not have.
@@ -173,8 +175,7 @@ def response_of(
 def noise_density(
     w: Windowed, at: Averages, E: Complex[np.ndarray, "W k p"]
 ) -> Complex[np.ndarray, "k p p"]:
-    """Return the spectral matrix of the part of errors that no response explains, smoothed over
-    frequency.
+    """Return the smoothed spectral matrix of the errors' part that no response explains.
 
     Args:
         E: errors (W, k, p); zero in windows that an output does not have.
@@ -188,14 +189,14 @@ def noise_density(
     kernel = kernel / np.sum(kernel, axis=1, keepdims=True)
     own = np.sum(np.abs(_unexplained(w, E, w.seen)) ** 2, axis=0) / at.freedom
     own = np.maximum(own, floor)
-    # The mean over lines of a steep spectrum is too large: it is taken of the spectrum over its
-    # geometric mean (Blackman and Tukey, 1958, prewhitening).
+    # The mean over lines of a steep spectrum is too large. So it is taken of the spectrum over its
+    # geometric mean (prewhitening: Blackman and Tukey, 1958).
     shape = np.exp(kernel @ np.log(own))
     size = np.sqrt(shape * (kernel @ (own / shape)))
     R = np.broadcast_to(np.eye(p), (len(own), p, p))
     if w.together:
-        # Coherences are taken from windows that all outputs have: those of pairs would contradict
-        # one another, and the matrix would not be positive definite.
+        # Coherences use only windows that all outputs have. Otherwise pairs might contradict each
+        # other, and the matrix would not be positive definite.
         D = _unexplained(w, E, np.repeat(w.common[:, None], p, axis=1)) / np.sqrt(shape)
         S = np.einsum("kl,wli,wlj->kij", kernel, D, np.conj(D), optimize=True)
         root = np.sqrt(np.maximum(np.real(np.einsum("kii->ki", S)), _ROUNDING))
@@ -206,10 +207,8 @@ def noise_density(
 def _unexplained(
     w: Windowed, E: Complex[np.ndarray, "W k p"], seen: Float[np.ndarray, "W p"]
 ) -> Complex[np.ndarray, "W k p"]:
-    """Return the part of errors that no response to the instruments explains, in the windows
-    seen."""
-    # By regression on the instruments and not by the response: that one is unbounded where the
-    # excitation has no power.
+    """Return the errors' part that no response to the instruments explains, in measured windows."""
+    # The regression is on the instruments, because the response is unbounded without excitation.
     P = np.stack([_inverse_power(w, mask) for mask in seen.T])
     S_ze = np.einsum("wp,wkz,wkp->kpz", seen, np.conj(w.Z), E, optimize=True)
     part = np.einsum("pkmz,kpz->kpm", P, S_ze / np.sum(seen, axis=0)[None, :, None])
@@ -217,15 +216,14 @@ def _unexplained(
 
 
 def _inverse_power(w: Windowed, seen: Float[np.ndarray, " W"]) -> Complex[np.ndarray, "k m m"]:
-    """Return the inverse of the instruments' spectral matrix; zero where they move as one."""
+    """Return the inverse of the instruments' spectral matrix; zero if they are dependent."""
     S_zz = _cross(seen, w.Z, w.Z)
     power = np.real(np.einsum("kaa->ka", S_zz))
     return np.nan_to_num(inverse(S_zz, power, power))
 
 
 def _definite(S: np.ndarray, floor: np.ndarray) -> np.ndarray:
-    """Return a spectral matrix (k, p, p) that has an inverse, with a diagonal of at least `floor`
-    (p,)."""
+    """Return an invertible spectral matrix (k, p, p) with a diagonal of at least `floor` (p,)."""
     power = np.maximum(np.real(np.einsum("kii->ki", S)), floor)
     scale = np.sqrt(power)
     rho = S / (scale[:, :, None] * scale[:, None, :])
@@ -244,13 +242,13 @@ def covariance(at: Averages, S: Complex[np.ndarray, "k p p"]) -> Complex[np.ndar
 def whitening(
     at: Averages, S: Complex[np.ndarray, "k p p"], used: Bool[np.ndarray, "k p m"]
 ) -> Complex[np.ndarray, "k r r"]:
-    """Return factors that make the errors of the responses used white at each line; the rows of the
+    """Return factors that whiten the errors of the used responses at each line; the rows of the
     others are zero. r = p m."""
     k, p, m = used.shape
     taken = used.reshape(k, -1)
     C = covariance(at, S).reshape(k, p * m, p * m)
     size = np.sqrt(np.real(np.einsum("krr->kr", C)))
-    # A response that is not used has variance 1 and no correlation.
+    # An unused response has variance 1 and no correlation.
     scale = np.where(taken & (size > 0), size, 1.0)
     both = taken[:, :, None] & taken[:, None, :]
     C = np.where(both, C / (scale[:, :, None] * scale[:, None, :]), 0.0)
@@ -259,7 +257,7 @@ def whitening(
 
 
 def partial_coherence(w: Windowed, at: Averages) -> Float[np.ndarray, "k p m"]:
-    """Return the partial coherence of each output with each input; 0 where inputs move as one."""
+    """Return the partial coherence of each output with each input; 0 if inputs are dependent."""
     H = response_of(w, at, w.Y)
     left = (w.Y - np.einsum("wkm,kpm->wkp", w.U, np.nan_to_num(H))) * w.seen[:, None, :]
     density = np.sum(np.abs(left) ** 2, axis=0) / np.sum(w.seen, axis=0)
@@ -278,7 +276,7 @@ def pairs_used(
     coherence: Float[np.ndarray, "k p m"],
     sound: Bool[np.ndarray, "k p m"],
 ) -> Bool[np.ndarray, "k p m"]:
-    """Return which responses are used, by frequency."""
+    """Return, by frequency, which responses are used."""
     used = np.zeros(sound.shape, bool)
     omega = 2.0 * np.pi * w.hz
     everything = tuple(PairOptions(i, o) for i in w.inputs for o in w.outputs)
@@ -288,14 +286,14 @@ def pairs_used(
         at = (slice(None), w.outputs.index(pair.output), w.inputs.index(pair.input))
         low, high = pair.band or (0.0, np.inf)
         least = options.coherence if pair.coherence is None else pair.coherence
-        # The mean over an octave: a line that exceeds a limit by chance has too large a gain by the
-        # same chance.
+        # The mean over an octave is compared: a line that exceeds the limit by chance also has too
+        # large a gain by chance.
         enough = octave_mean(omega, coherence[at]) >= least
         used[at] = sound[at] & enough & (w.hz >= low * (1 - 1e-9)) & (w.hz <= high * (1 + 1e-9))
     return used
 
 
-# Fields of this class are arrays of NumPy, or of JAX once they are traced: Any.
+# Fields are Any, because they are NumPy arrays, or JAX arrays once traced.
 
 
 class ResponseWeights(NamedTuple):
@@ -303,21 +301,21 @@ class ResponseWeights(NamedTuple):
 
     windows: Windowed
     averages: Averages
-    """with zeros where they are not determined"""
+    """Averages, with zeros where they are not determined."""
     coherence: Any
-    """(k, p, m) partial"""
+    """Partial coherence (k, p, m)."""
     used: Any
-    """(k, p, m) True for responses that are used"""
+    """True for responses that are used (k, p, m)."""
     density: Any
-    """(k, p, p) the noise's spectral matrix, per Hz"""
+    """Spectral matrix of the noise, per Hz (k, p, p)."""
     whitening: Any
-    """(k, r, r), r = p m: whitening times the root of `share`"""
+    """Whitening times the square root of `share` (k, r, r), r = p m."""
     share: Any
-    """(k,) share of an independent line"""
+    """Share of an independent line (k,)."""
 
     @property
     def log_determinant(self) -> float:
-        """Log-determinant of the weights of the responses used, lines by their share."""
+        """Log-determinant of the weights of the used responses, lines weighted by their share."""
         r = np.arange(self.whitening.shape[1])
         diagonal = np.real(np.asarray(self.whitening)[:, r, r])
         taken = np.asarray(self.used).reshape(diagonal.shape)
@@ -332,23 +330,24 @@ class ResponseWeights(NamedTuple):
 
     @property
     def numbers_of_noise(self) -> float:
-        """Number of independent real values that the noise's spectrum is estimated from."""
+        """Number of independent real values from which the noise's spectrum is estimated."""
         averages = np.maximum(self.windows.averages - len(self.windows.inputs), 1.0)
         seen = np.any(np.asarray(self.used), axis=2)
         return float(np.sum(2.0 * np.asarray(self.share)[:, None] * seen * averages))
 
     def variance(self) -> np.ndarray:
-        """(k, p, m) of the complex error of each response"""
+        """Variance of the complex error of each response (k, p, m)."""
         C = covariance(self.averages, self.density)
         return np.real(np.einsum("kixix->kix", C))
 
 
 def first_weights(problem: Problem, flights: Sequence[Flight]) -> ResponseWeights:
-    """Return the weights of the measured signals: the noise is the part of the outputs that no
-    response explains.
+    """Return the weights of the measured signals.
+
+    The noise is the outputs' part that no response explains.
 
     Raises:
-        ValueError: windows, band or pairs do not fit the flights, or too little is left.
+        ValueError: windows, band or pairs do not fit the flights, or too few data remain.
     """
     options = problem.frequency
     w = windowed(flights, options, instruments_of(problem))
@@ -421,10 +420,10 @@ def _require_numbers(problem: Problem, weights: ResponseWeights) -> None:
 
 
 def on_device(weights: ResponseWeights) -> ResponseWeights:
-    """Return the weights with arrays of JAX: they are copied once, and not with every call."""
+    """Return the weights as JAX arrays, copied once instead of with every call."""
     return jax.tree.map(lambda v: jax.device_put(v) if isinstance(v, np.ndarray) else v, weights)
 
 
 def back(weights: ResponseWeights) -> ResponseWeights:
-    """Return the weights with arrays of NumPy."""
+    """Return the weights as NumPy arrays."""
     return jax.tree.map(lambda v: np.asarray(v) if isinstance(v, jax.Array) else v, weights)

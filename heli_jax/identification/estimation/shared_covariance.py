@@ -16,34 +16,34 @@ from heli_jax.simulation.discretize import process_noise
 from heli_jax.simulation.hold import between_samples
 from heli_jax.simulation.stepping import held_columns
 
-# Without missing samples the covariances depend on the model alone and not on the measurements:
-# records of one model share them. They converge (Kalman, 1960); then the gain is constant, and the
-# filter is a linear recurrence. Both have derivatives of their own: those of the Riccati equation
-# are a Lyapunov recursion with the closed-loop matrix, which all unknowns share; those of the state
-# are the same recurrence with another forcing.
+# Without missing samples the covariances depend only on the model, so its records share them. They
+# converge (Kalman, 1960); then the gain is constant, and the filter is a linear recurrence. Both
+# have custom derivatives. Those of the Riccati equation are a Lyapunov recursion with the
+# closed-loop matrix, which all unknowns share. Those of the state are the same recurrence with
+# another forcing.
 #
-# If the covariance does not converge (an unstable mode that no output shows, a short record) the
-# gain never freezes: the filter is exact in any case.
+# If the covariance does not converge (an unstable mode invisible in the outputs, a short record)
+# the gain never freezes. The filter is exact in any case.
 
 
 _CHUNK = 64
-"""samples after which the covariance is compared with what it was"""
+"""Samples between convergence checks of the covariance."""
 _CONVERGED = 1e-10
-"""change of a covariance within a chunk, in units of the two standard deviations, below which it
-has converged: derivatives converge later than values, by a factor of about the samples it took"""
+"""Change of a covariance within a chunk, in units of the two standard deviations, below which it
+has converged. Derivatives converge later than values, by a factor of about the samples it took."""
 
 
 class Records(NamedTuple):
     """m records of N samples, side by side."""
 
     U: Float[Array, "N m r"]
-    """inputs of `Gaussian.B`"""
+    """Inputs of `Gaussian.B`."""
     acting: Float[Array, "N m i"]
-    """the inputs that act at the samples themselves"""
+    """Inputs that act at the samples."""
     y: Float[Array, "N m p"]
-    """measured; no NaN"""
+    """Measurements, without NaN."""
     x0: Float[Array, "m n"]
-    """mean of the state at the first sample"""
+    """Mean of the state at the first sample."""
 
 
 class Gaussian(NamedTuple):
@@ -54,24 +54,24 @@ class Gaussian(NamedTuple):
     C: Float[Array, "p n"]
     D: Float[Array, "p i"]
     Q: Float[Array, "n n"]
-    """covariance of the process noise of a step"""
+    """Covariance of the process noise of a step."""
     R: Float[Array, " p"]
-    """variances of the measurement noise"""
+    """Variances of the measurement noise."""
     P0: Float[Array, "n n"]
-    """covariance of the state at the first sample"""
+    """Covariance of the state at the first sample."""
 
 
 class _Gain(NamedTuple):
     """Gains of a sample."""
 
     G: Float[Array, "n p"]
-    """Ad times the Kalman gain"""
+    """Ad times the Kalman gain."""
     white: Float[Array, "p p"]
-    """inverse of the Cholesky factor of the innovations' covariance"""
+    """Inverse of the Cholesky factor of the innovations' covariance."""
 
 
 class _State(NamedTuple):
-    """The filter between two chunks."""
+    """State of the filter between two chunks."""
 
     x: Float[Array, "m n"]
     P: Float[Array, "n n"]
@@ -82,16 +82,16 @@ class _State(NamedTuple):
 def filtered_records(system: Gaussian, records: Records) -> tuple[Array, Array]:
     """Return errors (N, m, p) and variances (N, p) of the innovations.
 
-    Outputs of one sample are taken one after another, as in `kalman.innovations`.
+    Outputs of one sample are processed one after another, as in `kalman.innovations`.
     """
     N, m, p = records.y.shape
     n, count = records.x0.shape[1], -(-N // _CHUNK)
 
     def chunk(state: _State, part: Any) -> tuple[_State, Any]:
-        # By chunks, since the loop within one has no branch.
+        # Chunks keep the branch out of the inner loop.
         return jax.lax.cond(state.steady, _frozen, _transient, system, state, *part)
 
-    # The last chunk is padded behind the record, and cut off again.
+    # The last chunk is padded after the record; the padding is removed afterwards.
     samples = (records.U, records.acting, records.y)
     parts = jax.tree.map(
         lambda v: jnp.pad(v, ((0, count * _CHUNK - N), (0, 0), (0, 0))).reshape(
@@ -116,7 +116,7 @@ def _transient(
     def step(carry: tuple[Array, Array, _Gain], now: Any) -> tuple[Any, Any]:
         x, P, _ = carry
         U, acting, y = now
-        # One covariance for all records, and a state for each.
+        # All records share one covariance; each has its own state.
         P, gain = riccati(Ad, C, Q, R, P)
         nu = y - acting @ D.T - x @ C.T
         x = x @ Ad.T + nu @ gain.G.T + U @ B.T
@@ -134,7 +134,7 @@ def _frozen(
     """Filter a chunk with a constant gain."""
     G, white = state.gain
     v = y - acting @ system.D.T
-    # Prediction and correction are one matrix, the closed loop of the filter.
+    # Prediction and correction form one matrix, the closed loop of the filter.
     x, X = recurrence(system.Ad - G @ system.C, v @ G.T + U @ system.B.T, state.x)
     sd = 1.0 / jnp.diagonal(white)
     error = (v - X @ system.C.T) @ (white * sd[:, None]).T
@@ -144,12 +144,13 @@ def _frozen(
 def _converged(before: Array, after: Array) -> Array:
     before, after = jax.lax.stop_gradient((before, after))
     sd = jnp.sqrt(jnp.maximum(jnp.diagonal(after), 0.0))
-    # Over the two standard deviations: in any units, and for states that are known almost exactly.
+    # Dividing by both standard deviations makes the test independent of units and valid for nearly
+    # exact states.
     return _in_all(jnp.all(jnp.abs(after - before) <= _CONVERGED * sd[:, None] * sd[None, :]))
 
 
-# In a batch the gain freezes once it may in all: with a condition for each both branches would be
-# computed in all.
+# In a batch the gain freezes only if it may in all members: separate conditions would make JAX
+# compute both branches.
 @jax.custom_batching.custom_vmap
 def _in_all(flag: Array) -> Array:
     return flag
@@ -162,7 +163,7 @@ def _(size: int, batched: list[bool], flag: Array) -> tuple[Array, bool]:
 
 @jax.custom_jvp
 def riccati(Ad: Array, C: Array, Q: Array, R: Array, P: Array) -> tuple[Array, _Gain]:
-    """Return the covariance of the state one sample on, and the gains of the sample.
+    """Return the covariance of the state one sample later, and the gains of the sample.
 
     Args:
         Q: (n, n), covariance of the process noise of the step.
@@ -178,22 +179,25 @@ def _riccati(
 ) -> tuple[Array, _Gain, tuple[Array, Array]]:
     """Return `riccati`, the Kalman gain, and Ad times the covariance of the corrected state."""
     H = P @ C.T
-    # The Cholesky factor takes off each innovation what the outputs before it predict: the same
-    # numbers as with outputs one after another.
+    # The Cholesky factor subtracts from each innovation its prediction from the outputs before it.
+    # This gives the same values as processing outputs one after another.
     L = jnp.linalg.cholesky(C @ H + jnp.diag(R))
     white = jax.scipy.linalg.solve_triangular(L, jnp.eye(R.shape[0], dtype=R.dtype), lower=True)
     whitened = H @ white.T
     K = whitened @ white
     corrected = Ad @ (P - whitened @ whitened.T)
     following = corrected @ Ad.T + Q
-    # Made symmetric: rounding would grow with each step.
+    # The matrix is made symmetric, because rounding would grow with each step.
     return 0.5 * (following + following.T), _Gain(Ad @ K, white), (K, corrected)
 
 
 @riccati.defjvp
 def _riccati_jvp(primals: Any, tangents: Any) -> Any:
-    """Differentiate: with G = Ad K and F = Ad - G C, dP+ = F dP F' + dQ + G dR G' + W + W', where W
-    = dAd (P corrected) Ad' - G dC P F'. The gain is optimal, so that no dK enters."""
+    """Differentiate the Riccati step.
+
+    With G = Ad K and F = Ad - G C, dP+ = F dP F' + dQ + G dR G' + W + W', where W = dAd (P
+    corrected) Ad' - G dC P F'. The gain is optimal, so dK does not enter.
+    """
     Ad, C, _, _, P = primals
     dAd, dC, dQ, dR, dP = tangents
     following, gain, (K, corrected) = _riccati(*primals)
@@ -202,18 +206,18 @@ def _riccati_jvp(primals: Any, tangents: Any) -> Any:
     d_following = F @ dP @ F.T + dQ + (gain.G * dR[None, :]) @ gain.G.T + W + W.T
     dCH = dC @ H
     dS = C @ dP @ C.T + dCH + dCH.T + jnp.diag(dR)
-    # L^-1 dS L^-T = Phi + Phi' gives dL = L Phi, with Phi a lower triangle.
+    # L^-1 dS L^-T = Phi + Phi' gives dL = L Phi, with lower triangular Phi.
     whitened = gain.white @ dS @ gain.white.T
     half = jnp.tril(whitened) - 0.5 * jnp.diag(jnp.diagonal(whitened))
     d_white = -half @ gain.white
-    # The derivative of the gain is in the states, although not in the covariance.
+    # The states depend on the derivative of the gain, although the covariance does not.
     dK = (dP @ C.T + P @ dC.T - K @ dS) @ (gain.white.T @ gain.white)
     return (following, gain), (d_following, _Gain(dAd @ K + Ad @ dK, d_white))
 
 
 @jax.custom_jvp
 def recurrence(F: Array, forcing: Array, x0: Array) -> tuple[Array, Array]:
-    """Return x after the last of K samples and x (K, m, n) at all: x[k+1] = F x[k] + forcing[k]."""
+    """Return the last x, and all x (K, m, n), of the recurrence x[k+1] = F x[k] + forcing[k]."""
     return jax.lax.scan(lambda x, f: (x @ F.T + f, x), x0, forcing)
 
 
@@ -221,7 +225,7 @@ def recurrence(F: Array, forcing: Array, x0: Array) -> tuple[Array, Array]:
 def _recurrence_jvp(primals: Any, tangents: Any) -> Any:
     (F, _, _), (dF, d_forcing, dx0) = primals, tangents
     x, X = recurrence(*primals)
-    # dF x of all samples at once, in place of one more product in every step.
+    # dF x is computed for all samples at once, which saves one product in every step.
     driven = X @ dF.T + d_forcing
     return (x, X), recurrence(F, driven, dx0)
 
@@ -239,7 +243,7 @@ def innovations_together(
     starts = [layout.model.initial_state(d.params) if d.state is None else d.state for d in drives]
     x0 = jnp.stack([naming.ravel(start, dtype) for start in starts])
     error, variance = filtered_records(system, Records(U, acting, y, x0))
-    # Shorter records were padded behind their end, which no sample before it depends on.
+    # Shorter records are padded after their end, which earlier samples do not depend on.
     lengths = [by_name[names[0]].shape[0] for by_name in measured]
     return [
         Innovations(
@@ -254,7 +258,7 @@ def _system(
     layout: Layout, drives: list[Drive], noise: Noise, u: Unknowns, group: tuple[int, ...]
 ) -> tuple[Gaussian, Array, Array]:
     """Return the model, the inputs of its B, and the inputs that act at the samples, (N, m, .)."""
-    # Parameters, sample time and holds are the same in the whole group.
+    # The whole group shares parameters, sample time and holds.
     model, params, dt = layout.model, drives[0].params, drives[0].dt
     names = layout.outputs[group[0]]
     inputs = jax.tree.map(lambda *v: _columns(v), *(drive.inputs for drive in drives))
@@ -265,7 +269,7 @@ def _system(
         _, inputs, linear = between_samples(layout.model, inputs, inputs, hold)
         return held_columns(model, params, inputs, dt, u.shift, linear)
 
-    # The matrices do not depend on the inputs, and come out once.
+    # The matrices do not depend on the inputs, so vmap returns them once.
     Ad, B, U, acting = jax.vmap(held, -1, (None, None, 1, 1))(inputs)
     _, _, C, D = jacobians(model, params)
     rows = np.asarray([naming.names(model.Outputs).index(n) for n in names])
@@ -280,6 +284,6 @@ def _system(
 
 
 def _columns(records: Any) -> Float[Array, "N m"]:
-    """Return signals (N,) as columns, shorter ones padded behind their end."""
+    """Return signals (N,) as columns, shorter ones padded after their end."""
     N = max(v.shape[0] for v in records)
     return jnp.stack([jnp.pad(v, (0, N - v.shape[0])) for v in records], axis=1)

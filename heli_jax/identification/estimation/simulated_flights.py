@@ -1,4 +1,4 @@
-"""Simulation of the flights with given unknowns; windows of one length run together."""
+"""Simulation of the flights with given unknowns; windows of equal length run together."""
 
 from typing import Any, NamedTuple
 
@@ -15,29 +15,29 @@ from heli_jax.numerics.jitted import jitted
 from heli_jax.simulation.hold import Delays, at, delays_of
 from heli_jax.simulation.simulate import Trajectory, simulate
 
-# Params, State and Inputs are a model's own classes: they are annotated Any.
+# Params, State and Inputs are Any, because they are a model's own classes.
 
 
 class Drive(NamedTuple):
     """Parameters, inputs and initial state of the model in one flight."""
 
     params: Any
-    """the model's Params, SI"""
+    """The model's Params, SI."""
     inputs: Any
-    """the model's Inputs, arrays (N,)"""
+    """The model's Inputs, arrays (N,)."""
     dt: Any
-    """[s]"""
+    """Sample time [s]."""
     state: Any
-    """the model's State at the first sample; None where it is the model's own"""
+    """The model's State at the first sample; None for the model's own."""
 
 
 def driven(layout: Layout, data: Data, u: Unknowns, i: int) -> Drive:
-    """Return the drive of the i-th flight: inputs are (logged + offset) * gain."""
+    """Return the drive of the i-th flight; its inputs are (logged + offset) * gain."""
     flight, offsets = data.flights[i], u.offsets[i]
-    # The last value counts: one that is known of this flight alone.
+    # The last value counts, so known values of this flight take precedence.
     params = layout.model.Params(**{**data.base, **u.params, **u.noise, **flight.known})
     inputs = naming.asdict(flight.inputs)
-    # In units of the log, so that the offset does not change with the gain.
+    # Offsets are in units of the log, so that they do not change with the gain.
     inputs = {n: v + offsets[n] if n in offsets else v for n, v in inputs.items()}
     inputs = {n: v * u.gains[n] if n in u.gains else v for n, v in inputs.items()}
     return Drive(params, layout.model.Inputs(**inputs), flight.dt, u.states[i])
@@ -47,30 +47,31 @@ class SimulatedOutputs(NamedTuple):
     """Simulated outputs of the flights."""
 
     outputs: tuple[Float[Array, "p N"], ...]
-    """by flight, SI, as `Layout.outputs` orders them, with the bias"""
+    """Outputs with bias by flight, SI, in the order of `Layout.outputs`."""
     states: tuple[Float[Array, "s N"], ...]
-    """by flight, as the model's State orders them"""
+    """States by flight, in the order of the model's State."""
 
 
 class Run(NamedTuple):
     """A simulated flight."""
 
     states: Float[Array, "s N"]
-    """as the model's State orders them"""
+    """States, in the order of the model's State."""
     outputs: Float[Array, "p N"]
-    """the measured outputs, as `Layout.outputs` orders them, without bias"""
+    """Measured outputs in the order of `Layout.outputs`, without bias."""
     ends: Any
-    """with windows the State at the end of each, at the first sample of the next, (windows,)"""
+    """State at the end of each window (the first sample of the next), (windows,), with windows
+    only."""
 
 
 def predict(layout: Layout, data: Data, u: Unknowns) -> tuple[Run, ...]:
     """Return the simulated flights (without bias).
 
-    Windows of one length are simulated together, of all flights.
+    Windows of equal length, of all flights, are simulated together.
     """
     by_flight, groups = {}, {}
     for i, flight in enumerate(data.flights):
-        # Only flights that are equal in each of these share a program.
+        # Flights share a program only if all of these are equal.
         key = (layout.windows[i][1], tuple(flight.known), layout.holds[i])
         groups.setdefault(key, []).append(i)
     for (m, *_), members in groups.items():
@@ -96,7 +97,7 @@ def _simulated(layout: Layout, i: int, drive: Drive, shift: Any) -> Trajectory:
         substeps=layout.substeps,
         delay=shift,
         block=layout.block,
-        # Compiles faster than an adjoint for both modes; least squares differentiates forwards.
+        # It compiles faster than an adjoint for both modes, and least squares uses forward mode.
         adjoint=dfx.ForwardMode(),
         hold=layout.hold(i),
     )
@@ -107,7 +108,7 @@ def _side_by_side(
 ) -> dict[int, Run]:
     """Return the runs of several windows of m samples, by vmap."""
     chained = any(layout.windows[i][0] > 1 for i in members)
-    # With several windows one more sample, the first of the next.
+    # With several windows one sample is added, the first of the next window.
     each = [_cut(layout, data, u, i, m + chained) for i in members]
     stacked = jax.tree.map(lambda *v: jnp.concatenate(v), *each)
 
@@ -117,25 +118,25 @@ def _side_by_side(
         # All members have the same holds.
         late = delays_of(layout.model, params, u.shift, dt)
         if late is not None:
-            # `_with_lead` has shifted by whole samples, but for the one in front.
+            # `_with_lead` has shifted by whole samples, except for the leading sample.
             late = Delays(late.groups, tuple(-1 for _ in late.whole), late.rest)
         run = _simulated(layout, members[0], Drive(params, inputs, dt, state), late)
         return jax.tree.map(lambda v: v[: m + chained], (run.states, run.outputs))
 
     states, outputs = jax.vmap(window)(*stacked)
     names = naming.names(layout.model.Outputs)
-    # In one array, since XLA makes a kernel of every slice.
+    # Signals are joined in one array, because XLA makes a kernel of every slice.
     x, y = (jnp.stack(jax.tree.leaves(v)) for v in (states, outputs))
     runs, first = {}, 0
     for i in members:
-        # The batch has the windows flight after flight.
+        # The batch contains the windows flight after flight.
         count = layout.windows[i][0]
         n = jax.tree.leaves(data.flights[i].inputs)[0].shape[0]
         windows = slice(first, first + count)
 
         def joined(v: Array, windows: slice = windows, n: int = n) -> Array:
             """Join the windows of one flight, of signals (signals, windows, samples)."""
-            # Sample m is the first of the next window; those past n are repetitions.
+            # Sample m is the first of the next window; samples after n are repetitions.
             return v[:, windows, :m].reshape(v.shape[0], -1)[:, :n]
 
         ends = None
@@ -150,12 +151,12 @@ def _side_by_side(
 def _cut(
     layout: Layout, data: Data, u: Unknowns, i: int, samples: int
 ) -> tuple[Any, dict[str, Array], Array, Any]:
-    """Return inputs (windows, samples), known parameters, sample time and initial states of the
-    windows of the i-th flight, (windows,)."""
+    """Return inputs (windows, samples), known parameters, sample time and initial states (windows,)
+    of the i-th flight."""
     flight, (count, m) = data.flights[i], layout.windows[i]
     drive = driven(layout, data, u, i)
     late = delays_of(layout.model, drive.params, u.shift, flight.dt)
-    # The last window may reach past the record: it is padded with the last sample.
+    # The last window may exceed the record, so it is padded with the last sample.
     of_window = m * np.arange(count)[:, None] + np.arange(samples)[None, :]
     state = u.states[i]
     if state is not None:
@@ -168,7 +169,7 @@ def _cut(
 def _with_lead(inputs: Any, samples: np.ndarray, late: Delays | None) -> Any:
     """Return the inputs (windows, m) as they act, delayed.
 
-    With a delay each window has the sample before its first in front, which acts until the first
+    With a delay each window begins with the sample before its first, which acts until the first one
     does: (windows, m + 1).
     """
     if late is None:
@@ -176,14 +177,14 @@ def _with_lead(inputs: Any, samples: np.ndarray, late: Delays | None) -> Any:
     lead = np.concatenate([samples[:, :1] - 1, samples], axis=1)
     leaves, structure = jax.tree.flatten(at(inputs, lead, late))
     for i, v in enumerate(jax.tree.leaves(inputs)):
-        # An input without a delay needs no sample in front.
+        # An input without a delay needs no leading sample.
         if late.group(i) is None:
             leaves[i] = at(v, np.concatenate([samples, samples[:, -1:] + 1], axis=1))
     return jax.tree.unflatten(structure, leaves)
 
 
 def outputs_of(u: Unknowns, runs: tuple[Run, ...]) -> SimulatedOutputs:
-    """Return the simulated outputs with their biases, as reports show them."""
+    """Return the simulated outputs with their biases, as in reports."""
     with_bias = [
         run.outputs + jnp.stack(list(bias.values()))[:, None]
         for run, bias in zip(runs, u.biases, strict=True)
@@ -199,7 +200,11 @@ def simulated_at(layout: Layout, data: Data, z: Float[Array, " q"]) -> Simulated
 
 
 def by_output(layout: Layout, simulated: SimulatedOutputs) -> tuple[dict[str, np.ndarray], ...]:
-    """Name the simulated outputs (N,) of each flight; `simulated` is fetched from the device."""
+    """Return the simulated outputs (N,) of each flight by name.
+
+    Args:
+        simulated: outputs fetched from the device.
+    """
     return tuple(
         {n: np.asarray(y) for n, y in zip(names, run, strict=True)}
         for names, run in zip(layout.outputs, simulated.outputs, strict=True)
@@ -210,8 +215,8 @@ def by_output(layout: Layout, simulated: SimulatedOutputs) -> tuple[dict[str, np
 
 
 _BEHIND = 0.02
-"""of the noise before filters, the least that is behind them: without it the first innovation,
-which an initial state makes zero, has no variance, and the likelihood no maximum"""
+"""Least noise after the filters, as a fraction of the noise before them. Without it the first
+innovation, which an initial state makes zero, has no variance, and the likelihood no maximum."""
 
 
 def signals(layout: Layout) -> list[tuple[int, str]]:
@@ -220,15 +225,15 @@ def signals(layout: Layout) -> list[tuple[int, str]]:
 
 
 def signal_numbers(layout: Layout, data: Data) -> np.ndarray:
-    """Return the signal of every measured number."""
-    # From shapes alone: a constant in a trace.
+    """Return the index of the signal of every measured value."""
+    # Only shapes are used, so that the result is constant in a trace.
     sizes = [data.flights[i].outputs[n].shape[0] for i, n in signals(layout)]
     return np.repeat(np.arange(len(sizes)), sizes)
 
 
 def measured_signals(layout: Layout, data: Data, noise: Noise) -> tuple[Array, Array]:
     """Return all measurements and their sd, each (n,)."""
-    # Joined, since XLA makes a kernel of every single signal.
+    # Signals are joined, because XLA makes a kernel of every single one.
     at = signals(layout)
     sd = jnp.stack([noise.sd[i][n] for i, n in at])
     y = jnp.concatenate([data.flights[i].outputs[n] for i, n in at])
@@ -243,14 +248,14 @@ def measurement_sd(u: Unknowns, output: str, sd: Array) -> Array:
 
 
 def measured_count(data: Data) -> int:
-    """Return the count of measured numbers."""
+    """Return the number of measured values."""
     outputs = [y for flight in data.flights for y in flight.outputs.values()]
     return int(sum(np.isfinite(np.asarray(y)).sum() for y in outputs))
 
 
 def least_noise(y: np.ndarray) -> float:
     """Return the sd [SI] below which the residual of an output (N,) is rounding; NaN is missing."""
-    # A noise of zero would make the next rows infinite; of an output that is zero 1e-12 of its
-    # unit will do.
+    # A noise of zero would make the next rows infinite. For an output of zeros 1e-12 of its unit is
+    # enough.
     rms = float(np.sqrt(np.mean(np.square(y[np.isfinite(y)]))))
     return 1e-12 * (rms if rms > 1e-100 else 1.0)

@@ -1,4 +1,4 @@
-"""Points to start a search from: coarse searches of disturbances and delays, and draws."""
+"""Start points of a search: coarse searches of disturbances and delays, and random draws."""
 
 import jax
 import jax.numpy as jnp
@@ -14,30 +14,29 @@ from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise
 from heli_jax.numerics.jitted import jitted
 
-# A first guess of the disturbances: the greatest likelihood on a coarse grid.
+# First guess of the disturbances: the greatest likelihood on a coarse grid.
 
 
 _DECADES = {"sigma": np.arange(-3.0, 2.5), "tau": np.arange(-1.0, 2.0)}
-"""by which the coarse search moves the parameters: from a disturbance far too faint the likelihood
-has no slope that leads back"""
+"""Decades by which the coarse search moves the parameters. For a far too small disturbance the
+likelihood has no slope towards the optimum."""
 _FINER, _ROUNDS = 0.2, 3
-"""decades between the points of a finer search, and how often it is done: a round reaches 0.4
-decades up and 0.6 down"""
+"""Step [decades] and rounds of the finer search; a round reaches 0.4 decades up and 0.6 down."""
 
 
 def noise_guess_at(
     layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"], *, finer: bool = False
 ) -> Float[Array, " q"]:
-    """Return z with sigma_w and tau_w of the greatest likelihood on a coarse grid about it.
+    """Return z with the sigma_w and tau_w of greatest likelihood on a coarse grid around it.
 
-    Several disturbances are moved first all together, then each by itself.
+    Several disturbances are first moved together, then each alone.
 
     Args:
-        finer: search on, each by itself, to about a tenth of a decade.
+        finer: refine each disturbance to about a tenth of a decade.
     """
     each = [(d.sigma, d.tau) for d in disturbances_of(layout.model)]
     each = [names for names in each if set(names) & set(layout.disturbance)]
-    # A grid over all at once would have 18 to the power of their number.
+    # A grid over all n disturbances at once would have 18^n points.
     coarse = [layout.disturbance, *(each if len(each) > 1 else [])]
     for names in coarse:
         z = _best_on_grid(layout, data, noise, z, names, 1.0)
@@ -49,8 +48,13 @@ def noise_guess_at(
 def _best_on_grid(
     layout: Layout, data: Data, noise: Noise, z0: Array, names: tuple[str, ...], width: float
 ) -> Array:
-    """Return z0 with the named parameters moved by the same factors of every sigma and of every
-    tau; `width` scales the decades."""
+    """Return z0 with the named parameters moved to the best point of a grid.
+
+    All sigmas move by a common factor, and so do all taus.
+
+    Args:
+        width: scale of the decades.
+    """
     kinds = {n: "sigma" if n in layout.sigmas else "tau" for n in layout.disturbance if n in names}
     used = [k for k in _DECADES if k in kinds.values()]
     grid = np.stack(np.meshgrid(*(_DECADES[k] for k in used), indexing="ij"), axis=-1)
@@ -59,7 +63,7 @@ def _best_on_grid(
     for name, kind in kinds.items():
         points[:, layout.disturbance_at(name)] += grid[:, used.index(kind)]
     costs = np.asarray(_costs_at(layout, data, noise, jnp.asarray(points, z0.dtype)))
-    # A filter may overflow at the ends of the grid: such a point is no candidate, and no failure.
+    # A filter may overflow at the ends of the grid; such points are no candidates.
     best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
     return jnp.asarray(points[best], z0.dtype)
 
@@ -69,11 +73,11 @@ def _costs_at(
     layout: Layout, data: Data, noise: Noise, points: Float[Array, "s q"]
 ) -> Float[Array, " s"]:
     """Return the mean of the squared rows at each point."""
-    # One point after another: side by side they would need the memory of as many filters.
+    # Points are evaluated in sequence, because a batch would need one filter's memory for each.
     return jax.lax.map(lambda z: jnp.mean(jnp.square(rows_of(layout, data, noise, z))), points)
 
 
-# Starts about the given one, drawn within the bounds.
+# Starts drawn around the stated one, within the bounds.
 
 
 def draw(
@@ -81,9 +85,9 @@ def draw(
 ) -> Float[Array, "s q"]:
     """Draw starts (s, q): the first is z0, the others differ in the free parameters.
 
-    Between two bounds of one sign the draw is uniform in log, between two of different sign
-    uniform; else log-normal about the start, a factor of three wide or as wide as the prior, and of
-    either sign where any is allowed.
+    Between two bounds of one sign the draw is uniform in the logarithm, between bounds of different
+    sign uniform. Otherwise it is log-normal around the start, with a width of a factor of three or
+    of the prior. The sign is random if any is allowed.
     """
     rng = np.random.default_rng(seed)
     rows = np.tile(np.asarray(z0, dtype=np.float64), (max(starts, 1), 1))
@@ -94,7 +98,7 @@ def draw(
 
 
 def _draw_values(free: Free, size: int, rng: np.random.Generator) -> np.ndarray:
-    # Not at the bounds.
+    # The draw avoids the bounds.
     share = rng.uniform(0.02, 0.98, size)
     low, high = free.lower, free.upper
     if low is not None and high is not None:
@@ -103,41 +107,40 @@ def _draw_values(free: Free, size: int, rng: np.random.Generator) -> np.ndarray:
         return low + (high - low) * share
     width = 1.1  # e^1.1 is a factor of three
     if free.prior is not None and free.prior.mean:
-        # Twice as wide as the prior: it would pull back a start beyond.
+        # Beyond twice its width the prior would pull a start back.
         width = min(width, 2.0 * free.prior.sd / abs(free.prior.mean))
-    # Log-normal: a parameter of physics is more likely wrong by a factor than by an amount, and
-    # keeps its sign.
+    # Physical parameters are more likely wrong by a factor than by an amount, and keep their sign.
     values = free.start * np.exp(width * rng.standard_normal(size))
     if transforms.changes_sign(free):
-        # As large as the start, or about the mean of the prior.
+        # The draw has the size of the start, or is around the mean of the prior.
         drawn = rng.standard_normal((2, size))
         values = transforms.scale(free) * np.exp(width * drawn[0]) * np.sign(drawn[1])
         if free.prior is not None:
             values = free.prior.mean + 2.0 * free.prior.sd * drawn[0]
-    # A value beyond a single bound is replaced by the start.
+    # The start replaces a value beyond a single bound.
     return np.where([transforms.inside(free, float(v)) for v in values], values, free.start)
 
 
-# The start where a delay is free: a misfit has a valley for each period of the motion by which a
-# delay is wrong, and in a loop a narrow one about the truth alone. The misfit is scanned over each
-# delay, and the other unknowns take a step at each of its values (variable projection: Golub and
-# Pereyra, 1973).
+# Start of a free delay. The misfit has a minimum at each period of the motion, and in a closed loop
+# a narrow one near the truth only. So the misfit is scanned over each delay, and the other unknowns
+# take a step at each value (variable projection: Golub and Pereyra, 1973).
 
 
 _EARLIEST, _LATEST = -0.1, 0.2
-"""s: range of a delay without bounds; to twice its start at least"""
+"""Range of a delay without bounds [s], extended to at least twice its start."""
 _SHIFT_RANGE = 0.8
-"""of the largest time shift: at the bounds themselves the coordinate is infinite"""
+"""Fraction of the largest time shift, because the coordinate is infinite at the bounds."""
 _OFF_BOUNDS = 0.02
-"""of the range between two bounds, for the same reason"""
+"""Distance from bounds as a fraction of their range, for the same reason."""
 _FIRST = 0.2
-"""of a step: the least value of a delay that is positive"""
+"""Least value of a positive delay, as a fraction of a step."""
 _STEP = 1.4
-"""rad: of the motion that a delay shifts, between two values of it; a valley is a half turn wide"""
+"""Phase of the delayed motion between two values of the delay [rad]; a minimum is a half turn
+wide."""
 _FEWEST, _MOST = 5, 64
-"""values of a delay"""
+"""Fewest and most values of a delay."""
 _EVALUATIONS = 4
-"""of the optimiser at each value: a step, and two shorter ones where it is refused"""
+"""Evaluations of the optimiser at each value: a step, and two shorter ones if it is rejected."""
 
 
 def delay_start(
@@ -148,8 +151,11 @@ def delay_start(
     z0: Float[Array, " q"],
     J: Float[np.ndarray, "n q"],
 ) -> Float[Array, " q"]:
-    """Return z0, or where a delay or the time shift is free the deepest valley of the misfit over
-    it; J is the Jacobian at z0."""
+    """Return z0, or the deepest minimum of the misfit over a free delay or time shift.
+
+    Args:
+        J: the Jacobian at z0.
+    """
     least, best = np.inf, z0
     for i, values in _grids(problem, layout, data, J).items():
         start, held = best, np.arange(layout.size) == i
@@ -161,7 +167,7 @@ def delay_start(
 
 
 def _grids(problem: Problem, layout: Layout, data: Data, J: np.ndarray) -> dict[int, np.ndarray]:
-    """Return the coordinates to try, in increasing order, by number of the unknown."""
+    """Return the coordinates to try, in increasing order, by index of the unknown."""
     grids = {}
     for name in problem.model.delay_parameters:
         if name not in problem.free:
@@ -190,7 +196,7 @@ def _between(low: float, high: float, step: float) -> np.ndarray:
 
 
 def _step(layout: Layout, data: Data, J: np.ndarray, i: int) -> float:
-    """Return the step between values of a delay [s], by how fast its effect on the rows changes."""
+    """Return the step between values of a delay [s], from how fast the rows change with it."""
     dt = min(float(f.dt) for f in data.flights)
     if layout.noise_model != "white":
         return dt

@@ -1,8 +1,8 @@
-"""The unknowns of a problem: their places in one vector z, and the numbers of the problem.
+"""The unknowns of a problem: their places in the vector z, and the numbers of the problem.
 
 z holds coordinates of the free parameters, then input gains, the time shift, the disturbance, the
-noise of sensors before filters and of outputs, then for each flight the initial state, the biases
-and the offsets of the inputs.
+noise of sensors before filters and of outputs. For each flight the initial state, the biases and
+the offsets of the inputs follow.
 """
 
 import functools
@@ -23,57 +23,57 @@ from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.transforms import Real
 
-# Any stands for a record class of the model (Params, State, Inputs), and for numbers that are
-# NumPy's before they are on the device and JAX's after.
+# Any: a record class of the model (Params, State, Inputs), or NumPy values that become JAX arrays.
 
 _BLOCK = 32
 _SCALES = 40.0
-"""logarithm by which the noise of one output may differ from its guess"""
+"""Largest difference between the log noise of one output and its guess."""
 _FAINTEST, _STRONGEST = 60.0, 10.0
-"""logarithms by which sigma_w may fall below the measured motion, and rise above the disturbance
-that moves the model so far within one sample"""
+"""Limits of log sigma_w: below the measured motion, and above the disturbance that moves the model
+as far within one sample."""
 _SHORTEST, _LONGEST = 0.01, 1e3
-"""bounds of tau_w, in samples and in lengths of the record"""
+"""Bounds of tau_w, in samples and in record lengths."""
 
 
 class FlightData(NamedTuple):
     """One flight as arrays."""
 
     dt: Any
-    """[s]"""
+    """Sample time [s]."""
     inputs: Any
-    """the model's Inputs, arrays (N,), SI"""
+    """The model's Inputs, arrays (N,), SI."""
     outputs: dict[str, Any]
-    """measured, arrays (N,), SI, NaN where one is missing"""
+    """Measured outputs, arrays (N,), SI; NaN for missing samples."""
     known: dict[str, Any]
-    """parameters that differ in this flight, SI"""
+    """Parameters specific to this flight, SI."""
     state_scale: dict[str, Any]
-    """sd of the weak prior on the initial state"""
+    """sd of the weak prior on the initial state."""
     bias_scale: dict[str, Any]
-    """sd of the weak prior on the bias"""
+    """sd of the weak prior on the bias."""
     offset_scale: dict[str, Any]
-    """sd of the weak prior on the offset of each input"""
+    """sd of the weak prior on the offset of each input."""
     by_instrument: Any = None
-    """the model's Inputs, arrays (N,): the part that follows the instruments; None without"""
+    """The part of the model's Inputs that follows the instruments, arrays (N,); None without
+    instruments."""
 
 
 class Data(NamedTuple):
     """All numbers of a problem."""
 
     base: Any
-    """the vehicle's parameters by name"""
+    """The vehicle's parameters by name."""
     sign: Any
-    """of the start; of a linear coordinate its scale"""
+    """Sign of the start; the scale of a linear coordinate."""
     low: Any
     high: Any
     prior_mean: Any
     prior_sd: Any
-    """inf where a parameter has no prior"""
+    """sd of the prior; inf without a prior."""
     flights: tuple[FlightData, ...]
 
 
 class Layout(eqx.Module):
-    """The static part of a problem: the unknowns and their order."""
+    """Static part of a problem: the unknowns and their order."""
 
     model: Model
     free: tuple[str, ...] = eqx.field(static=True)
@@ -83,48 +83,48 @@ class Layout(eqx.Module):
     initial_state: bool = eqx.field(static=True)
     bias: bool = eqx.field(static=True)
     offsets: tuple[str, ...] = eqx.field(static=True)
-    """inputs with an offset of their own in each flight"""
+    """Inputs with an offset of their own in each flight."""
     outputs: tuple[tuple[str, ...], ...] = eqx.field(static=True)
-    """by flight, sorted by name: the order of the residuals"""
+    """Outputs by flight, sorted by name: the order of the residuals."""
     disturbance: tuple[str, ...] = eqx.field(static=True)
-    """parameters of the disturbance, estimated beside the others by filter error"""
+    """Disturbance parameters that filter error estimates."""
     filtered: tuple[str, ...] = eqx.field(static=True)
-    """filter error: outputs whose sensor's noise came through on-board low-passes, of unknown sd"""
+    """Filter error: outputs with sensor noise of unknown sd before on-board low-passes."""
     scaled: tuple[str, ...] = eqx.field(static=True)
-    """filter error: outputs whose noise has an unknown factor of its own"""
+    """Filter error: outputs with their own unknown noise factor."""
     objective: Any = eqx.field(static=True)
-    """the method's `Objective`, whose class stands above this module"""
+    """The method's `Objective`, whose module imports this one."""
     concentrated: bool = eqx.field(static=True)
-    """filter error: True if a common factor of all noise is concentrated out of the likelihood"""
+    """Filter error: True if a common factor of all noise is concentrated out of the likelihood."""
     solver: str | None = eqx.field(static=True)
     substeps: int = eqx.field(static=True)
     block: int = eqx.field(static=True)
-    """samples per step of the exact recurrence"""
+    """Samples per step of the exact recurrence."""
     windows: tuple[tuple[int, int], ...] = eqx.field(static=True)
-    """by flight the number of windows, and the samples of each"""
+    """Number of windows and samples of each, by flight."""
     continuity: float | None = eqx.field(static=True)
-    """see `Problem.continuity`"""
+    """See `Problem.continuity`."""
     holds: tuple[tuple[str, ...], ...] = eqx.field(static=True)
-    """by flight the hold of each of the model's inputs (`Flight.hold`)"""
+    """Hold of each of the model's inputs by flight (`Flight.hold`)."""
     one_covariance: tuple[tuple[int, ...], ...] = eqx.field(static=True)
-    """filter error: groups of flights that share covariances"""
+    """Filter error: groups of flights that share covariances."""
     flight_facts: tuple[Any, ...] = eqx.field(static=True, default=())
-    """by flight `Objective.flight_facts`"""
+    """`Objective.flight_facts` by flight."""
 
     @property
     def noise_model(self) -> str:
-        """The noise model of the method (`Objective.noise_model`)."""
+        """Noise model of the method (`Objective.noise_model`)."""
         return self.objective.noise_model
 
     @property
     def of_interest(self) -> tuple[str, ...]:
-        """The parameters of interest, first in z: the free parameters, the gains and the shift."""
+        """Parameters of interest, first in z: free parameters, gains and the shift."""
         gains = tuple(f"gain {name}" for name in self.gains)
         return (*self.free, *gains, *(("time_shift",) if self.shift else ()))
 
     @property
     def states(self) -> tuple[str, ...]:
-        """The states whose initial values are unknowns: all that are not random."""
+        """States whose initial values are unknowns: all that are not random."""
         if not self.initial_state:
             return ()
         # The state of a disturbance has a distribution at the first sample.
@@ -133,33 +133,32 @@ class Layout(eqx.Module):
 
     @property
     def first_nuisance(self) -> int:
-        """The place in z of the first nuisance parameter of a flight: initial states, biases and
-        input offsets, which have weak priors."""
+        """Index in z of the first nuisance parameter of a flight: initial states, biases and input
+        offsets, which have weak priors."""
         return len(self.of_interest) + len(self.noises) + len(self.scaled)
 
     @property
     def noises(self) -> tuple[str, ...]:
-        """The parameters of process noise: those of the disturbance, then the sds of noise before
-        filters."""
+        """Parameters of process noise: disturbance parameters, then sds of noise before filters."""
         return (*self.disturbance, *map(sensor_noise, self.filtered))
 
     @property
     def sizes(self) -> tuple[str, ...]:
-        """The standard deviations among these."""
+        """Standard deviations among the parameters of process noise."""
         return (*self.sigmas, *map(sensor_noise, self.filtered))
 
     @property
     def sigmas(self) -> tuple[str, ...]:
-        """The disturbances' standard deviations among the unknowns."""
+        """Standard deviations of disturbances among the unknowns."""
         return tuple(d.sigma for d in disturbances_of(self.model) if d.sigma in self.disturbance)
 
     def disturbance_at(self, name: str) -> int:
-        """Return the place in z of a parameter of process noise."""
+        """Return the index in z of a parameter of process noise."""
         return len(self.of_interest) + self.noises.index(name)
 
     @property
     def size(self) -> int:
-        """The number of unknowns."""
+        """Number of unknowns."""
         return self.first_nuisance + sum(places.every.size for places in flight_places(self))
 
     def hold(self, i: int) -> dict[str, str]:
@@ -168,27 +167,28 @@ class Layout(eqx.Module):
 
     @property
     def determined(self) -> int:
-        """The number of unknowns, where the states that continuity ties together count once."""
+        """Number of unknowns, with states linked by continuity counted once."""
         if self.continuity is None:
             return self.size
-        # The states at the start of a window are nearly those at the end of the one before it.
+        # With continuity the states at the start of a window nearly equal those at the end of the
+        # last.
         return self.size - len(self.states) * sum(count - 1 for count, _ in self.windows)
 
 
 class FlightUnknown(NamedTuple):
-    """An unknown of one flight, whose weak prior has an sd of ten times the signal."""
+    """An unknown of one flight; its weak prior has an sd of ten times the signal."""
 
     label: str
-    """as the fit names it: 'flight 1/bias p', 'flight 1/initial p of window 2'"""
+    """Name in the fit: 'flight 1/bias p', 'flight 1/initial p of window 2'."""
     kind: str
-    """the switch in `Nuisance` that it belongs to"""
+    """Its switch in `Nuisance`."""
     of: str
-    """the state, output or input"""
+    """Its state, output or input."""
     flight: int
 
     @property
     def words(self) -> str:
-        """As a sentence names it, whichever flight it belongs to: 'the bias of p'."""
+        """Name in a sentence, for any flight: 'the bias of p'."""
         kinds = {"initial_state": "initial", "bias": "bias of", "input_offset": "offset of"}
         return f"the {kinds[self.kind]} {self.of}"
 
@@ -204,7 +204,7 @@ class FlightUnknown(NamedTuple):
 
 
 class FlightPlaces(NamedTuple):
-    """The places of one flight's unknowns in z."""
+    """Indices of one flight's unknowns in z."""
 
     states: Int[np.ndarray, "windows k"]
     biases: Int[np.ndarray, " p"]
@@ -212,7 +212,7 @@ class FlightPlaces(NamedTuple):
 
     @property
     def constants(self) -> Int[np.ndarray, " c"]:
-        """The biases and the offsets."""
+        """Biases and offsets."""
         return np.concatenate([self.biases, self.offsets])
 
     @property
@@ -222,7 +222,7 @@ class FlightPlaces(NamedTuple):
 
 
 def flight_places(layout: Layout) -> list[FlightPlaces]:
-    """Return the places of each flight's unknowns in z."""
+    """Return the indices of each flight's unknowns in z."""
     places, at, k = [], layout.first_nuisance, len(layout.states)
     for (windows, _), outputs in zip(layout.windows, layout.outputs, strict=True):
         sizes = windows * k, len(outputs) if layout.bias else 0, len(layout.offsets)
@@ -248,20 +248,21 @@ class Noise(NamedTuple):
     """The noise by which residuals are divided."""
 
     sd: tuple[dict[str, Any], ...]
-    """of the measurement noise, by flight and output; `Layout.scaled` ones times their factors"""
+    """sd of the measurement noise by flight and output; those in `Layout.scaled` are multiplied by
+    their factors."""
     log_variance_ratio: Any
-    """filter error: the mean over all measurements of log(innovation variance / sd^2) at the last
-    relaxation, which gives the rows variance 1; frequency error: the mean over all lines of log
-    det(spectrum)"""
+    """Filter error: mean over all measurements of log(innovation variance / sd^2) at the last
+    relaxation, which gives the rows variance 1. Frequency error: mean over all lines of log
+    det(spectrum)."""
     whitening: Any = ()
-    """frequency error: by record (K, p, p) the whitening matrices of its lines; () else"""
+    """Frequency error: whitening matrices of each record's lines (K, p, p); otherwise ()."""
     corrections: Any = ()
-    """filter error: by parameter the slope of a correction of the likelihood, and where it is zero
-    (2,), see `noise_scales`; () where the model integrates no sensor"""
+    """Filter error: slope of a likelihood correction by parameter, and where the correction is zero
+    (2,), see `noise_scales`; () if the model integrates no sensor."""
 
 
 class Solution(NamedTuple):
-    """A point, with all that evaluates it: the end of a fit, say."""
+    """A point with all that is needed to evaluate it, such as the end of a fit."""
 
     layout: Layout
     data: Data
@@ -270,25 +271,25 @@ class Solution(NamedTuple):
 
 
 class Unknowns(NamedTuple):
-    """The vector z taken apart, in the units of the model."""
+    """The vector z split into names, in the units of the model."""
 
     params: dict[str, Any]
     noise: dict[str, Any]
     scales: dict[str, Any]
-    """factors of the measurement noise by output"""
+    """Factors of the measurement noise by output."""
     gains: dict[str, Any]
     shift: Any
     states: tuple[Any, ...]
-    """by flight the State at the first sample, with arrays (windows,) where there are several; None
-    where it is the model's own"""
+    """State at the first sample by flight, with arrays (windows,) if there are several; None for
+    the model's own."""
     biases: tuple[dict[str, Any], ...]
     offsets: tuple[dict[str, Any], ...]
-    """of the inputs, by flight"""
+    """Offsets of the inputs by flight."""
 
 
 def layout_of(problem: Problem, flights: tuple[Flight, ...]) -> Layout:
-    """The static side of a problem over the given flights."""
-    # All of it is hashable and static: two problems of one layout share their compiled programs.
+    """Return the static part of a problem for the given flights."""
+    # All of it is hashable and static, so problems with equal layouts share compiled programs.
     objective = objective_of(problem.method)
     scaled, concentrated = objective.scaled_outputs(problem)
     nuisance = problem.nuisance
@@ -302,7 +303,7 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...]) -> Layout:
         initial_state=nuisance.initial_state,
         bias=nuisance.bias,
         offsets=problem.offset_inputs,
-        # By name, as JAX orders the dictionaries in everything that is compiled.
+        # JAX orders dictionaries by name in compiled programs.
         outputs=tuple(tuple(sorted(f.outputs)) for f in flights),
         disturbance=tuple(problem.noise),
         filtered=tuple(problem.filtered_noise),
@@ -311,7 +312,7 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...]) -> Layout:
         concentrated=concentrated,
         solver=problem.solver,
         substeps=problem.substeps,
-        # Several samples a step only where the recurrence is exact.
+        # Only an exact recurrence allows several samples in a step.
         block=_BLOCK if exact else 1,
         windows=tuple(_windows(problem, flight) for flight in flights),
         continuity=problem.continuity,
@@ -326,7 +327,10 @@ def _holds(model: Model, flight: Flight) -> tuple[str, ...]:
 
 
 def _one_covariance(problem: Problem, flights: tuple[Flight, ...]) -> tuple[tuple[int, ...], ...]:
-    """Return the flights of a linear model without missing samples, in groups of one covariance."""
+    """Return groups of flights that share one covariance.
+
+    They are flights of a linear model without missing samples.
+    """
     if not (problem.model.linear and problem.noise_model == "disturbance"):
         return ()
     groups: dict[Any, list[int]] = {}
@@ -340,12 +344,12 @@ def _one_covariance(problem: Problem, flights: tuple[Flight, ...]) -> tuple[tupl
 
 
 def _windows(problem: Problem, flight: Flight) -> tuple[int, int]:
-    """Return the number of windows, and the samples of each; a short rest belongs to the last."""
+    """Return the number of windows and the samples of each; a short rest belongs to the last."""
     n = flight.n_samples
     if problem.window is None:
         return 1, n
     samples = round(problem.window / flight.dt)
-    # Only about the length of `Problem.window`: windows of one length share one vmap.
+    # `Problem.window` is met only roughly, because windows of equal length share one vmap.
     count = max(1, round(n / samples))
     return count, -(-n // count)
 
@@ -356,11 +360,11 @@ def value_of(layout: Layout, data: Data, i: int, z: Real) -> Any:
 
 
 def disturbance_limits(layout: Layout, data: Data) -> dict[str, tuple[Any, Any]]:
-    """Return the lowest and highest logarithm of each parameter of the disturbances.
+    """Return the lowest and highest logarithm of each disturbance parameter.
 
-    A correlation time below a hundredth of a sample is white noise in any record, one above a
-    thousand records a random walk. sigma_w is limited by the size of the measured motion. Without
-    limits a likelihood without a maximum would drive them to overflow.
+    A correlation time below a hundredth of a sample is white noise, and one above a thousand
+    records is a random walk. sigma_w is limited by the size of the measured motion. Without limits
+    a likelihood without a maximum would drive them to overflow.
     """
     dt = functools.reduce(jnp.minimum, [flight.dt for flight in data.flights])
     longest = functools.reduce(
@@ -371,8 +375,8 @@ def disturbance_limits(layout: Layout, data: Data) -> dict[str, tuple[Any, Any]]
     motion = functools.reduce(
         jnp.maximum, [0.1 * s for f in data.flights for s in f.bias_scale.values()]
     )
-    # sigma_w is an acceleration: over one sample it moves an angle by sigma_w dt^2, hence the
-    # -2 log(dt) at the upper end.
+    # sigma_w is an acceleration. Over one sample it moves an angle by sigma_w dt^2, hence -2
+    # log(dt) in the upper limit.
     limits = dict.fromkeys(
         layout.disturbance, (jnp.log(_SHORTEST * dt), jnp.log(_LONGEST * longest))
     )
@@ -380,7 +384,7 @@ def disturbance_limits(layout: Layout, data: Data) -> dict[str, tuple[Any, Any]]
         size = jnp.log(motion)
         limits[name] = (size - _FAINTEST, size - 2.0 * jnp.log(dt) + _STRONGEST)
     for output in layout.filtered:
-        # The scale of a bias is ten times the output, which no noise exceeds by far.
+        # The scale of a bias is ten times the output, more than any noise.
         scales = [f.bias_scale[output] for f in data.flights if output in f.bias_scale]
         size = jnp.log(functools.reduce(jnp.maximum, scales))
         limits[sensor_noise(output)] = (size - _FAINTEST, size)
@@ -395,12 +399,12 @@ def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
     at = q + len(layout.gains)
     shift = None
     if layout.shift:
-        # Bounded smoothly: a clip would leave a shift at the bound without a derivative.
+        # The bound is smooth, because a clipped shift would have no derivative at the bound.
         shift = MAX_TIME_SHIFT * jnp.tanh(z[at])
         at += 1
     limits = disturbance_limits(layout, data)
-    # Clipped, not transformed: inside the limits the likelihood keeps its shape in the logarithm,
-    # and outside its derivative is zero, which shows that the parameter has no effect.
+    # Clipping keeps the likelihood's shape in the logarithm inside the limits. Outside, the zero
+    # derivative shows that the parameter has no effect.
     noise = {
         name: jnp.exp(jnp.clip(z[at + i], *limits[name])) for i, name in enumerate(layout.noises)
     }
@@ -411,7 +415,7 @@ def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
 
 
 def scales_of(layout: Layout, z: Float[Array, " q"]) -> dict[str, Any]:
-    """Return by output the factor on the guess of its noise, for those that have one."""
+    """Return the estimated factors on the guessed noise, by output."""
     first = layout.first_nuisance - len(layout.scaled)
     return {
         name: jnp.exp(jnp.clip(z[first + i], -_SCALES, _SCALES))

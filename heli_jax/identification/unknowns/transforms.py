@@ -1,4 +1,4 @@
-"""Free parameters as coordinates: log, linear where the sign is open, or logit between bounds of
+"""Coordinates of free parameters: logarithmic, linear for any sign, or logit between bounds of
 different sign."""
 
 import math
@@ -11,7 +11,7 @@ from jaxtyping import Array
 from heli_jax.identification.problem import Free
 
 type Real = Array | np.ndarray | np.floating | float
-"""real numbers of any shape, traced or not"""
+"""Real numbers of any shape, traced or not."""
 
 KINDS = ("log", "linear", "logit")
 """log: x = sign e^z. linear: x = scale z. logit: between two bounds of different sign."""
@@ -20,8 +20,8 @@ KINDS = ("log", "linear", "logit")
 def kind(free: Free) -> str:
     """Return the coordinate of a free parameter: a logarithm unless zero is inside its bounds.
 
-    Other bounds limit the optimiser and do not bend the coordinate: a product of powers that the
-    data determine, such as a/Ixx, is a straight valley in logarithms.
+    Other bounds limit the optimiser without bending the coordinate. A product of powers that the
+    data determine, such as a/Ixx, is then a straight valley in logarithms.
     """
     low, high = limits(free)
     if low >= 0 or high <= 0:
@@ -32,10 +32,10 @@ def kind(free: Free) -> str:
 
 
 def limits(free: Free) -> tuple[float, float]:
-    """Return lower and upper bound; a missing one is zero or infinity by the sign of the start.
+    """Return lower and upper bound; the start's sign sets a missing one to zero or infinity.
 
-    A positive mass below 2 kg lies between 0 and 2. Where any sign is allowed missing bounds are
-    infinite.
+    A positive mass with upper bound 2 kg lies between 0 and 2. If any sign is allowed, missing
+    bounds are infinite.
     """
     if free.sign == "any":
         return (
@@ -49,7 +49,7 @@ def limits(free: Free) -> tuple[float, float]:
 
 
 def changes_sign(free: Free) -> bool:
-    """Return True if a parameter may change its sign, and need not stay between bounds."""
+    """True if a parameter may change its sign, and need not stay between bounds."""
     return kind(free) == "linear"
 
 
@@ -64,45 +64,48 @@ def scale(free: Free) -> float:
 
 
 def sign_or_scale(free: Free) -> float:
-    """Return the `sign` that `to_value` and `to_coordinate` take."""
+    """Return the `sign` argument of `to_value` and `to_coordinate`."""
     if changes_sign(free):
         return scale(free)
     return math.copysign(1.0, free.start) if free.start else 1.0
 
 
 def inside(free: Free, value: float) -> bool:
-    """Return True if a value lies within the bounds."""
+    """True if a value lies within the bounds."""
     low, high = limits(free)
     return bool(low <= value <= high)
 
 
 def coordinates(free: Free, kind: str, values: Real) -> np.ndarray:
-    """Return the coordinates of values; NaN where there is none."""
+    """Return the coordinates of values; NaN for values without one."""
     return np.asarray(to_coordinate(kind, values, sign_or_scale(free), *limits(free)))
 
 
 def coordinate(free: Free, kind: str, value: float) -> float | None:
-    """Return the coordinate of a value; None where it lies outside the bounds, or has none."""
+    """Return the coordinate of a value; None outside the bounds, or without a coordinate."""
     z = float(coordinates(free, kind, value))
     return z if inside(free, value) and math.isfinite(z) else None
 
 
 def at_bound(free: Free, value: float) -> bool:
-    """Return True if an estimate is at a stated bound."""
+    """True if an estimate is at a stated bound."""
     low, high = free.lower, free.upper
     width = high - low if low is not None and high is not None else abs(value)
     near = 1e-3 * width
-    # Near a small lower bound of a wide range in proportion to the bound: coordinates are
-    # logarithms.
+    # For a small lower bound of a wide range the tolerance is relative to the bound, because
+    # coordinates are logarithms.
     by_low = low is not None and value - low < min(near, 1e-3 * abs(low) if low else near)
     by_high = high is not None and high - value < near
     return bool(by_low or by_high)
 
 
 def to_value(transform: str, z: Real, sign: Real, low: Real, high: Real) -> Real:
-    """Return the value of a coordinate of one of `KINDS`; `sign` is the scale of a linear one
-    (`sign_or_scale`)."""
-    # The branch is known before tracing: the compiled program holds one expression.
+    """Return the value of a coordinate of one of `KINDS`.
+
+    Args:
+        sign: sign, or scale of a linear coordinate (`sign_or_scale`).
+    """
+    # The branch is static, so the compiled program contains one expression.
     if transform == "log":
         return sign * jnp.exp(z)
     if transform == "linear":
@@ -111,9 +114,8 @@ def to_value(transform: str, z: Real, sign: Real, low: Real, high: Real) -> Real
 
 
 def to_coordinate(transform: str, x: Real, sign: Real, low: Real, high: Real) -> Real:
-    """Return the coordinate of a value inside the bounds: the inverse of `to_value`, of numbers
-    alone."""
-    # By NumPy: each step by itself would be a program of JAX's to load.
+    """Return the coordinate of a value inside the bounds: the inverse of `to_value`, not traced."""
+    # JAX would load a separate program for each operation, so NumPy is used.
     x, sign, low, high = (np.asarray(v) for v in (x, sign, low, high))
     # A value on a bound of a logit has an infinite coordinate.
     with np.errstate(all="ignore"):
@@ -129,6 +131,6 @@ def to_coordinate(transform: str, x: Real, sign: Real, low: Real, high: Real) ->
 def coordinate_limits(kind: str, sign: Real, low: Real, high: Real) -> np.ndarray:
     """Return the lowest and the highest coordinate within the bounds (2,)."""
     ends = np.array([to_coordinate(kind, bound, sign, low, high) for bound in (low, high)])
-    # Zero is no bound of a logarithm on its other side.
+    # Zero does not bound a logarithm from the other side.
     ends = np.where(np.isnan(ends), -np.inf, ends)
     return np.sort(ends)

@@ -1,7 +1,6 @@
-"""The report's figures: plain data in, a `Chart` out; None where there is nothing to draw.
+"""The report's figures: each turns plain data into a `Chart`, or None if there is nothing to draw.
 
-Pairs of samples are no lines: they are Matplotlib's, drawn within `style.in_style()`, and images on
-the page.
+Scatter plots of samples use Matplotlib within `style.in_style()` and are images on the page.
 """
 
 from heli_jax.report.figures.bode import bode_unit, draw_response, match

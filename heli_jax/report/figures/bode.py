@@ -1,7 +1,7 @@
 """Bode figures: model beside data, and a measured response.
 
-Frequencies are in Hz, as configurations have bands; a phase lies on the branch nearest to that of
-the smoothest curve.
+Frequencies are in Hz, as in configurations. A phase lies on the branch nearest to that of the
+smoothest curve.
 """
 
 import itertools
@@ -21,22 +21,22 @@ from heli_jax.report.charts import Chart, Panel, Series, band, bars, limits_of, 
 from heli_jax.report.fitted_responses import FittedPair
 
 _TURN = 2.0 * np.pi
-"""rad/s of 1 Hz"""
+"""rad/s of 1 Hz."""
 _DB = 20.0 / np.log(10.0)
 SEEN, BEYOND_CHANCE = 0.1, 0.3
-"""mean coherence over an octave below which it is chance, and from which on it is not; the axis
-ends at the last bin of the second"""
+"""Mean coherence over an octave below which it is chance, and above which it is not; the axis ends
+at the last bin above the second."""
 _WIDE, _WIDE_DATA = 1.0, 0.5
-"""relative random error above which a measured response, and one beside a model, is not drawn"""
+"""Relative random error above which a measured response, and one beside a model, is not drawn."""
 _BY_CHANCE = 2.0
-"""least mean coherence over an octave times the number of averages, of a bin that sets the axes and
-the branch of the phase"""
+"""Least product of mean coherence over an octave and number of averages, for a bin that sets the
+axes and the phase branch."""
 _MARGINS = (6.0, 45.0)
-"""margins of the axes [dB, deg]"""
+"""Margins of the axes [dB, deg]."""
 _ERRORS = (12.0, 90.0)
-"""half range of the error panels [dB, deg]"""
+"""Half range of the error panels [dB, deg]."""
 _FEW = 3
-"""fewest bins that set the axes"""
+"""Fewest bins that set the axes."""
 
 
 def _chart(title: str, note: str, limits: Sequence[float], panels: Sequence[Panel]) -> Chart:
@@ -51,16 +51,16 @@ def _nearest(degrees: np.ndarray, along: np.ndarray) -> np.ndarray:
 
 
 def phase(H: np.ndarray) -> np.ndarray:
-    """Unwrapped phase (k,) [deg], begun between -270 and 90."""
+    """Return the unwrapped phase (k,) [deg], which starts between -270 and 90."""
     unwrapped = np.degrees(np.unwrap(np.angle(H)))
     first = unwrapped[0] if unwrapped.size else 0.0
-    # 1e-6 against rounding at +90.
+    # 1e-6 allows for rounding at +90.
     return unwrapped - 360.0 * np.ceil((first - 90.0 - 1e-6) / 360.0)
 
 
 def baseline_response(baseline: Baseline, omega: np.ndarray) -> np.ndarray:
-    """Hd(e^{i omega dt}) (k,) of the recursive least squares, without the hold of its input."""
-    # On the unit circle: the continuous form may be an approximation.
+    """Return Hd(e^{i omega dt}) (k,) of the recursive least squares, without its input's hold."""
+    # The unit circle is used because the continuous form may be an approximation.
     turns = omega * baseline.dt
     z, hold = np.exp(1j * turns), np.sinc(turns / (2.0 * np.pi)) * np.exp(-0.5j * turns)
     with np.errstate(all="ignore"):
@@ -70,7 +70,7 @@ def baseline_response(baseline: Baseline, omega: np.ndarray) -> np.ndarray:
 def _curve(
     label: str, omega: np.ndarray, H: np.ndarray, degrees: np.ndarray, color: str, width: float
 ) -> tuple[Series, Series]:
-    """Magnitude [dB] and phase of a response."""
+    """Return magnitude [dB] and phase of a response."""
     # A zero has no phase; NaN breaks the line.
     good = np.isfinite(H) & (np.abs(H) > 0)
     gain = np.where(good, _DB * np.log(np.where(good, np.abs(H), 1.0)), np.nan)
@@ -90,7 +90,7 @@ def _bars(
     color: str,
     label: str = "",
 ) -> tuple[Series, Series]:
-    """Gain [dB] and phase with error bars, by the relative errors of the two."""
+    """Return gain [dB] and phase with error bars from the relative errors of both."""
     hz = omega / _TURN
     down = -_DB * np.log(np.maximum(1.0 - relative[0], 1e-2))
     reach = np.degrees(np.minimum(relative[1], np.pi))
@@ -104,7 +104,7 @@ def _coherence(omega: np.ndarray, coherence: np.ndarray) -> Panel:
 
 
 def bode_unit(model: Model, output: str, input: str) -> str:
-    """`dB re rad/m`; plain dB where a unit is missing, or is a quotient and would need brackets."""
+    """Return `dB re rad/m`; only `dB` if a unit is missing or would need brackets."""
     out, into = naming.unit(model.Outputs, output), naming.unit(model.Inputs, input)
     if into == "1":
         return f"dB re {out}" if out and out != "1" else "dB"
@@ -112,7 +112,7 @@ def bode_unit(model: Model, output: str, input: str) -> str:
 
 
 def _last_of(omega: np.ndarray, coherence: np.ndarray, known: np.ndarray) -> float:
-    """Return the last frequency of the axes [rad/s]: that of a coherent bin."""
+    """Return the last frequency of the axes [rad/s], that of a coherent bin."""
     mean = octave_mean(omega, coherence)
     for bins in (known & (mean >= BEYOND_CHANCE), known & (mean >= SEEN), known):
         if bins.any():
@@ -121,7 +121,7 @@ def _last_of(omega: np.ndarray, coherence: np.ndarray, known: np.ndarray) -> flo
 
 
 def _room(values: np.ndarray, margin: float, series: Sequence[Series]) -> tuple[float, float]:
-    """Return limits by given values; by all series if there are none."""
+    """Return limits that contain given values, or all series if there are none."""
     if not values.size:
         return limits_of(series)
     return float(np.min(values)) - margin, float(np.max(values)) + margin
@@ -132,7 +132,7 @@ def match(pair: FittedPair, unit: str, note: str, baseline: Baseline | None = No
     intervals and the envelopes of unnoticeable dynamics.
 
     Args:
-        baseline: the recursive least squares of this input and output, as a further curve.
+        baseline: the recursive least squares of this input and output, as an additional curve.
     """
     omega, model = pair.omega, pair.model
     known = np.isfinite(pair.H) & (pair.sd < _WIDE_DATA * np.abs(pair.H))
@@ -169,7 +169,7 @@ def match(pair: FittedPair, unit: str, note: str, baseline: Baseline | None = No
         limits = _room(ruling, _MARGINS[k], series)
         panels.append(panel(words, series, height, limits=limits))
     panels.append(_coherence(omega, pair.coherence))
-    # Data over model, with the random error and that of the parameters.
+    # The ratio of data and model has the random error and that of the parameters.
     both = modelled[known]
     error = H[both] / model.response[known & modelled]
     reach = [np.hypot(own[both], Z95 * sd[known & modelled]) for sd in (gain_sd, phase_sd)]
@@ -214,7 +214,7 @@ def draw_response(
     colours = itertools.cycle((style.VERMILLION, style.GREEN, style.PURPLE))
     for (label, H), color in zip(fits, colours, strict=False):
         turned = phase(H)
-        # The branch of the whole curve.
+        # The whole curve moves to one branch.
         apart = np.median((branch - turned)[seen]) if seen.any() else 0.0
         turned = turned + 360.0 * np.round(apart / 360.0)
         curves.append(_curve(label, omega, H, turned, color, 1.4))
@@ -239,12 +239,13 @@ def seen_of(omega: np.ndarray, pair: Any, averages: float) -> np.ndarray:
 
 
 def branch_of(omega: np.ndarray, H: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return the phase (k,) [deg] on the branch of the nearest frequencies that are seen.
+    """Return the phase (k,) [deg] on the branch of the nearest usable frequencies.
 
     Args:
         omega: (k,) [rad/s]
         H: (k,) complex; NaN stays NaN.
-        seen: (k,) bool; with none of them the phase is within half a turn of zero.
+        seen: (k,) bool, usable frequencies; if there are none, the phase is within half a turn of
+            zero.
     """
     along = np.zeros(omega.size)
     if seen.any():

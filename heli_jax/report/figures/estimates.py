@@ -1,4 +1,4 @@
-"""Figures of the estimates: what each start reached, what was sampled."""
+"""Figures of the estimates: samples by pairs of parameters."""
 
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
@@ -16,18 +16,18 @@ if TYPE_CHECKING:
 
 
 MOST = 6
-"""parameters that are drawn: of more the cells are too small to be read"""
+"""Most parameters drawn, because smaller cells are unreadable."""
 _RADIUS = 2.4477
-"""sd that an ellipse reaches for 95 % of a normal distribution in two dimensions to lie in it: the
-root of chi-squared's 95 % point at two degrees of freedom"""
+"""Radius of the 95 % ellipse of a two-dimensional normal distribution [sd]: the root of
+chi-squared's 95 % point with two degrees of freedom."""
 _DOTS = 1500
-"""samples of which dots are drawn: of more they hide one another"""
+"""Most samples drawn as dots, because more hide each other."""
 _MARKS = 200
-"""divergent steps that are marked"""
+"""Most divergent steps that are marked."""
 
 
 def posterior_pairs(posterior: Posterior, fit: Fit) -> "Figure":
-    """Draws by pairs of parameters, divergent ones marked."""
+    """Draw samples by pairs of parameters, with divergent ones marked."""
     draws = {name: np.asarray(v).ravel() for name, v in posterior.draws.items()}
     diverging = posterior.statistics.get("diverging")
     marked = None if diverging is None else np.asarray(diverging).ravel()
@@ -35,8 +35,10 @@ def posterior_pairs(posterior: Posterior, fit: Fit) -> "Figure":
 
 
 def bootstrap_pairs(booted: Bootstrap, fit: Fit) -> "Figure | None":
-    """Estimates from simulated records by pairs of parameters; None where fewer than two
-    were fitted."""
+    """Draw estimates from simulated records by pairs of parameters.
+
+    Return None for fewer than two fitted parameters.
+    """
     if len(next(iter(booted.values.values()), ())) < 2:
         return None
     return _pairs(booted.values, fit, "Estimates of the bootstrap", style.GREEN, None)
@@ -77,11 +79,11 @@ def _pairs(
 
 
 def _label(grid: np.ndarray, names: list[str], fit: Fit) -> None:
-    """Names at the left and at the foot; ticks between would be read for another cell's."""
+    """Write names at the left and at the foot only; ticks between cells would be ambiguous."""
     for i, name in enumerate(names):
         label = style.label(name, fit.estimates[name].unit)
         grid[-1, i].set_xlabel(label)
-        # A power of ten beside the axis and not upon its label, in narrow cells.
+        # In narrow cells the power of ten must not overlap the label.
         power = grid[-1, i].xaxis.get_offset_text()
         power.set_horizontalalignment("left")
         for ax in grid[i:, i]:
@@ -93,12 +95,12 @@ def _label(grid: np.ndarray, names: list[str], fit: Fit) -> None:
             ax.tick_params(axis="y", labelleft=j == 0)
         if i:
             grid[i, 0].set_ylabel(label)
-        # Heights of a histogram are of no interest beside its shape.
+        # The heights of a histogram do not matter, only its shape.
         grid[i, i].set_yticks([])
         grid[i, i].spines["left"].set_visible(False)
 
 
-# One of matplotlib's two methods: axvline or axhline.
+# `draw` is axvline or axhline of Matplotlib.
 def _interval_lines(draw: Callable[..., object], e: Estimate) -> None:
     for end in (e.lower95, e.upper95):
         if end is not None and np.isfinite(end):
@@ -106,10 +108,10 @@ def _interval_lines(draw: Callable[..., object], e: Estimate) -> None:
 
 
 def gaussian_ellipse(fit: Fit, x: str, y: str) -> Float[np.ndarray, "2 n"] | None:
-    """The curve within which 95 % of the fit's Gaussian approximation lie, of two parameters.
+    """Return the 95 % curve of the fit's Gaussian approximation for two parameters.
 
-    It is an ellipse in the coordinates in which their intervals are symmetric. None where the data
-    do not determine both.
+    It is an ellipse in the coordinates in which their intervals are symmetric. The result is None
+    if the data do not determine both.
     """
     names, pair = fit.verdict.names, (fit.estimates[x], fit.estimates[y])
     if not {x, y} <= set(names) or not all(e.sd and np.isfinite(e.sd) for e in pair):
@@ -118,12 +120,12 @@ def gaussian_ellipse(fit: Fit, x: str, y: str) -> Float[np.ndarray, "2 n"] | Non
     if not abs(r) < 1.0:
         return None
     angle = np.linspace(0.0, 2.0 * np.pi, 181)
-    # The Cholesky factor of a correlation matrix, times a circle.
+    # This is a circle times the Cholesky factor of a correlation matrix.
     unit = np.cos(angle), r * np.cos(angle) + np.sqrt(1.0 - r**2) * np.sin(angle)
     curve = []
     for away, e in zip(unit, pair, strict=True):
         reach = _RADIUS * float(e.sd or 0.0) * away
-        # By factors if the interval does not hold zero.
+        # Intervals without zero are symmetric in logarithms.
         one_sign = (e.lower95 or 0.0) * (e.upper95 or 0.0) > 0.0
         curve.append(e.value * np.exp(reach / abs(e.value)) if one_sign else e.value + reach)
     return np.array(curve)

@@ -1,5 +1,5 @@
-"""Figures over time and by lag: outputs with residuals and inputs, coefficients of the RLS,
-whiteness, and a manoeuvre."""
+"""Figures over time and by lag: outputs with residuals and inputs, RLS coefficients, whiteness, and
+a manoeuvre."""
 
 from collections.abc import Mapping, Sequence
 
@@ -38,10 +38,10 @@ from heli_jax.simulation.trajectory import Trajectory
 
 
 def response(signals: Signals, output: str, model: Model) -> Chart:
-    """Measured and simulated output, the residual, and the inputs, over time."""
+    """Draw measured and simulated output, the residual, and the inputs over time."""
     unit, t = naming.unit(model.Outputs, output), signals.log_times
     residual = samples("", t, signals.residual(output), style.VERMILLION, 0.7)
-    # In the model's order: a log may have its columns in any, and figures shall be comparable.
+    # The model's order makes figures comparable, because logs order their columns differently.
     inputs = [n for n in naming.names(model.Inputs) if n in signals.inputs]
     held = {n: Series("", t, signals.inputs[n], style.BLACK, "step", width=0.8) for n in inputs}
     panels = (
@@ -49,13 +49,14 @@ def response(signals: Signals, output: str, model: Model) -> Chart:
         panel(label("residual", unit), [residual], 0.8, levels=(0.0,)),
         *(panel(label(n, naming.unit(model.Inputs, n)), [s], 0.6) for n, s in held.items()),
     )
-    # Only panels of one flight share cursor and zoom: those of two have no moment in common.
+    # Only panels of one flight share cursor and zoom, because different flights have different
+    # times.
     of, words = signals.flight, time_label(signals.log_start)
     return Chart(_agreement(signals, output), words, time_limits(t), panels, of=of)
 
 
 def overview(signals: Signals, output: str, model: Model) -> Chart:
-    """Measured and simulated output over time, and nothing else."""
+    """Draw only measured and simulated output over time."""
     unit = naming.unit(model.Outputs, output)
     panels = (panel(label(output, unit), _measured_and_simulated(signals, output), 2.2),)
     words, limits = time_label(signals.log_start), time_limits(signals.log_times)
@@ -63,37 +64,36 @@ def overview(signals: Signals, output: str, model: Model) -> Chart:
 
 
 def _measured_and_simulated(signals: Signals, output: str) -> tuple[Series, Series]:
-    # The measured line is the wider and lies behind, so that it still shows as a rim where the
-    # simulation covers it.
+    # The measured line is wider and behind, so that a rim stays visible under the simulation.
     t = signals.log_times
     simulated = Series("simulated", t, signals.simulated[output], style.BLUE, width=0.9)
     return samples("measured", t, signals.measured[output], style.PALE, 1.9), simulated
 
 
 def time_label(log_start: float | None) -> str:
-    """Label of a time axis: time in the log if the flight has one, else from its first sample."""
+    """Return the label of a time axis: time in the log, or from the flight's first sample."""
     return "time [s]" if log_start is None else "time in the log [s]"
 
 
 def _agreement(signals: Signals, output: str) -> str:
     agreement = metrics(signals.measured[output], signals.simulated[output])
     source = "held out, simulated" if signals.hold_out else "simulated"
-    # NaN where the measured output never moves: it has no variance to account for.
+    # VAF is NaN if the measured output never moves.
     vaf = f", VAF {vaf_percent(agreement.vaf)}" if np.isfinite(agreement.vaf) else ""
     return f"{output}, {style.short(signals.flight)}: {source}{vaf}"
 
 
 def rls_history(baseline: Baseline, *, log_start: float | None = None) -> Chart:
-    """Every coefficient of the recursive least squares over time, the a's above the b's.
+    """Draw every coefficient of the recursive least squares over time, the a's above the b's.
 
     Args:
-        log_start: time in the log of its flight's first sample [s], where there is a log.
+        log_start: time of the flight's first sample in the log [s], if there is a log.
     """
     n, history, begin = baseline.order, baseline.history, log_start or 0.0
     t = begin + baseline.dt * np.arange(history.shape[0])
     panels = (
         _coefficients("-a", t, history[:, :n], [f"-a{i + 1}" for i in range(n)]),
-        # b_i is output over input in SI, and each has the same unit; the a's are plain numbers.
+        # All b_i have the unit of output over input in SI; the a's are plain numbers.
         _coefficients("b (SI)", t, history[:, n:], [f"b{i}" for i in range(history.shape[1] - n)]),
     )
     note = f"{baseline.input} to {baseline.output}; scaled to the second half of the record"
@@ -103,10 +103,10 @@ def rls_history(baseline: Baseline, *, log_start: float | None = None) -> Chart:
 
 
 def _coefficients(words: str, t: np.ndarray, values: np.ndarray, names: list[str]) -> Panel:
-    """Columns of values (N, k) over t (N,), by their names."""
-    # What they do in the second half of the record, and as much room again; where one alone has
-    # come to rest the range is zero: then a part of its value. The first samples, with P(0) = 1e12
-    # I, throw them over many powers of ten: lines leave the panel, but no path has huge numbers.
+    """Draw columns of values (N, k) over t (N,), by their names."""
+    # The second half of the record sets the range, with a margin. A constant gives no range, so a
+    # fraction of its value is used. The first samples, with P(0) = 1e12 I, spread over many powers
+    # of ten; values are clipped to keep huge numbers out of paths.
     later = values[values.shape[0] // 2 :]
     later = later[np.isfinite(later)]
     low, high = (float(later.min()), float(later.max())) if later.size else (0.0, 0.0)
@@ -128,28 +128,28 @@ def residual_correlation(
     together: int = 1,
     test: Whiteness | None = None,
 ) -> Chart:
-    """Autocorrelation of the residual (filter error: the innovations) and its correlation with each
-    input, with 99 % bands.
+    """Draw the autocorrelation of the residual (filter error: innovations) and its correlation with
+    each input, with 99 % bands.
 
     Args:
-        together: how many residuals are tested side by side (Bonferroni, as in `whiteness`).
-        test: of the fit, whose numbers the figure says; made here unless given.
+        together: number of residuals tested together (Bonferroni, as in `whiteness`).
+        test: whiteness from the fit, whose numbers the figure shows; computed by default.
     """
     residual, dt = signals.error(output), _sample_time(signals.times)
     whole, residual = residual, sequence(residual)
     seen = np.arange(whole.size)
     if residual.size < whole.size:
-        # Mostly missing: lags count in the sensor's own samples.
+        # If most samples are missing, lags count the sensor's own samples.
         seen = np.flatnonzero(~np.isnan(whole))
         dt *= float(np.median(np.diff(seen)))
     n, lags = residual.size, lags_for(residual.size)
-    # What the test of whiteness counts, missing samples left out; without lag 0, at which an
-    # autocorrelation is 1 whatever the residual.
+    # As in the whiteness test, missing samples are left out, and so is lag 0, whose autocorrelation
+    # is always 1.
     at, r, pairs, parts = seen_autocorrelation(residual)
     panels = [_stems("autocorrelation", dt * at, r * parts, band99(pairs, parts))]
     for name in signals.inputs:
-        # Both signs: correlation at negative lags means that the input answers the residual (a
-        # pilot, a controller), or that the clocks of the two differ.
+        # Both signs are shown. Correlation at negative lags means that the input follows the
+        # residual (a pilot, a controller), or that the clocks differ.
         c = cross_correlation(signals.inputs[name][seen], residual, lags)
         limit = np.full(c.size, BAND99 / np.sqrt(n))
         panels.append(_stems(f"with {name}", dt * np.arange(-lags, lags + 1), c, limit))
@@ -171,12 +171,12 @@ def residual_correlation(
 
 
 def _sample_time(t: np.ndarray) -> float:
-    """Time between samples [s]; 1 for a single sample, which has none."""
+    """Return the time between samples [s]; 1 for a single sample."""
     return float(t[1] - t[0]) if t.size > 1 else 1.0
 
 
 def _stems(words: str, x: np.ndarray, y: np.ndarray, limit: np.ndarray) -> Panel:
-    """Stems from zero over a band (lags,); those outside it in another colour."""
+    """Draw stems from zero over a band (lags,); those outside it in another colour."""
     outside = np.abs(y) > limit
     series = [band(x, -limit, limit, style.SKY)]
     for which, color, name in (
@@ -185,19 +185,19 @@ def _stems(words: str, x: np.ndarray, y: np.ndarray, limit: np.ndarray) -> Panel
     ):
         ends = np.minimum(y[which], 0.0), np.maximum(y[which], 0.0)
         series.append(Series(name, x[which], y[which], color, "bars", *ends, width=1.4))
-    # Twice the band at least: where all is white, the band shall look like one.
+    # The axis spans at least twice the band, so that white residuals look white.
     least = 2.0 * float(limit.max()) * np.array([-1.0, 1.0])
     limits = limits_of([*series, Series("", least, least, "")])
     return panel(words, series, 1.1, limits=limits, levels=(0.0,))
 
 
 _APART = "rotor_speed"
-"""output with a panel of its own"""
+"""Output with a panel of its own."""
 _STILL = 0.05
-"""smallest span of an axis over its largest value"""
+"""Smallest span of an axis relative to its largest value."""
 _LEAST = {"m": 0.01, "m/s": 0.02, "rad": 0.005, "rad/s": 0.01, "m/s^2": 0.05, "1": 0.02}
-"""smallest span of an axis by unit"""
-# States and signals of a model are classes of the user's own, with arrays (N,): annotated Any.
+"""Smallest span of an axis by unit."""
+# States and signals are Any, because they are user classes with arrays (N,).
 
 
 def motion(run: Trajectory, model: Model) -> Chart:
@@ -226,10 +226,10 @@ def sticks(run: Trajectory, model: Model) -> Chart:
 
 
 def _by_unit(record: type, names: list[str]) -> list[tuple[str | None, list[str]]]:
-    """The names of each unit, in the record's order; a field without one stands for itself."""
+    """Return the names by unit, in the record's order; a field without a unit is alone."""
     groups: dict[str, list[str]] = {}
     for name in names:
-        # What has no unit may be anything: two of them need not share a scale.
+        # Signals without a unit need not share a scale.
         groups.setdefault(naming.unit(record, name) or f"no unit: {name}", []).append(name)
     return [(naming.unit(record, group[0]), group) for group in groups.values()]
 
