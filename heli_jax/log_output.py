@@ -172,7 +172,7 @@ def _print_topics(topics: Sequence[TopicInfo]) -> None:
         elif topic.n_rows <= _MOST_OF_BURST and clock.duration < _BURST:
             cells = (f"all within {_short_time(clock.duration)}", "", "", "")
         else:
-            # Whether a rate can bridge the gaps depends on the longest, not on the count.
+            # The longest gap, not their count, decides if a rate can bridge them.
             longest = max((gap.length for gap in clock.gaps), default=0.0)
             gaps = (str(len(clock.gaps)), _short_time(longest) if longest else "")
             cells = (f"{clock.rate:.4g}", _percent(clock.jitter), *gaps)

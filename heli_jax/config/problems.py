@@ -243,7 +243,7 @@ def candidate_models(experiment: Experiment, fitted: Problem) -> "Alternatives":
     asked = (
         stated if disturbance is not None and disturbance.axis else undisturbed_too(model, stated)
     )
-    # Whether there is a stand is in question only where its stiffness is.
+    # The stand is compared only if its stiffness is free.
     bare = model.without_stand if len(asked) == 1 and "kappa" in fitted.free else None
     with located(f"{experiment.path}: disturbance"):
         return alternatives(fitted, model, asked, stated=stated, without_stand=bare)
@@ -269,7 +269,7 @@ def disturbed(experiment: Experiment) -> tuple[Model, Any]:
 
 def _gain_units(experiment: Experiment) -> dict[str, str]:
     """Return the unit of each input's gain: 1 if the log's unit is of the right kind."""
-    # Of the first flight, because all flights share the gains.
+    # The first flight serves for all, because flights share the gains.
     out = {}
     for name, signal in first_signals(experiment).inputs.items():
         si = naming.unit(experiment.model.Inputs, name)

@@ -37,7 +37,7 @@ def disturbable_states(model: Model) -> tuple[str, ...]:
     params = plain(model.Params(**dict.fromkeys(naming.names(model.Params), nan)))
     inputs = model.Inputs(**dict.fromkeys(naming.names(model.Inputs), nan))
     # NaN propagates through every operation, so a finite result uses neither parameters nor inputs.
-    # That alone is not kinematics: v' = -0.4 v + 9.81 phi is a force with constant coefficients.
+    # This alone is not kinematics: v' = -0.4 v + 9.81 phi is a force with constant coefficients.
     with np.errstate(all="ignore"):
         rates = naming.asdict(model.vector_field(params, model.State(**state), inputs))
     turning = {axis.rate for axis in axes_of(model)}

@@ -20,8 +20,6 @@ _TAIL = re.compile(
     r"(?:s|sec|second|seconds)(?:\^?-?([12]))?",
     re.IGNORECASE,
 )
-_BRACKETS = re.compile(r".*[\[(]([^\[\]()]*[^\[\]()\d\s][^\[\]()]*)[\])]\s*")
-"""Unit in brackets; gyroADC[1] has a number in brackets and no unit."""
 _MEANINGS = {
     "rad/s": "an angular rate",
     "rad/s^2": "an angular acceleration",
@@ -76,8 +74,6 @@ _STICKS = {
     ),
     *("desired", "target", "excitation", "sweep"),
 }
-_UNSURE = {"current", "bank", "heading", "mag", "climb", "clock", "stamp", "height", "omega"}
-"""Words that usually, but not certainly, mean this in a list of channels."""
 
 
 def rate_at_end(name: str) -> tuple[str, str] | None:
@@ -91,14 +87,6 @@ def rate_at_end(name: str) -> tuple[str, str] | None:
     return match[1], f"{_PLAIN[match[2].lower()]}/s{'^2' if match[3] == '2' else ''}"
 
 
-def unit_in_name(name: str) -> str:
-    """Return the unit in brackets, or of a rate at the end of a name; empty if there is none."""
-    match = _BRACKETS.fullmatch(name)
-    if match is not None and units.is_unit(match[1].strip()):
-        return match[1].strip()
-    return (rate_at_end(name) or ("", ""))[1]
-
-
 def kind_of_unit(unit: str) -> str:
     """Return the SI unit of the same kind; empty if it may be a stick's."""
     if not unit or unit in _PULSES or not units.is_unit(unit):
@@ -106,7 +94,7 @@ def kind_of_unit(unit: str) -> str:
     return next((si for si in _MEANINGS if _is_of(unit, si)), "")
 
 
-def no_stick(name: str, unit: str, si: str, *, sure: bool = False) -> str:
+def no_stick(name: str, unit: str, si: str) -> str:
     """Return the measured quantity, such as `an angular rate`, of a channel that is no input.
 
     It is empty if the channel can be an input.
@@ -115,20 +103,18 @@ def no_stick(name: str, unit: str, si: str, *, sure: bool = False) -> str:
         name: name of the channel.
         unit: unit that the log or the name states, or empty.
         si: SI unit of the model's input.
-        sure: True to exclude only what can hardly be a stick, instead of what is unlikely to be
-            one.
     """
     words = words_in(name)
     called = names_a_stick(name)
     kind = kind_of_unit(unit)
-    if kind and not _is_of(unit, si) and (kind not in _OF_STICKS or not (called or sure)):
+    if kind and not _is_of(unit, si) and (kind not in _OF_STICKS or not called):
         return _MEANINGS[kind]
     # A speed is valid for an input that is a speed, such as a rotor's.
     if called or si in ("rad/s", "m/s", "rad/s^2", "m/s^2"):
         return ""
-    if len(words) == 1 and words[0] in _AXIS and not sure:
+    if len(words) == 1 and words[0] in _AXIS:
         return "an angular rate"
-    matches = [w for w in words if w in _WORDS and not (sure and w in _UNSURE)]
+    matches = [w for w in words if w in _WORDS]
     return _WORDS[matches[0]] if matches else ""
 
 

@@ -61,7 +61,7 @@ def lines(
     times = np.arange(x.size)
     x = detrend(np.interp(times, times[there], x[there]))
     hz, power = welch(x, 1.0 / dt, nperseg=n, detrend="linear")
-    # Of the whole record, because motion slower than a segment is also part of the variance.
+    # Use the whole record, because motion slower than a segment is also part of the variance.
     total = float(np.var(x)) / float(hz[1])
     if not total > 0:
         return ()

@@ -117,7 +117,7 @@ def _read_table(table: Table, rate: float | None) -> Log:
         raise wrong(table.path, f"{problem}: {time.problem}")
     clock = time.column
     names = [c.name for c in info.columns if c.kind == "number"]
-    # Of two columns with the same name, neither can be selected.
+    # Columns that share a name cannot be selected.
     names = [n for n in names if table.names.count(n) == 1]
     # Only arrays with the length of the clock.
     rows = {ROWS: info.n_rows} | {c.name: c.rows for c in info.columns}

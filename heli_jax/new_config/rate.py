@@ -50,7 +50,7 @@ def channels_of_preset(name: str, series: Collection[str], signals: Collection[s
     """Return the log's channels that a preset may use for signals of a model."""
     inputs, outputs, table = model_inputs(), model_outputs(), preset(name).signals
     meant = [outputs.get(n, inputs[n].command if n in inputs else n) for n in signals]
-    # Of several channels the first in the log is used.
+    # The first of several channels in the log is used.
     channels = []
     for signal in meant:
         for alternative in table.get(signal, ()):

@@ -6,7 +6,9 @@ import pytest
 import scipy.linalg
 
 from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model
+from heli_jax.analysis.spectra import ResponseOptions
 from heli_jax.identification.diagnostics.loop import inputs_follow_response
+from heli_jax.identification.diagnostics.search import band_unused
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.frequency_error import _weighed, products, projected
 from heli_jax.identification.estimation.frequency_instrument import (
@@ -164,6 +166,14 @@ def test_by_instrument_feedback_moves_no_estimate_and_directly_it_is_said(leanin
     assert worst in direct.untrusted
     assert direct.distrusts[worst].code == "loop.no-instrument"
     assert direct.exit_code == 3
+
+
+def test_a_band_that_the_fit_ignores_is_noted(leaning):
+    band = ResponseOptions(band=(0.2, 5.0))
+    for method, count in (("frequency-error", 1), ("frequency-response", 0), ("output-error", 0)):
+        asked = problem(leaning, [flown(1, 1000)], method=method, frequency=band)
+        assert len(list(band_unused(context_of(asked)))) == count
+    assert list(band_unused(context_of(problem(leaning, [flown(1, 1000)])))) == []
 
 
 def test_a_response_far_larger_than_the_measured_one_explains_nothing():

@@ -97,8 +97,7 @@ def _with_input_delays(model: Model, parameters: tuple[tuple[str, str], ...]) ->
         name=f"{model.name}+delays",
         Params=naming.extended(model.Params, f"{model.Params.__name__}Late", fields),
         delays=(*model.delays, *parameters),
-        # What is said of free flight is said of the vehicle with its delay: without this, margins
-        # of a model on the stand would lose it.
+        # The free-flight model has the delay too, so that margins of a model on the stand keep it.
         without_stand=None if bare is None else _with_input_delays(bare, parameters),
     )
 
@@ -126,8 +125,7 @@ def _with_output_delays(model: Model, late: tuple[tuple[str, str], ...], order: 
             raise ValueError(
                 f"model {model.name} has a parameter {parameter!r} already, expected another name"
             )
-    # What the models know of their delays is kept by name in `delay_lines` as well: a fit begins
-    # from several starts where one of these is free.
+    # Delays are also kept by name in `delay_lines`: a fit with a free delay has several starts.
     device = _LateOutputs(model, dict(late), order)
     return device.made(
         "output-delays",

@@ -148,7 +148,7 @@ class Device(abc.ABC):
             "positive": (*model.positive, *positive),
             "within": _around(model.within, again),
         }
-        # What is not named here stays as it is. `initial_sd` and `correlation` go by names of
+        # Fields that are not named stay unchanged. `initial_sd` and `correlation` go by names of
         # states, so they hold for a State that has grown; axes and delays name what is still there.
         return dataclasses.replace(model, **{**fields, **changes})
 

@@ -162,7 +162,7 @@ def with_filters(
                 f"delay of {name}: it is late by {dict(model.delay_lines)[name]} already, expected "
                 "one delay"
             )
-    # What does nothing adds no device: the same model, and the same compiled program.
+    # A filter or delay without effect adds no device, so model and compiled program stay.
     channels = tuple(
         (name, tuple(filters.get(name, ())), float(delays.get(name, 0.0)))
         for name in dict.fromkeys((*filters, *delays))

@@ -142,8 +142,8 @@ def _with_sensors(model: Model, shown: tuple[str, ...]) -> Model:
     def again(other: Model) -> Model:
         return _with_sensors(other, shown)
 
-    # What the sensors show is made of derivatives, so a push on these has to come before them:
-    # `with_disturbance` puts it on the model within.
+    # Sensors use derivatives, so a disturbance must act before them: `with_disturbance` puts it on
+    # the model within.
     return _MotionSensors(model, shown).made("+".join(shown), again, within=(model, again))
 
 
@@ -419,9 +419,8 @@ def _into_body(s: Record, vector: Vector) -> Vector:
 
 def _turning(model: Model, p: Record, s: Record, u: Record, rates: Record) -> tuple[Vector, Vector]:
     """The rates of the body and their derivatives, where the velocities are over the ground."""
-    # Of the angles' own derivatives where these are states. The paper's helicopter shows them as
-    # the rates of the body, which they are in level flight alone; its sensors are where its angles
-    # put them.
+    # Use the derivatives of the angles if these are states. The paper's helicopter takes them for
+    # body rates, which holds only in level flight.
     if set(_ANGLE_RATES) <= set(naming.names(model.State)):
         return _along_motion(_from_angles, s, rates)
 

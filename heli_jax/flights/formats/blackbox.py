@@ -59,7 +59,7 @@ def open_blackbox(path: Path) -> tuple[ChannelLog, ...]:
         raise wrong(str(path), "is no blackbox log, expected one that begins with its header")
     if len(starts) > _MOST_FLIGHTS:
         raise wrong(str(path), f"expected at most {_MOST_FLIGHTS} flights, got {len(starts)}")
-    # Of the whole file, so that it equals the output of sha256sum for the user's file.
+    # Hash the whole file, so that it equals the output of sha256sum for the user's file.
     sha256, size = hashlib.sha256(data).hexdigest(), len(data)
     # Each flight's bytes are released once its frames are found. This keeps the peak memory at
     # three times the file, not four.

@@ -412,7 +412,7 @@ def _units(parts: Sequence[Part], alone: Mapping[str, _Messages]) -> dict[int, d
     ids = zip(stated["FmtType"], stated["UnitIds"], alone["FMTU"].at, strict=True)
     for row, (number, unit_ids, at) in enumerate(ids):
         of_number = [p for p in parts if p.number == int(number)]
-        # Of several descriptions, use the one that is valid at this position.
+        # Use the description that is valid at this position.
         part = next((p for p in reversed(of_number) if p.since <= at), next(iter(of_number), None))
         if part is None:
             continue

@@ -48,6 +48,7 @@ DIAGNOSTICS: tuple[Diagnostic, ...] = (
     search.search_told,
     search.prior_contradicted,
     search.profile_intervals,
+    search.band_unused,
 )
 """All diagnostics, causes first: among equally severe findings this order decides."""
 

@@ -56,6 +56,13 @@ def profile_intervals(c: Context) -> Iterator[Finding]:
         yield found("uncertainty.profile-interval", "note", *c.errors.limits)
 
 
+def band_unused(c: Context) -> Iterator[Finding]:
+    """A stated band of frequencies that the method of the fit ignores."""
+    objective, band = c.at.layout.objective, c.problem.frequency.band
+    if band is not None and objective.noise_model == "spectrum" and not objective.fits_responses:
+        yield found("frequency.band-unused", "note", low=band[0], high=band[1])
+
+
 def log_cautions(c: Context) -> Iterator[Finding]:
     """Report cautions of the logs on signals that bias a fit, each sentence once."""
     said: dict[str, Finding] = {}

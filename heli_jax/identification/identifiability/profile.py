@@ -155,7 +155,7 @@ def profile_wide_intervals(
         return {}, ()
     lacking = verdict.not_identifiable
     sds = np.sqrt(np.maximum(np.diag(verdict.covariance), 0.0))
-    # What is open already follows any other unknown.
+    # Unknowns that the data leave open follow any other unknown.
     J = np.array(e.J, np.float64)
     J[:, [i for i, n in enumerate(verdict.names) if n in lacking]] = 0.0
     wide = [
