@@ -22,7 +22,7 @@ import numpy as np
 import scipy.fft
 import scipy.linalg
 import scipy.special
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Inexact, Int
 
 from heli_jax.identification.estimation.evaluation import directions
 
@@ -45,6 +45,8 @@ _ROUNDING = 1e-9
 _MEDIAN = 0.6745
 """Median size of a standard normal number."""
 _EULER = 0.5772156649015329
+_BAND = 0.01
+"""Width of a band of lines as a share of its frequency; the narrowest filter is six times as wide."""
 _AT_ONCE = 8
 """Number of residuals that are multiplied with all columns together."""
 
@@ -174,11 +176,15 @@ def strongest(records: Sequence[Lines], drives: Sequence[Drive]) -> Strongest:
         np.concatenate(each)
         for each in zip(*[(r.e, r.J, r.drives, r.angles) for r in records], strict=True)
     )
+    # One column per record for a filter's states at the record's ends.
+    ends = np.repeat(np.eye(len(records)), [r.e.size for r in records], axis=0)
+    order = np.argsort(angles, kind="stable")
+    e, J, X, angles, ends = (v[order] for v in (e, J, X, angles, ends))
     rows, residual = _real(J), _real(e[:, None])
     known = directions(rows, _SAME)
     white = _without(known, residual)
     freedom, squares = white.size - known.shape[1], float(np.sum(white**2))
-    trials, known_lines = list(_trials(records, drives, X.T, angles)), _complex(known).T
+    trials, known_lines = list(_trials(drives, ends.T, X.T, angles)), _complex(known).T
     gains = [each.gains(known_lines, _complex(white).T)[:, :, 0] for each in trials]
     best = int(np.argmax([np.max(of) for of in gains]))
     one, of = trials[best], gains[best]
@@ -199,21 +205,41 @@ def strongest(records: Sequence[Lines], drives: Sequence[Drive]) -> Strongest:
     of_chance = [each.gains(known_lines, _complex(anew).T).max(axis=(0, 1)) for each in trials]
     own = one.beside + 2 * at
     through = one.columns[[*range(one.beside), own, own + 1]]
-    steps = _steps(rows, _real((one.response[of_filter] * through).T), residual)
+    response = _responses(one.filters[[of_filter]], angles)
+    steps = _steps(rows, _real((response * through).T), residual)
     p_value = _by_chance(gain, np.max(of_chance, axis=0))
     return Strongest(drive, gain, p_value, damping, frequency, *steps)
+
+
+class _Bands(NamedTuple):
+    """Narrow bands of sorted lines, in each of which a filter's response is constant."""
+
+    starts: Int[np.ndarray, " B"]
+    """First line of each band."""
+    angles: Float[np.ndarray, " B"]
+    """Mean frequency of each band [rad/sample]."""
+
+    def sums(self, v: Inexact[np.ndarray, "*n K"]) -> Inexact[np.ndarray, "*n B"]:
+        """Return the sums over the lines of each band."""
+        return np.add.reduceat(v, self.starts, axis=-1)
+
+
+def _bands(angles: Float[np.ndarray, " K"]) -> _Bands:
+    number = np.floor(np.log(angles) / _BAND)
+    starts = np.flatnonzero(np.diff(number, prepend=np.nan))
+    counts = np.diff(starts, append=angles.size)
+    return _Bands(starts, np.add.reduceat(angles, starts) / counts)
 
 
 class _Trial(NamedTuple):
     """Filters, and the drives that are tested through them after removing the same columns."""
 
-    response: Complex[np.ndarray, "f K"]
-    """Frequency response of each filter."""
     filters: Float[np.ndarray, "f 2"]
     """Damping and frequency [rad/sample]; infinite damping is no filter."""
     drives: tuple[Drive, ...]
     columns: Complex[np.ndarray, "c2 K"]
     """Columns that are removed first, then the drives; each also one sample later."""
+    bands: _Bands
 
     @property
     def beside(self) -> int:
@@ -230,40 +256,42 @@ class _Trial(NamedTuple):
         Args:
             known: orthonormal columns, to which the residuals are orthogonal.
         """
-        f, d, b = len(self.response), len(self.drives), self.beside
-        columns = self.columns
-        power = np.real(self.response) ** 2 + np.imag(self.response) ** 2
-        whole = np.stack([power @ np.real(columns * np.conj(v)).T for v in columns[:b]], axis=2)
+        response = _responses(self.filters, self.bands.angles)
+        power = np.real(response) ** 2 + np.imag(response) ** 2
+        d, b, columns = len(self.drives), self.beside, self.columns
+        pairs = columns[:, None] * np.conj(columns[:b])
+        whole = np.tensordot(power, self.bands.sums(np.real(pairs)), (1, 2))
         own = columns[b:].reshape(d, 2, -1)
-        square, across = np.abs(own[:, 0]) ** 2, np.real(own[:, 0] * np.conj(own[:, 1]))
-        own = (power @ np.concatenate([square, across, across, square]).T).reshape(f, 2, 2, d)
-        own = np.moveaxis(own, 3, 1)
-        of_known, answers = self._products(known), self._products(residuals)
+        pairs = np.real(own[:, :, None] * np.conj(own[:, None]))
+        own = np.tensordot(power, self.bands.sums(pairs), (1, 3))
+        of_known, answers = (self._products(response, v) for v in (known, residuals))
 
         left = whole - of_known @ of_known[:, :b].mT
         taken = left[:, b:] @ _inverse(left[:, :b], whole[:, :b])
         answers = answers[:, b:] - taken @ answers[:, :b]
         answers, of_known, left, taken = (
-            v.reshape(f, d, 2, -1) for v in (answers, of_known[:, b:], left[:, b:], taken)
+            v.reshape(len(v), d, 2, -1) for v in (answers, of_known[:, b:], left[:, b:], taken)
         )
         over = _inverse(own - of_known @ of_known.mT - taken @ left.mT, own)
         return np.sum(answers * (over @ answers), axis=2)
 
-    def _products(self, others: Complex[np.ndarray, "n K"]) -> Float[np.ndarray, "f c2 n"]:
+    def _products(
+        self, response: Complex[np.ndarray, "f B"], others: Complex[np.ndarray, "n K"]
+    ) -> Float[np.ndarray, "f c2 n"]:
         """Return the products of the filtered columns with other signals."""
-        response = _real(self.response.astype(others.dtype).T)
-        columns = self.columns.astype(others.dtype)
-        out = np.zeros((len(self.response), len(columns), len(others)), response.dtype)
+        columns = np.conj(self.columns.astype(others.dtype))
+        response = _real(response.astype(others.dtype).T).T
+        found = []
         for k in range(0, len(others), _AT_ONCE):
-            each = np.conj(columns)[:, None] * others[None, k : k + _AT_ONCE]
-            values = response.T @ _real(each.reshape(-1, each.shape[2]).T)
-            out[:, :, k : k + _AT_ONCE] = values.reshape(len(out), len(columns), -1)
-        return out
+            pairs = self.bands.sums(columns[:, None] * others[k : k + _AT_ONCE])
+            pairs = np.concatenate([np.real(pairs), np.imag(pairs)], axis=-1)
+            found.append(np.tensordot(response, pairs, (1, 2)))
+        return np.concatenate(found, axis=2)
 
 
 def _trials(
-    records: Sequence[Lines],
     drives: Sequence[Drive],
+    ends: Float[np.ndarray, "r K"],
     X: Complex[np.ndarray, "d K"],
     angles: Float[np.ndarray, " K"],
 ) -> Iterator[_Trial]:
@@ -271,11 +299,8 @@ def _trials(
 
     The slowest filter has two periods in the longest record.
     """
-    low = 2.0 * min(float(record.angles[0]) for record in records)
-    high = 0.9 * max(float(record.angles[-1]) for record in records)
-    back = np.exp(-1j * angles)
-    # One column per record for the filter's states at the record's ends.
-    ends = np.repeat(np.eye(len(records)), [r.e.size for r in records], axis=1).astype(complex)
+    low, high = 2.0 * float(angles[0]), 0.9 * float(angles[-1])
+    back, bands = np.exp(-1j * angles), _bands(angles)
     for (bank, plain, beside), group in itertools.groupby(
         drives, lambda d: (d.bank, d.kind != "input", d.beside)
     ):
@@ -289,17 +314,14 @@ def _trials(
                 filters.append((damping, w))
                 # No finer than the lines.
                 w *= np.exp(max(step, 0.25 * low / w))
-        yield _Trial(_responses(np.array(filters), back), np.array(filters), those, columns)
+        yield _Trial(np.array(filters), those, columns, bands)
 
 
 def _responses(
-    filters: Float[np.ndarray, "f 2"], back: Complex[np.ndarray, " K"]
+    filters: Float[np.ndarray, "f 2"], angles: Float[np.ndarray, " K"]
 ) -> Complex[np.ndarray, "f K"]:
-    """Return the response of each filter at each line; 1 without a filter.
-
-    Args:
-        back: factor of a delay of one sample at each line.
-    """
+    """Return the response of each filter at each frequency [rad/sample]; 1 without a filter."""
+    back = np.exp(-1j * angles)
     damping, w = filters.T
     none = ~np.isfinite(damping)
     damping = np.where(none, 1.0, damping)
