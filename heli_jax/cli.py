@@ -44,7 +44,7 @@ _DEEPEST = 3
 
 def _count(text: str) -> int:
     if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"expected a number from 1, got {text!r}")
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, got {text!r}")
     return int(text)
 
 
@@ -77,13 +77,13 @@ _JSON = _arg("--json", help="print everything as JSON, for other programs")
 _VERBOSE = _arg("--verbose", help="all findings, agreement and gates (default: three findings)")
 _LOG = _arg("log", metavar="LOG", help="a table or an autopilot's log: docs/logs.md")
 _OTHER_LOG = _arg("log", nargs="?", metavar="LOG",
-                  help="read as the configuration's first (default: its own)")
+                  help="read like the first log of the configuration (default: that log)")
 _CLOCK = (
     _arg("--time", metavar="NAME", help="column of time stamps of a table"),
     _arg("--time-unit", metavar="UNIT", help="unit of the stamps: s, ms, us or ns"),
 )
 _TIME_RATE = _arg("--time-rate", type=float, metavar="HZ",
-                  help="samples a second of a table without times")
+                  help="samples per second of a table without times")
 _FLIGHT = _arg("--flight", type=_count, metavar="N",
                help="number of the flight in a log of several (from 1)")
 _RESUME = _arg("--resume", help="continue the study or sweep in --out")
@@ -101,7 +101,9 @@ _COMMANDS = {
              "combination; as --set repeated with one KEY, or study in CONFIG"),
         _arg("--reports", help="also write the page of each fit of a study"),
     )),
-    "compatibility": ("agreement of a log's sensors, and their errors", (*_CONFIG, _OUT)),
+    "compatibility": ((
+        "agreement of a log's sensors with each other, and their errors"
+    ), (*_CONFIG, _OUT)),
     "check": ("identifiability, sampling and excitation before any fit", (
         *_CONFIG, _JSON, _VERBOSE,
     )),
@@ -134,7 +136,9 @@ _COMMANDS = {
         *_CLOCK, _TIME_RATE, _FLIGHT,
         _arg("--signals", nargs="+", default=[], metavar="NAME",
              help="'vehicle_attitude.*', 'euler(vehicle_attitude.q).roll' (default all)"),
-        _arg("--preset", metavar="NAME", help="its signals, by its names and in SI"),
+        _arg("--preset", metavar="NAME", help=(
+            "the configuration's signals, by its names and in SI"
+        )),
         _arg("--config", metavar="CONFIG",
              help="the signals of its first flight, by the model's names and in SI; or its "
              "swashplate, for --signals ccpm.roll"),
@@ -154,7 +158,7 @@ _COMMANDS = {
         _arg("--model", metavar="NAME",
              help="as a configuration names it, such as roll-on-stand or attitude-flybarless "
              "(default: the linear model of the axis whose stick moves most)"),
-        _arg("--vehicle", metavar="FILE", help="a vehicle file that is there already"),
+        _arg("--vehicle", metavar="FILE", help="an existing vehicle file"),
         _arg("--out", metavar="FILE", help="configuration (default: the log's name)"),
     )),
     "keys": ("keys of a configuration and their meaning", (
@@ -306,9 +310,8 @@ def _prepare_jax(cpu_devices: int | None = None) -> None:
     # JAX raises AssertionError if its plugin for the device is installed but the device is missing.
     except (RuntimeError, AssertionError) as e:
         raise InputError(
-            f"JAX_PLATFORMS={platforms}: JAX finds no such device here, expected one that there is "
-            "(a GPU of NVIDIA's needs its driver and the extra gpu: pip install 'heli_jax[gpu]'), "
-            "or JAX_PLATFORMS=cpu"
+            f"JAX_PLATFORMS={platforms}: JAX finds no such device here; use JAX_PLATFORMS=cpu, or "
+            "for an NVIDIA GPU install its driver and the extra gpu: pip install 'heli_jax[gpu]'"
         ) from e
 
 
@@ -352,7 +355,7 @@ def _fit(options: argparse.Namespace) -> int:
     for option in ("resume", "workers", "scheduler", "reports"):
         if getattr(options, option):
             raise InputError(
-                f"--{option}: is for a study of fits, expected --over KEY=VALUE,VALUE, or "
+                f"--{option}: is only for a study of fits, expected --over KEY=VALUE,VALUE, or "
                 f"study in {options.config}"
             )
     out = _new_directory(options)
@@ -398,7 +401,7 @@ def _fit_study(options: argparse.Namespace, study: "Study") -> int:
 
 def _require_out(options: argparse.Namespace) -> None:
     if options.resume and not options.out:
-        raise InputError("--resume: expected --out DIR too, the directory that was begun")
+        raise InputError("--resume: expected --out DIR too, the directory of the interrupted run")
 
 
 # Any: dask.distributed is an extra, and only `sweeps.cluster` names its classes.
@@ -586,7 +589,7 @@ def _selection(options: argparse.Namespace) -> "Selection":
 
     if options.preset is not None and (options.signals or options.config is not None):
         other = "--signals" if options.signals else "--config"
-        raise InputError(f"--preset: names the columns, expected it without {other}")
+        raise InputError(f"--preset: already names the columns, expected it without {other}")
     by_preset = None
     if options.preset is not None:
         with located("--preset"):
@@ -607,8 +610,8 @@ def _runs(options: argparse.Namespace) -> int:
     folder = Path(options.directory)
     if not folder.exists():
         raise InputError(
-            f"{folder}: there is no such folder, expected one that holds runs of heli-jax fit: "
-            "heli-jax runs DIR"
+            f"{folder}: does not exist, expected a folder with runs of heli-jax fit: heli-jax "
+            "runs DIR"
         )
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of runs, got a file")
@@ -715,10 +718,8 @@ def _keys(options: argparse.Namespace) -> int:
     if not found:
         hint = ""
         if not options.fit and document.matching(options.pattern):
-            hint = f"; fit.json has it: heli-jax keys --fit {shlex.quote(options.pattern)}"
-        raise InputError(
-            f"keys: expected a text that some key or its meaning holds, got {options.pattern}{hint}"
-        )
+            hint = f"; it is a key of fit.json: heli-jax keys --fit {shlex.quote(options.pattern)}"
+        raise InputError(f"keys: no key and no meaning contains {options.pattern}{hint}")
     # Longer lines are hard to read.
     width, indent = min(shutil.get_terminal_size().columns, 100), "    "
     for key in found:

@@ -113,7 +113,7 @@ def run_compatibility(
     if _without_noise(run):
         words = _SMOOTH if _smooth(run) else _BEYOND_NOISE
         reason = Finding("sensors.noise-not-told", "doubt", words)
-        progress("filter error has no end: once more by output error")
+        progress("filter error did not converge: fitted again by output error")
         compatibility = judged(
             workflow.run_fit(_by_output_error(experiment), progress=lambda _: None)
         )
@@ -144,13 +144,13 @@ def _agreement(compatibility: Compatibility) -> SensorAgreement:
 
 
 _SMOOTH = (
-    "The log is smoother than white noise would have it (low-passed before the log?), and the "
-    "noise of gyros and angles cannot be told: fitted by output error, whose intervals go by the "
+    "The log is smoother than white noise (low-pass filtered before logging?), so that the noise "
+    "of gyros and angles cannot be estimated. Fitted by output error, with intervals from the "
     "autocorrelation of the residuals."
 )
 _BEYOND_NOISE = (
-    "Filter error, which estimates the noise too, did not converge: the signals differ by more "
-    "than these errors and noise. Fitted by output error."
+    "Filter error, which also estimates the noise, did not converge: these errors and noise do "
+    "not explain the differences. Fitted by output error."
 )
 
 
@@ -245,21 +245,22 @@ def _verdict(
     converged: bool,
 ) -> str:
     if not converged:
-        return "Not judged: the search did not converge."
+        return "No result: the optimiser did not converge."
     if bad:
         channels = ", ".join(f"{n} (R2 {r_squared[n]:.3f})" for n in bad)
         return (
-            f"Not compatible: no errors of these kinds bring {channels} to R2 {AGREES:g}. Look for "
-            "a wrong unit, sign or axis, a filter, a scale that changes in the flight."
+            f"Not compatible: no sensor errors of these kinds bring {channels} to R2 {AGREES:g}. "
+            "Check for a wrong unit, sign or axis, a filter, or a scale that changes during the "
+            "flight."
         )
     lowest = min([r for n, r in r_squared.items() if n not in drifting] or r_squared.values())
     agree = f"R2 {lowest:.4f} or more"
     if drifting:
         channels = ", ".join(f"{n} (R2 {r_squared[n]:.3f})" for n in drifting)
-        agree += f", but of {channels}, which the noise of the sensors lets drift so far"
+        agree += f", except for {channels}, which drift no further than sensor noise explains"
     shown = [e.name for e in errors if e.shows]
     if not shown:
-        return f"Compatible as logged: {agree}, and no error shows."
+        return f"Compatible as logged: {agree}, and no significant sensor error."
     return f"Compatible once {', '.join(shown)} are corrected: {agree}."
 
 
@@ -279,10 +280,10 @@ def _untold(run: FitRun, errors: Sequence[SensorError]) -> str:
     ]
     if far:
         return (
-            f" But only with {', '.join(far)}, which no sensor has and these channels do not "
-            "determine: the signals may well contradict each other."
+            f" This needs {', '.join(far)}, which is implausible for a sensor and which these "
+            "channels do not determine: the signals may contradict each other."
         )
-    return f" Of {', '.join(e.name for e in untold)} these channels do not tell."
+    return f" These channels do not determine {', '.join(e.name for e in untold)}."
 
 
 def _doubts(run: FitRun, errors: Sequence[SensorError]) -> tuple[Finding, ...]:
@@ -302,9 +303,9 @@ def _doubts(run: FitRun, errors: Sequence[SensorError]) -> tuple[Finding, ...]:
         return tuple(notes)
     each = ", ".join(f"{e.name} {100 * e.estimate.value:+.0f} %" for e in scales)
     words = (
-        f"{each}: more than a sensor's own error. Is it a unit, a filter in front of one of the "
-        "two signals, or an angle that is an estimator's and not the vehicle's? Such numbers bring "
-        "the log's signals together; which of them is wrong they do not say."
+        f"{each}: larger than the error of a sensor. Check the unit, filters on one of the two "
+        "signals, and whether the angle is the vehicle's or an estimator's. These values make "
+        "the signals agree; they do not show which signal is wrong."
     )
     largest = max((e.estimate.value for e in scales), key=abs)
     criterion = f"scale error, {_LARGEST_SCALE:g}"

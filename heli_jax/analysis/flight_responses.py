@@ -225,7 +225,7 @@ def _notes(flights: Sequence[Flight], inputs: list[str], by: tuple[str, ...]) ->
         n for n in outputs if not any(_moves(f.outputs[n]) for f in flights if n in f.outputs)
     ]
     notes += [
-        note("responses.still", f"{n} does not move: no input is seen to move it", n)
+        note("responses.still", f"{n} does not move, so that no input shows a response of it", n)
         for n in resting
     ]
     # No number below reveals the sign of this bias, so a note states it.
@@ -233,9 +233,9 @@ def _notes(flights: Sequence[Flight], inputs: list[str], by: tuple[str, ...]) ->
     if without:
         taken = "inputs that do not follow" if len(without) > 1 else "an input that does not follow"
         words = (
-            f"{', '.join(without)}: taken for {taken} the outputs; where a pilot "
-            "or an autopilot closes a loop the response is biased towards minus one over its gain, "
-            "and a logged excitation (signals.instruments) or a fit by filter error is needed"
+            f"{', '.join(without)}: the outputs are divided by {taken}. If a pilot or an "
+            "autopilot closes a loop, the response is biased towards minus one over its gain: "
+            "log the excitation (signals.instruments), or fit by filter error"
         )
         notes.append(note("loop.responses-direct", words, *without))
     return notes
@@ -265,8 +265,8 @@ def _moving_as_one(
     # If no pair is proportional, one input is a sum of others.
     those = [n for n, one in zip(inputs, alike, strict=True) if np.sum(one) > 1] or inputs
     words = (
-        f"{' and '.join(those)} move as one: no response tells what each of them does; move them "
-        "apart, or leave one of them out"
+        f"{' and '.join(those)} move together, so that their responses cannot be separated; move "
+        "them independently, or leave one of them out"
     )
     return [Finding("excitation.inputs-as-one", "doubt", words, subjects=tuple(those))]
 
@@ -285,9 +285,9 @@ def _weak(
         runs = np.split(at, np.flatnonzero(np.diff(at) > 1) + 1)
         bands = ", ".join(f"{hz[run[0]]:.3g} to {hz[run[-1]]:.3g} Hz" for run in runs)
         words = (
-            f"{name}: at {at.size} of {omega.size} frequencies ({bands}) the excitation hardly "
-            "moves the input beside what feedback and pilot make of it: no response is given "
-            "there; a larger or longer excitation tells"
+            f"{name}: at {at.size} of {omega.size} frequencies ({bands}) feedback and pilot move "
+            "the input far more than the excitation does: these have no response; use a larger "
+            "or longer excitation"
         )
         notes.append(note("excitation.weak-instrument", words, name, value=at.size))
     return notes
@@ -450,8 +450,8 @@ def parts_of(flights: Sequence[Flight], output: str, window: int) -> Parts | str
     if parts:
         return tuple(parts)
     return (
-        f"{output}: no response, expected a part of at least {window} samples (a window) without a "
-        f"missing one, got {longest} at most"
+        f"{output}: no response, expected a part of at least {window} samples (a window) without "
+        f"a missing one, got {longest} at most"
     )
 
 

@@ -288,7 +288,7 @@ def _put_frequency(
     omega, sd = float(np.exp(values[name])), float(np.linalg.norm(by[name]))
     low, high = _ends(response, name, values, by)
     if low < omega / _VAGUE or high > omega * _VAGUE or sd > 1.0:
-        words = "its interval reaches past half or twice its value, or out of the band"
+        words = "its interval reaches beyond half or twice its value, or out of the band"
         sentences.append(_missing(name.replace("_", " "), words))
         return
     numbers[name] = Number(omega, omega * sd, low, high)
@@ -339,8 +339,8 @@ def _put_bandwidth(kind: Kind, numbers: dict[str, Number], sentences: list[str])
             sentences.append(
                 "caution: the gain bandwidth is "
                 + ("indeterminate" if gain is None else "below the phase bandwidth")
-                + ", the vehicle may be prone to pilot-induced oscillations in super-precision "
-                "tasks or where the pilot is aggressive (ADS-33E-PRF, Figure 2)"
+                + ", so that the vehicle may be prone to pilot-induced oscillations in "
+                "super-precision tasks or with an aggressive pilot (ADS-33E-PRF, Figure 2)"
             )
     elif gain is not None and phase is not None:
         numbers["bandwidth"] = min(gain, phase, key=lambda n: n.value)
@@ -370,7 +370,7 @@ def _explain_low_gain(response: _Response, crossover: float, sentences: list[str
     if upward.size or (values.size and values[0] < values[-1] - _RISES):
         at, degrees = _hz(float(np.exp(response.x[i]))), np.degrees(response.phase[i])
         sentences.append(
-            "caution: the phase rises up to the crossover, as where an unstable vehicle is in the "
-            f"loop; it may have a margin towards low gain too, {-_DB * response.gain[i]:.3g} dB at "
+            "caution: the phase rises up to the crossover, as with an unstable vehicle in the "
+            f"loop; there may also be a lower gain margin of {-_DB * response.gain[i]:.3g} dB at "
             f"{at}, where the phase is {degrees:.0f} deg"
         )

@@ -64,9 +64,9 @@ def d2c(
     if method == "zoh" and negative.size:
         named = ", ".join(f"{p:.3f}" for p in sorted(negative))
         raise ValueError(
-            f"no inverse of the zero-order hold exists: the discrete system has a real pole at "
-            f"z = {named}, which no continuous system of order {n} gives when sampled; "
-            "method='real-log' gives a real approximation, which is another system"
+            "the zero-order hold has no inverse: the discrete system has a real pole at z = "
+            f"{named}, which no sampled continuous system of order {n} has; method='real-log' "
+            "gives a real approximation, which is another system"
         )
     M = np.eye(n + 1)
     M[:n, :n], M[:n, n:] = A, B

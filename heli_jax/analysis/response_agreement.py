@@ -41,8 +41,8 @@ class PairAgreement(NamedTuple):
 
 
 APART = (
-    "Too few windows hold all outputs to say how their errors go together: these are taken as "
-    "independent, and intervals are too narrow where they are not. A shorter window has more."
+    "Too few windows hold all outputs to estimate the correlation of their errors. The errors "
+    "are taken as independent; if they are not, intervals are too narrow. Use a shorter window."
 )
 
 
@@ -81,12 +81,12 @@ class ResponseAgreement(NamedTuple):
         words = list(self.notes)
         left = [f"{p.input} to {p.output}" for p in self.pairs if not p.lines]
         if left:
-            words.append(f"Responses that take no part: {', '.join(left)}.")
+            words.append(f"Responses that are not used: {', '.join(left)}.")
         some = sum(p.of - p.lines for p in self.pairs if p.lines)
         if some:
             total = sum(p.of for p in self.pairs if p.lines)
             words.append(
-                f"{some} of {total} lines of the responses take no part: outside of a band or "
+                f"{some} of {total} lines of the responses are not used: outside of a band or "
                 "below a coherence."
             )
         return tuple(words)

@@ -130,16 +130,16 @@ def measured_curve(
     coherent = _widest(np.log(omega), known)
     if coherent.size < _LEAST_BINS:
         if not coherent.size:
-            return f"its coherence stays below {COHERENT} in the mean over an octave"
+            return f"its mean coherence over an octave stays below {COHERENT}"
         return (
-            f"{coherent.size} frequencies side by side have a coherence of {COHERENT} in the mean "
-            f"over an octave, expected {_LEAST_BINS} at least: more `points`, or more excitation"
+            f"{coherent.size} adjacent frequencies have a mean coherence of {COHERENT} over an "
+            f"octave, expected at least {_LEAST_BINS}: more `points`, or more excitation"
         )
     # Beyond a bin that jumps, unwrapping may be wrong by a turn.
     known[coherent] &= ~_leaps(H[coherent], sd[coherent])
     run = _widest(np.log(omega), known)
     if run.size < _LEAST_BINS:
-        return "its phase leaps from bin to bin"
+        return "its phase jumps from bin to bin"
     w, H, relative = omega[run], H[run], sd[run] / np.abs(H[run])
     x = np.log(w)
     y = np.stack([np.log(np.abs(H)), np.unwrap(np.angle(H))], axis=1)
@@ -172,8 +172,8 @@ def _too_sharp(w: np.ndarray, off: np.ndarray, relative: np.ndarray) -> str:
     hz = w[[both[0], both[-1] + 1]] / (2.0 * np.pi)
     return (
         f"caution: at {hz[0]:.3g} to {hz[1]:.3g} Hz the response is sharper than the half octave "
-        "that it is smoothed over, as beside a mode of little damping (a slung load, a tail boom): "
-        "what is read off below w180 may be far off, a fitted model or a transfer function tells"
+        "over which it is smoothed, as near a lightly damped mode (a slung load, a tail boom); "
+        "values below w180 may be wrong: fit a model or a transfer function"
     )
 
 

@@ -283,8 +283,8 @@ def chosen(flights: Sequence[Flight], window: float | None) -> Choice:
     inputs = tuple(n for n in flights[0].inputs if any(np.ptp(f.inputs[n]) > 0 for f in flights))
     if not inputs:
         raise ValueError(
-            "no input moves, and a response is one to an input; a free decay is fitted by "
-            "output-error or frequency-error"
+            "no input moves, so that there is no response; fit a free decay by output-error or "
+            "frequency-error"
         )
     return Choice(dt, window, inputs)
 

@@ -114,7 +114,11 @@ def trim(
             _check_range(model, params, best, condition)
             return best
         offset = rng.standard_normal(offset.size)
-    left = "" if best is None else f": the nearest leaves an acceleration of {best.residual:.3g}"
+    left = (
+        ""
+        if best is None
+        else (f": the best attempt leaves an acceleration of {best.residual:.3g}")
+    )
     if "governor" in naming.names(model.State):
         left += "; its governor has a throttle of 0 to 1 to hold Omega, and no brake"
     raise ValueError(f"no trim of {_words(condition)} exists for this vehicle{left}")
@@ -320,7 +324,7 @@ def _why_heavy(model: Model, params: Any, result: Trim, stick: str) -> str:
         return f"; its weight of {weight:.3g} N is too much for motor or rotor ({gain})"
     return (
         f"; to carry its weight of {weight:.3g} N the rotor would have to turn at "
-        f"{float(result.state.Omega):.4g} rad/s: too heavy, or too slow a rotor "
+        f"{float(result.state.Omega):.4g} rad/s: the vehicle is too heavy, or the rotor too slow "
         "(K_throttle, K_theta0)"
     )
 

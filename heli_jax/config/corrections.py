@@ -136,7 +136,10 @@ def with_corrections(model: Model, flight: Flight, corrections: Corrections, whe
     known, words = _lever_arm(model, flight, corrections)
     notes += words
     if corrections.not_determined:
-        words = f"not corrected, since undetermined: {', '.join(corrections.not_determined)}"
+        words = (
+            "not corrected, because the record does not determine it: "
+            f"{', '.join(corrections.not_determined)}"
+        )
         notes.append(note("corrections.left-out", words, *corrections.not_determined))
     flight = dataclasses.replace(flight, **samples, known={**flight.known, **known})
     return with_notes(flight, notes)

@@ -31,8 +31,8 @@ def _size(value: Any) -> Any:
     real = isinstance(number, int | float) and not isinstance(number, bool)
     if not (real and 0 < number < float("inf")):
         raise ValueError(
-            "expected a number above zero (SI, or {value, unit}), or of several disturbances one "
-            f"for each by name, got {number!r:.60}"
+            "expected a number above zero (SI, or {value, unit}), or one number by name for each "
+            f"disturbance, got {number!r:.60}"
         )
     # The unit is checked where the model, and so the unit of the disturbed state, is known.
     return value if _has_unit(value) else float(value)
@@ -126,7 +126,9 @@ class DisturbanceConfig(Section):
         if len(self.names) > 1 and (isinstance(self.sigma_w, float) or _has_unit(self.sigma_w)):
             # For states in different units, one number would have different meanings.
             example = ", ".join(f"{n}: {_plain(self.sigma_w)}" for n in self.names)
-            raise ValueError(f"sigma_w: expected a value for each, as {{{example}}}, got one")
+            raise ValueError(
+                f"sigma_w: expected a value for each disturbance, as {{{example}}}, got one"
+            )
         for name in self.fixed:
             if name not in (*self.parameters, "sigma_y"):
                 known = ", ".join((*self.parameters, "sigma_y"))

@@ -299,12 +299,12 @@ def _sentence(error: ErrorDetails) -> str:
 
 
 _MEANT = {
-    "signal": "the channel in the log; an output that was not logged is taken out, an input that "
-    "stayed where it was is {constant: 0}",
-    "unit": "that of the channel's numbers in the log",
+    "signal": "the channel in the log; delete an output that was not logged; an input that did "
+    "not move is {constant: 0}",
+    "unit": "the unit of the channel's numbers in the log",
     "rate": "samples a second, in Hz",
     "scale": "the input's full travel in the stated unit over its full travel in the log's numbers",
-    "start": "a value of the parameter to begin from, right to a factor of three or so",
+    "start": "a start value, within a factor of about three",
 }
 """Values that `heli-jax new` cannot know, by the last word of the key."""
 
@@ -355,9 +355,7 @@ def _vehicle(config: Config, path: Path, model: Model) -> Vehicle:
     for name in model.positive:
         constant = vehicle.constants.get(name)
         if constant is not None and constant.value <= 0:
-            raise InputError(
-                f"{vehicle.path}: {name} must be more than zero, got {constant.value:g}"
-            )
+            raise InputError(f"{vehicle.path}: {name} must be above zero, got {constant.value:g}")
     return vehicle
 
 

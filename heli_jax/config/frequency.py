@@ -31,9 +31,9 @@ def asked_handling(
         ):
             continue
         raise InputError(
-            f"{experiment.path}: frequency.handling[{i}].output: {h.output} is in {unit[h.output]},"
-            " expected an angle or a rate of turn, of which alone bandwidth and phase delay are "
-            "defined"
+            f"{experiment.path}: frequency.handling[{i}].output: {h.output} is in "
+            f"{unit[h.output]}, expected an angle or an angular rate, since bandwidth and phase "
+            "delay are defined for these"
         )
     return tuple(
         HandlingPair(

@@ -161,7 +161,8 @@ def prepared(model: Model, flight: Flight, where: str) -> Flight:
         remedy = "choose another window" if reached < _STRAIGHT_UP else "is its unit another?"
         raise InputError(
             f"{where}: theta reaches {np.degrees(reached):.0f} deg, expected at most "
-            f"{np.degrees(STEEPEST):.0f} deg, beyond which roll and yaw are one turn: {remedy}"
+            f"{np.degrees(STEEPEST):.0f} deg, since beyond it roll and yaw cannot be separated: "
+            f"{remedy}"
         )
     _check_rates(flight, where)
     _check_moving(flight, where)
@@ -179,7 +180,7 @@ def _check_rates(flight: Flight, where: str) -> None:
         if fastest > _FASTEST:
             raise InputError(
                 f"{where}: {n} reaches {fastest:.0f} rad/s, expected at most {_FASTEST:g} rad/s, "
-                "more than gyros measure: check its unit"
+                "the limit of gyros: check its unit"
             )
 
 

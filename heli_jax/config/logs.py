@@ -158,7 +158,7 @@ def _check(model: Model, f: FlightConfig, where: str) -> None:
     require_known(f.known, known, f"{where}.known", f"model {model.name} has no parameter")
     if f.window == "auto" and f.hold_out:
         raise InputError(
-            f"{where}.window: auto chooses what to fit, expected two numbers with hold_out"
+            f"{where}.window: auto chooses data to fit, expected two numbers with hold_out"
         )
 
 
@@ -277,11 +277,10 @@ def _columns(experiment: Experiment) -> NamedBy:
         inputs, outputs = _of_model(experiment.model, everything, f"{where}.signals", gain)
         both = {n: inputs[n] for n in own.inputs} | {n: outputs[n] for n in own.outputs}
         constants = [n for n, signal in both.items() if signal.constant is not None]
-        notes = [
-            note(LEFT_OUT, f"{n} is a constant of {path}, and no column", n) for n in constants
-        ]
+        notes = [note(LEFT_OUT, f"{n} is a constant in {path}, not a column", n) for n in constants]
         notes += [
-            note(LEFT_OUT, f"what {path} takes from {also.log} is left out") for also in first.also
+            note(LEFT_OUT, (f"the signals that {path} takes from {also.log} are left out"))
+            for also in first.also
         ]
         notes += [*_unstated_units(experiment.model, own), *own.notes]
         signals = {n: signal for n, signal in both.items() if n not in constants}
@@ -391,7 +390,7 @@ def signals(
     missing = [n for n in known if n not in stated]
     # Every input acts on the vehicle, so none may be missing; one output is enough.
     if role == "inputs" and missing:
-        remedy = f"where it did not act, {missing[0]}: {{constant: 0}}"
+        remedy = f"if it did not act, {missing[0]}: {{constant: 0}}"
         problem = f"{missing[0]} missing, model {model.name} needs it; {remedy}"
         raise InputError(f"{where}.inputs: {problem}")
     # Without an output there is no residual to fit, and nothing to compare a simulation with.
@@ -433,15 +432,15 @@ def _si(unit: str, si: str | None, place: str, gain: bool, role: str) -> str:
         hint = ""
         # The remedy applies only to sticks logged in percent or counts.
         if si is not None and unit.strip() in ("", "1", "-", "%", "stick", "dimensionless"):
-            hint = "; or set fit.nuisance.input_gain: true, and the estimated gain carries the unit"
+            hint = (
+                "; or set fit.nuisance.input_gain: true to estimate a gain that includes the unit"
+            )
         # A receiver's pulse width is a time, and no model has a stick in units of time.
         if role == "inputs" and si is not None and units.is_time(unit):
             example = f'{_OFFSET_AND_SCALE}, unit: "1"'
             if not units.is_plain(si):
                 example = f"such as offset: 1500, scale in {si} per {unit.strip()}, unit: {si}"
-            hint = (
-                f"; of pulse widths state offset, scale and the unit that they then have, {example}"
-            )
+            hint = f"; for pulse widths state offset, scale and the unit after scaling, {example}"
         raise InputError(f"{place}: {e}{hint}") from e
     return si
 
@@ -461,8 +460,8 @@ def _pulse_width_doubts(flight: Flight) -> tuple[Finding, ...]:
         if signal.scale != 1.0:
             taken = f"{signal.scale:g} {taken} each"
         words = (
-            f"{name}: {low:.4g} to {high:.4g} in the log look like pulse widths in us, and are "
-            f"taken as {taken}, with no offset: state offset and scale, {_OFFSET_AND_SCALE}"
+            f"{name}: {low:.4g} to {high:.4g} in the log look like pulse widths in us but are "
+            f"taken as {taken} without offset: state offset and scale, {_OFFSET_AND_SCALE}"
         )
         doubts.append(Finding("units.unlikely", "doubt", words, high, "largest number", (name,)))
     return tuple(doubts)

@@ -181,8 +181,9 @@ def filter_cautions(
             said.append(_not_modelled(name, output, logged))
         if logged.unknown:
             words = (
-                f"{name} was also filtered by {', '.join(_short(s) for s in logged.unknown)}: such "
-                "filters move in flight or are of an unknown kind, and are not modelled"
+                f"{name} was also filtered by {', '.join(_short(s) for s in logged.unknown)}. "
+                "These filters are not modelled, because they change in flight or are of an "
+                "unknown kind"
             )
             said.append(Finding("filters.unknown", "doubt", words, subjects=(name,)))
     return tuple(said)
@@ -198,10 +199,10 @@ def coloured_noise_cautions(flight: Flight, model: Model) -> tuple[Finding, ...]
         Finding(
             "filters.noise-coloured",
             "doubt",
-            f"{p.output}: its noise went through the low-pass of {p.hz:.3g} Hz too, and is not "
-            f"white at {1.0 / flight.dt:.4g} Hz, for which `disturbance.fixed: [sigma_y]` takes "
-            "it: estimates may be off by several standard deviations; leave sigma_y out of it, and "
-            "the noise before the filter is estimated",
+            f"{p.output}: the low-pass of {p.hz:.3g} Hz also filtered its noise, which is "
+            f"therefore not white at {1.0 / flight.dt:.4g} Hz, as `disturbance.fixed: [sigma_y]` "
+            "assumes. Estimates may be wrong by several standard deviations; remove sigma_y from "
+            "it, and the noise before the filter is estimated",
             p.hz,
             "Hz, the cut-off",
             (p.output,),
@@ -223,9 +224,9 @@ def _not_modelled(name: str, output: OutputConfig, logged: LoggedFilters) -> Fin
     # The inputs were not filtered; if both were filtered alike, the vehicle would look the same.
     words = (
         f"{name} was {what} by the autopilot ({', '.join(_short(s) for s in logged.settings)}), "
-        f"which delays it by about {late:.1f} ms, and the inputs were not: what is estimated takes "
-        f"that delay for the vehicle's; state `{name}: {{{', '.join(line)}, filter: from log}}` "
-        "under outputs to model it, or `filter: []` there if it is of no account"
+        f"which delays it by about {late:.1f} ms, unlike the inputs. The fit attributes this "
+        f"delay to the vehicle; state `{name}: {{{', '.join(line)}, filter: from log}}` under "
+        "outputs to model it, or `filter: []` to neglect it"
     )
     return Finding("filters.not-modelled", "doubt", words, 1e-3 * late, "delay [s]", (name,))
 
@@ -263,9 +264,9 @@ def unfiltered_cautions(flight: Flight, outputs: Mapping[str, OutputConfig]) -> 
             slow, fast, there, left = found
             words = (
                 f"{name}: its noise at {fast:.3g} Hz has {percent(there, 0)} of its power at "
-                f"{slow:.3g} Hz, of which the stated low-pass of {cutoff(filters):.3g} Hz leaves "
-                f"{percent(left, 0)}: was it logged before the filter? Then the lag of a filter "
-                "that is not there is taken off the vehicle's; leave the filter out and compare"
+                f"{slow:.3g} Hz, but the stated low-pass of {cutoff(filters):.3g} Hz would leave "
+                f"{percent(left, 0)}. If it was logged before the filter, the fit makes the "
+                "vehicle too fast by the filter's lag; remove the filter and compare"
             )
             said.append(Finding("filters.not-passed", "doubt", words, there, "power", (name,)))
     return tuple(said)

@@ -324,7 +324,7 @@ def _shipped_value(experiment: Experiment, name: str) -> str:
     if not (isinstance(model, LinearConfig) and is_shipped(model.linear)):
         return ""
     value = float(getattr(experiment.vehicle.params, name))
-    return f" ({value:.4g} is that of the vehicle that the model was taken from)"
+    return f" ({value:.4g} is the value of the vehicle for which the model was published)"
 
 
 def _from_vehicle(experiment: Experiment, free: Mapping[str, Free]) -> Mapping[str, Free]:

@@ -43,9 +43,11 @@ class TimeConfig(Section):
     @model_validator(mode="after")
     def _one_clock(self) -> "TimeConfig":
         if self.signal is None and self.rate is None:
-            raise ValueError("expected the column of times, signal, or samples a second, rate")
+            raise ValueError(
+                "expected either signal, the column of times, or rate, the samples per second"
+            )
         if self.rate is not None and "unit" in self.model_fields_set:
-            raise ValueError("unit: expected none beside a rate, which says how long a sample is")
+            raise ValueError("unit: expected none with a rate, which already gives the sample time")
         return self
 
 

@@ -49,7 +49,7 @@ class LoggedInputConfig(ScaledConfig):
             raise ValueError("expected either signal or constant")
         if self.constant is not None and self.conversion != ScaledConfig().conversion:
             raise ValueError(
-                "scale, offset and invert are of a signal, expected none, got constant"
+                "scale, offset and invert need a signal, expected none with a constant"
             )
         return self
 

@@ -141,8 +141,7 @@ def _over(over: Sequence[str] | Mapping[str, Sequence[Any]]) -> Axes:
         # One value in brackets is a list as a value, for example of windows.
         if not isinstance(listed, list) or len(listed) < 2:
             raise InputError(
-                f"{where}: expected two values at least, with commas between them and no brackets "
-                "around"
+                f"{where}: expected at least two values, separated by commas and without brackets"
             )
         axes[key] = tuple(listed)
     return axes

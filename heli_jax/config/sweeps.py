@@ -36,10 +36,10 @@ def simulates(experiment: Experiment) -> bool:
     # Logs have priority: a configuration with both was written for a fit of a simulated log.
     source = config.sweep.inputs or ("flights" if config.flights else "simulate")
     if source == "flights" and not config.flights:
-        raise InputError(f"{path}: sweep.inputs: there are no flights, expected at least one log")
+        raise InputError(f"{path}: sweep.inputs: no flights, expected at least one log")
     if source == "simulate" and config.simulate is None:
         raise InputError(
-            f"{path}: sweep: no inputs, expected flights, or simulate, which makes some"
+            f"{path}: sweep: no inputs, expected flights, or simulate, which generates inputs"
         )
     return source == "simulate"
 
@@ -74,14 +74,14 @@ def sweep_job(
     if sweep.start is not None:
         # Two starts would contradict each other.
         if made is not None:
-            raise InputError(f"{where}.start: expected simulate.start, which makes the inputs")
+            raise InputError(f"{where}.start: expected simulate.start, which generates the inputs")
         # A logged stick already includes the trim, which must not be added twice.
         trimmed = Trimmed(Condition(**sweep.start.model_dump()), sticks=False, of=experiment.model)
     # The trim would silently overwrite an initial state.
     if trimmed is not None and experiment.config.initial_state:
         raise InputError(
-            f"{path}: initial_state: each element of this sweep begins in a trim of its own, "
-            "expected a configuration without it"
+            f"{path}: initial_state: each element of this sweep begins in its own trim, expected "
+            "a configuration without it"
         )
     with experiment.located("sweep"):
         return job(
@@ -114,12 +114,13 @@ def _model(experiment: Experiment, sweep: SweepConfig) -> tuple[Model, Any]:
         # Filter error guesses missing values from a record; a sweep has no record.
         if value is None and name not in drawn:
             raise InputError(
-                f"{experiment.path}: disturbance.{name}: missing, expected a number to draw it with"
+                f"{experiment.path}: disturbance.{name}: missing, expected a number, since the "
+                "sweep draws the disturbance"
             )
     if "seed" not in drawn:
         raise InputError(
-            f"{experiment.path}: sweep.axes.{drawn[0]}: expected an axis seed too, as "
-            "seed: {values: [0]}, without which nothing is drawn"
+            f"{experiment.path}: sweep.axes.{drawn[0]}: expected also an axis seed, as seed: "
+            "{values: [0]}; without it no disturbance is drawn"
         )
     return disturbed(experiment)
 

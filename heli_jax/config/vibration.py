@@ -86,8 +86,9 @@ def _too_slow(flight: Flight, frequencies: Sequence[float]) -> tuple[Finding, ..
             listed = ", ".join(f"{hz:g}" for hz in above)
             at = ", ".join(f"{folded(hz, rate):.3g}" for hz in above)
             words = (
-                f"{name} at about {rate:.4g} Hz is not notched at {listed} Hz: what it may have of "
-                f"that is folded to {at} Hz, where a notch would take the vehicle's motion too"
+                f"{name} at about {rate:.4g} Hz is not notched at {listed} Hz: a vibration there "
+                f"appears at {at} Hz in this signal, where a notch would also remove the "
+                "vehicle's motion"
             )
             notes.append(note("notches.too-slow", words, name, value=rate))
     return tuple(notes)
@@ -102,14 +103,14 @@ def _lost(
         there, left = int(np.isfinite(y).sum()), int(np.isfinite(outputs[name]).sum())
         if left == there:
             continue
-        words = f"behind missing samples of {name} notches take {settled:.2g} s to settle"
+        words = f"after missing samples of {name} the notches take {settled:.2g} s to settle"
         if left < max(FEWEST, _LEFT * there):
             raise InputError(
                 f"{where}: {words}, which leaves {left} of its {there} samples; expected a window "
                 "with fewer gaps, `gaps: split` where they are long, a rate as low as that of the "
                 "slowest output, or no notch"
             )
-        words += f", and {there - left} of {there} samples are left out for it"
+        words += f", and {there - left} of {there} samples are left out for this"
         notes.append(note("notches.samples-lost", words, name, value=there - left))
     return tuple(notes)
 
