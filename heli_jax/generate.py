@@ -182,7 +182,7 @@ def drive(experiment: Experiment) -> Made:
     _check_full_nonlinear(experiment, settings, where)
     # A sweep reduces results during the run, so all runs have the same length.
     if settings.ground is not None:
-        raise InputError(f"{where}.ground: a sweep has none, expected a configuration without it")
+        raise InputError(f"{where}.ground: not for sweeps, expected a configuration without it")
     n, rng = round(settings.duration * settings.rate), np.random.default_rng(settings.seed)
     flown = in_wind(experiment) if settings.wind is not None else experiment
     # The draws equal those of `generate`, so each element flies the same manoeuvre.
@@ -322,8 +322,7 @@ def _notes(experiment: Experiment, run: Trajectory) -> tuple[Finding, ...]:
         assert settings is not None
         ended = float(run.ended)
         words = (
-            f"the vehicle descends to {settings.ground:g} m at {ended:.4g} s: nothing "
-            "is written after that"
+            f"the vehicle reaches {settings.ground:g} m at {ended:.4g} s: the rest is not written"
         )
         notes.append(note("simulation.ends-on-ground", words, value=ended))
     # The state is frozen after an event and does not belong to the flight.
@@ -353,7 +352,7 @@ def _stick_notes(experiment: Experiment, run: Trajectory, flown: np.ndarray) -> 
         beyond = (stick < low - _MIDDLE) | (stick > high + _MIDDLE)
         if beyond.any():
             first = run.times[np.argmax(beyond)]
-            words = f"{name} is beyond its ends of {low:g} and {high:g}, first at {first:g} s"
+            words = f"{name} is beyond its limits of {low:g} and {high:g}, first at {first:g} s"
             notes.append(note("simulation.stick-beyond-ends", words, name, value=float(first)))
     return notes
 
@@ -371,8 +370,9 @@ def _held_notes(experiment: Experiment, logged: dict[str, np.ndarray]) -> list[F
     if not moving:
         return []
     words = (
-        f"{', '.join(moving)}: held between samples here, but moving at nearly every one; to fit "
-        "this log say hold: zero-order in flights[].signals.inputs (docs/inputs.md)"
+        f"{', '.join(moving)}: this simulation holds it between samples, but it changes at nearly "
+        "every sample; to fit this log state hold: zero-order in flights[].signals.inputs "
+        "(docs/inputs.md)"
     )
     return [note("hold.moving-held", words, *moving)]
 

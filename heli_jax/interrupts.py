@@ -130,7 +130,7 @@ def resumable(out: Path, finished: str) -> str:
     if not out.exists():
         return "interrupted; nothing was written"
     if any(out.glob(finished)):
-        return f"interrupted; what is finished is kept: --out {out} --resume goes on"
+        return f"interrupted; finished parts are kept: --out {out} --resume continues"
     return f"interrupted; nothing was finished yet: --out {out} --resume begins with the first"
 
 

@@ -115,7 +115,7 @@ def _flight_lines(flight: LogInfo, count: int) -> Iterator[str]:
     if flight.firmware:
         yield f"firmware: {flight.firmware}"
     if math.isnan(flight.duration):
-        yield "duration: unknown: rows have an order and no times, which no fit can use"
+        yield "duration: unknown, because rows have no times; a fit needs times"
     else:
         yield f"duration: {flight.duration:.6g} s"
     fitting = fitting_presets(flight.format, [column.name for column in flight.columns])
@@ -126,8 +126,8 @@ def _flight_lines(flight: LogInfo, count: int) -> Iterator[str]:
 def _clock_lines(clock: TimeInfo | None) -> Iterator[str]:
     if clock is None:
         yield (
-            "time: no column looks like a clock; --time NAME says which is one, --time-rate HZ how "
-            "many samples a second has (in a configuration time: {rate: HZ})"
+            "time: no column looks like a clock; name it by --time NAME, or give the samples per "
+            "second by --time-rate HZ (in a configuration time: {rate: HZ})"
         )
         return
     if clock.problem:
@@ -144,7 +144,7 @@ def _clock_lines(clock: TimeInfo | None) -> Iterator[str]:
         )
         yield f"jitter {_percent(clock.jitter)} of a step, {_gap_words(clock)}"
     if clock.guessed and clock.counted is None:
-        yield f"the unit {clock.unit} is guessed; --time-unit says which it is"
+        yield f"the unit {clock.unit} is a guess; --time-unit states it"
     # The longest gaps come first, since they affect a fit. A single lost row is bridged.
     for gap in sorted(clock.gaps, key=lambda gap: -gap.length)[:_MOST_LINES]:
         yield f"gap of {gap.length:.4g} s at {gap.start:.6g} s"
@@ -200,7 +200,11 @@ def _asked(columns: Sequence[ColumnInfo], pattern: str | None) -> list[ColumnInf
 def _print_channels(columns: Sequence[ColumnInfo], pattern: str | None) -> None:
     shown = _asked(columns, pattern)
     if not shown:
-        of = f"none is named {pattern!r}" if pattern else "--channels 'att*' lists those of a name"
+        of = (
+            f"none is named {pattern!r}"
+            if pattern
+            else ("--channels 'att*' lists those whose names match")
+        )
         tell(f"{len(columns)} channels; {of}")
         return
     rows = []

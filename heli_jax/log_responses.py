@@ -26,7 +26,7 @@ from heli_jax.terminal import print_table, tell, tell_table
 from heli_jax.yaml_file import as_yaml
 
 _HOLDS = {
-    "linear": "taken to move in straight lines",
+    "linear": "taken as linear",
     "zero-order": "held",
     "mixed": "held until they jump",
 }
@@ -63,10 +63,10 @@ def responses_of_log(
     if not any(np.isfinite(pair.coherence).any() for pair in pairs):
         longest = max(f.duration for f in flights)
         raise InputError(
-            f"{experiment.path}: no response: at no frequency of the band has a signal ten times "
-            "the power that the window's sidelobes bring, expected sticks that are excited there "
-            f"(a sweep, doublets) for longer than a few windows of {estimate.window:.3g} s, got "
-            f"{longest:.3g} s"
+            f"{experiment.path}: no response: nowhere in the band does a signal have ten times "
+            "the power that leaks from other frequencies; expected excitation of the sticks "
+            f"there (a sweep, doublets) for longer than a few windows of {estimate.window:.3g} s, "
+            f"got {longest:.3g} s"
         )
     notes = (
         *_held_out(flights),
@@ -87,8 +87,8 @@ def _held_out(flights: Sequence[Flight]) -> tuple[Finding, ...]:
     if not names:
         return ()
     words = (
-        f"{', '.join(names)}: used here as the other flights are, hold_out: true or not; a fit, "
-        "and the responses in its report, leave held-out flights out"
+        f"{', '.join(names)}: used here like the other flights, although held out from the fit "
+        "(hold_out: true) and from the responses in its report"
     )
     return (note("responses.held-out-used", words, *names),)
 
@@ -111,9 +111,9 @@ def between_samples(flights: Sequence[Flight], inputs: Collection[str]) -> list[
     notes = [
         note(
             "hold.differs",
-            f"{', '.join(names)}: of the first flight {_HOLDS[first]} between samples, of others "
-            f"{_HOLDS[other]}; all are taken as the first: state signals.inputs.*.hold, or take "
-            "responses of like flights together",
+            f"{', '.join(names)}: {_HOLDS[first]} between samples in the first flight, "
+            f"{_HOLDS[other]} in others; all are treated like the first: state "
+            "signals.inputs.*.hold, or take responses of like flights together",
             *names,
         )
         for (first, other), names in mixed.items()
@@ -124,8 +124,8 @@ def between_samples(flights: Sequence[Flight], inputs: Collection[str]) -> list[
         reasons = "; ".join(dict.fromkeys(guessed.values()))
         words = (
             f"{', '.join(guessed)}: {_HOLDS['linear']} between samples (it {reasons}), which is a "
-            "guess; of a command that is held from sample to sample delays and phase delays are up "
-            f"to half a sample, {half:.3g} ms, shorter and bandwidths higher: state "
+            "guess. If the command is held between samples, delays and phase delays are up to "
+            f"half a sample, {half:.3g} ms, shorter, and bandwidths higher: state "
             "signals.inputs.NAME.hold"
         )
         notes.append(note("hold.guessed", words, *guessed, value=1e-3 * half))
@@ -200,8 +200,8 @@ def not_usable(responses: FlightResponses) -> tuple[Finding, ...]:
     if any(np.max(octave_mean(responses.omega, p.coherence)) >= COHERENT for p in pairs):
         return ()
     words = (
-        f"no response is usable: none has a coherence of {COHERENT:g} in the mean over an octave; "
-        "little was excited, or gusts and noise are larger than the response"
+        f"no response is usable: none has a mean coherence of {COHERENT:g} over an octave; the "
+        "excitation was small, or gusts and noise are larger than the response"
     )
     return (Finding("responses.not-usable", "doubt", words),)
 

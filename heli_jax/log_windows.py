@@ -82,7 +82,7 @@ def print_ranking(ranking: Ranking) -> None:
     print_table(head, rows, keys=head.index("to [s]") + 1)
     unshown = len(rest) - max(_MOST - len(taken), 0)
     if unshown > 0:
-        tell(f"windows that say less, not shown: {unshown}")
+        tell(f"less informative windows, not shown: {unshown}")
     for w in ranking.windows:
         if w.excluded:
             tell(f"left out: {w.label}, {w.start:.4g} s to {w.end:.4g} s: {w.excluded}")
@@ -92,9 +92,10 @@ def print_ranking(ranking: Ranking) -> None:
         for n, s, a in zip(ranking.parameters, last.sd, ranking.all_sd, strict=True)
     )
     tell(
-        f"{len(taken)} of {len(ranking.windows)} windows of {ranking.length:.3g} s say "
-        f"{100 * last.efficiency:.0f} % of what all say together (at least {100 * ENOUGH:.0f} % "
-        f"asked); expected sd of these (of all): {together}. At the start values, from white noise."
+        f"{len(taken)} of {len(ranking.windows)} windows of {ranking.length:.3g} s give "
+        f"{100 * last.efficiency:.0f} % of the accuracy of all together (at least "
+        f"{100 * ENOUGH:.0f} % required); expected sd with these (with all): {together}. At the "
+        "start values, for white noise."
     )
     _print_doubts(ranking)
 
@@ -120,7 +121,7 @@ def _print_doubts(ranking: Ranking) -> None:
         tell(f"! {found.sentence}")
     if names := not_determined(ranking):
         whole = "The whole record does" if set(names) <= set(ranking.undetermined) else "All do"
-        tell(f"! {whole} not determine {', '.join(names)}; heli-jax check says why.")
+        tell(f"! {whole} not determine {', '.join(names)}; see heli-jax check.")
 
 
 def _of(w: Window) -> tuple[str, ...]:

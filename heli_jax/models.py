@@ -84,7 +84,7 @@ def by_name(
     if corrections is not None or wind:
         what = "wind" if wind else "corrections"
         raise InputError(
-            f"{where}: {name!r} takes no {what}, expected one of {', '.join(_HELICOPTERS)}"
+            f"{where}: {name!r} has no {what}, expected one of {', '.join(_HELICOPTERS)}"
         )
     return model
 

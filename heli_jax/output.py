@@ -124,14 +124,14 @@ def print_compatibility(result: Compatibility) -> None:
     head, rows = compatibility.table(result)
     print_table(head, [tuple(map(plain_cell, row)) for row in rows])
     r_squared = ", ".join(f"{n} {r:.4f}" for n, r in result.r_squared.items())
-    tell(f"R2 of what is reconstructed: {r_squared}")
+    tell(f"R2 of the reconstructed signals: {r_squared}")
     assert result.run.directory is not None
     tell(f"corrections: {result.run.directory / compatibility.FILE}")
     tell(f"report: {result.run.directory / 'report.html'}")
 
 
 def _print_first_guess(guess: EquationErrorStart | FrequencyErrorStart) -> None:
-    tell(f"Where the fit began, by {report_tables.start_method(guess)} (no result):")
+    tell(f"Start values, by {report_tables.start_method(guess)} (no result):")
     tell_table(report_tables.first_guess(guess))
 
 
@@ -157,7 +157,7 @@ def print_check(check: Check, *, verbose: bool = False) -> None:
     """Print the identifiability at the initial guess on standard output."""
     verdict = check.verdict
     # The fit's result at its estimates may differ, since sensitivities depend on the parameters.
-    tell("At the start values (the fit judges at its estimates, which may differ):")
+    tell("At the start values (a fit repeats this at its estimates):")
     tell(verdict.text)
     rows = []
     for i, name in enumerate(verdict.names):

@@ -60,9 +60,7 @@ def require_free(path: Path, otherwise: str = "") -> None:
         # Try it, since permissions do not reveal file systems that are read-only or full.
         os.rmdir(tempfile.mkdtemp(prefix=f".{path.name}-", dir=parent))
     except OSError as e:
-        raise InputError(
-            f"--out {path}: expected a place in a folder that can be written to, got {parent}"
-        ) from e
+        raise InputError(f"--out {path}: expected a writable folder, got {parent}") from e
 
 
 def is_new(path: Path, resume: bool) -> bool:
@@ -86,7 +84,7 @@ def require_writable(path: Path) -> None:
         InputError: it is no directory, or is not writable.
     """
     if not path.is_dir() or not os.access(path, os.W_OK | os.X_OK):
-        raise InputError(f"--out {path}: expected a directory that can be written to")
+        raise InputError(f"--out {path}: expected a writable directory")
 
 
 @contextlib.contextmanager

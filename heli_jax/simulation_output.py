@@ -99,13 +99,13 @@ def print_sweep(out: Path) -> None:
         if sum(apart.values()):
             words = " and ".join(f"{k} {what}" for what, k in apart.items() if k)
             of = result["n"] + sum(apart.values())
-            tell(f"! {name}: of {of} values {words}, which its line leaves out")
+            tell(f"! {name}: {words} of {of} values, which its line leaves out")
     timing = totals["timing"]
     # A sweep resumed after its end computes nothing and has no rate.
     if timing["computed_elements"]:
         tell(
             f"{timing['computed_elements']} elements in {terse(timing['seconds'], 3)} s "
-            f"({terse(timing['elements_per_s'], 3)} a second, with compilation)"
+            f"({terse(timing['elements_per_s'], 3)} per second, with compilation)"
         )
     tell(f"store: {out / 'sweep.zarr'}")
     if (out / "report.html").is_file():

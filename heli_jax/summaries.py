@@ -163,8 +163,8 @@ def precision_of(run: Any) -> tuple[str, str]:
     # Measured for the roll model on the bench, against the same run in float64.
     digits = np.finfo(least).precision + 1
     return least.name, (
-        f"computed in {least.name}, {digits} digits a number in place of 16, which leaves a roll "
-        "run of 100,000 samples off by 5e-5 of a signal's largest value (for float64 call "
+        f"computed in {least.name}, with {digits} instead of 16 digits, which changes a roll run "
+        "of 100,000 samples by 5e-5 of a signal's largest value (for float64 call "
         "jax.config.update('jax_enable_x64', True) first)"
     )
 

@@ -53,7 +53,7 @@ def run_sweep(
     notes = []
     # Not refused: a fit's configuration may have a disturbance that a sweep over Ixx does not need.
     if config.config.disturbance is not None and "seed" not in job.design.names:
-        words = "disturbance: nothing is drawn without an axis seed, as seed: {values: [0]}"
+        words = "disturbance: no disturbance is drawn without an axis seed, as seed: {values: [0]}"
         notes.append(note("sweep.nothing-drawn", words))
     out = None if out is None else Path(out)
     # Arguments take precedence over the configuration.
@@ -103,4 +103,4 @@ def _draw_sweep(out: Path, dataset: "xr.Dataset", say: Callable[[str], None]) ->
     # Each result and axis needs a figure, so only the first results are drawn.
     count = len(results(dataset))
     if count > RESULTS:
-        say(f"slices and maps are of the first {RESULTS} of {count} results")
+        say(f"slices and maps show the first {RESULTS} of {count} results")

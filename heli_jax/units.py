@@ -161,7 +161,7 @@ def _unknown(unit: str, text: str) -> str:
     """Return a message on an unreadable unit, with the closest known names."""
     if text in _FROM_ANOTHER_ZERO:
         remedy = _FROM_ANOTHER_ZERO[text]
-        return f"unit {text!r} counts from another zero than K; of a signal state {remedy}"
+        return f"unit {text!r} has another zero than K; for a signal state {remedy}"
     wrong, place = text[:60], ""
     if len(text) <= 60 and _UNIT.fullmatch(text):
         names = _unknown_names(text.replace("%", "percent").replace("°", "degree"))
@@ -195,8 +195,8 @@ def factor(unit: str, si: str) -> float:
         # Logs do not use radians per minute: 1/min usually means turns, a factor of 2 pi.
         if dict(have.dimensionality) == {"[time]": -1.0} and float(base.magnitude) != 1.0:
             raise ValueError(
-                f"unit {unit!r} is a number in a time, of turns or of radians, expected 'rpm' of "
-                "turns in a minute, or 'rad/min'"
+                f"unit {unit!r} is a number per time, of turns or of radians, expected 'rpm' for "
+                "turns per minute, or 'rad/min'"
             )
         if float(base.magnitude) == 1.0 or dict(base.dimensionality):
             return float(base.magnitude / want.to_base_units().magnitude)
@@ -235,7 +235,7 @@ def si_of(unit: str) -> str:
     for si in _SI:
         if _parse(si).dimensionality == kind:
             return si
-    raise ValueError(f"unit {unit!r} is of the kind {kind}, for which no SI unit is listed")
+    raise ValueError(f"unit {unit!r} is a {kind}, for which no SI unit is listed")
 
 
 _BASE = {

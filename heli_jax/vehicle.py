@@ -150,7 +150,7 @@ def _reasons(params: Mapping[str, Any]) -> Iterator[tuple[Any, str, tuple[Any, .
     if {"R1", "R2"} <= params.keys():
         words = (
             "R1 must be less than R2, got R1 = {:g} and R2 = {:g}: R1 is the inner and R2 the "
-            "outer end of the flybar paddle (the paper's nomenclature exchanges them)"
+            "outer end of the flybar paddle (the paper's nomenclature swaps them)"
         )
         yield params["R1"] >= params["R2"], words, (params["R1"], params["R2"])
     if "B" in params:
@@ -230,7 +230,7 @@ def vehicle_from_mapping(
     stands = [n for n, value in values.items() if value == EDIT]
     if stands:
         asked = ", ".join(f"{n} in {naming.unit(params, n) or '1'}" for n in stands)
-        raise InputError(f"{where}: is still {EDIT}, expected numbers of {asked}")
+        raise InputError(f"{where}: still {EDIT}, expected numbers for {asked}")
     for name, entry in content.items():
         constants[name] = constant(entry, name, naming.unit(params, name), where)
     lacking = [n for n in known if n not in constants and n not in naming.defaults(params)]

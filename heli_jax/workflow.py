@@ -167,8 +167,8 @@ def _fit_run(
         # A fit that ignores the study would look like the study's result.
         if config.config.study is not None:
             raise InputError(
-                f"{config.path}: study: asks for many fits, expected heli_jax.run_study, or "
-                "study: null"
+                f"{config.path}: study: needs many fits, expected heli_jax.run_study, or study: "
+                "null"
             )
         problem = configuration.problem(config)
     # Report before the fit, so that a wrong unit or hold is seen while the fit runs.
@@ -256,7 +256,7 @@ def log_notes(problem: Problem) -> list[Finding]:
             note(
                 "hold.guessed",
                 f"{where}: {name} is taken as {flight.hold[name]} between samples, because it "
-                f"{reason}; state hold: zero-order if a computer commanded it",
+                f"{reason}; if a computer commanded it, state hold: zero-order",
                 name,
             )
             for name, reason in flight.hold_reason.items()

@@ -67,7 +67,7 @@ def read_mapping(path: str | Path) -> dict[str, Any]:
     try:
         text = data.decode("utf-8-sig")  # Windows editors may add a byte-order mark
     except UnicodeDecodeError as e:
-        raise InputError(f"{path}: is not text, expected a YAML file") from e
+        raise InputError(f"{path}: not a text file, expected a YAML file") from e
     return parse_mapping(text, str(path))
 
 
@@ -80,7 +80,7 @@ def parse_mapping(text: str, where: str) -> dict[str, Any]:
     if not isinstance(value, dict):
         kind = "nothing" if value is None else _KINDS.get(type(value), "something else")
         # The first row of a log is words, which YAML reads as one text.
-        log = "; of a log `heli-jax new LOG` makes a configuration" if "," in text[:200] else ""
+        log = "; `heli-jax new LOG` makes a configuration for a log" if "," in text[:200] else ""
         raise InputError(f"{where}: expected keys with values, got {kind}{log}")
     return value
 

@@ -117,8 +117,8 @@ def _coarse(a: np.ndarray, b: np.ndarray) -> tuple[int, float]:
         lowest = float(r.min())
         if lowest < -LEAST and -lowest > r[best]:
             raise NotAligned(
-                f"the two move against one another (correlation {lowest:.2f}); expected the same "
-                "sign, or `reverse: true`"
+                f"the two have opposite signs (correlation {lowest:.2f}); expected the same sign, "
+                "or `reverse: true`"
             )
         raise NotAligned(
             f"they are hardly correlated ({r[best]:.2f} at the best lag), expected at least {LEAST}"
@@ -126,7 +126,7 @@ def _coarse(a: np.ndarray, b: np.ndarray) -> tuple[int, float]:
     rival = other_peak(r, best)
     if rival is not None and 1.0 - r[rival] ** 2 < _RIVAL * (1.0 - r[best] ** 2):
         raise NotAligned(
-            f"{abs(int(shifts[best] - shifts[rival]))} samples apart two lags fit nearly equally "
+            f"two lags {abs(int(shifts[best] - shifts[rival]))} samples apart fit nearly equally "
             f"well (correlations {r[best]:.4f} and {r[rival]:.4f}); expected a signal that does "
             "not repeat itself"
         )
@@ -171,7 +171,7 @@ def correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     # If one of the two hardly moves within the overlap, correlation is by chance.
     enough = (n >= shortest) & (var_a > 0.05 * np.var(x)) & (var_b > 0.05 * np.var(y))
     if not enough.any():
-        raise NotAligned("they are too short or too still to be compared")
+        raise NotAligned("they are too short, or move too little, to be compared")
     return np.where(enough, (sums(x, y) / n - mean_a * mean_b) / np.where(size > 0, size, 1), 0.0)
 
 

@@ -98,7 +98,7 @@ def _at_stated(signal: Signal, numbers: np.ndarray) -> np.ndarray:
 def _without(values: np.ndarray, at: np.ndarray, kind: str) -> tuple[np.ndarray, str]:
     """Remove values (N,) that mean none; return the values and a description."""
     count = int(np.count_nonzero(at))
-    words = f"has {count} sample{'' if count == 1 else 's'} that are missing by the configuration"
+    words = f"has {count} sample{'' if count == 1 else 's'} marked as missing by the configuration"
     if kind == "output":
         return np.where(at, np.nan, values), words
     known = np.flatnonzero(~at)
@@ -106,7 +106,7 @@ def _without(values: np.ndarray, at: np.ndarray, kind: str) -> tuple[np.ndarray,
         return values, words
     # An input acts all the time: a stick keeps its previous value.
     last = known[np.maximum(np.searchsorted(known, np.arange(at.size), side="right") - 1, 0)]
-    return values[last], f"{words}: the value before it is used"
+    return values[last], f"{words}: the previous value is used"
 
 
 def measured(signal: Signal, values: np.ndarray) -> np.ndarray:

@@ -280,7 +280,7 @@ def unit_notes(time: Signal, stated: str | None) -> tuple[Finding, ...]:
     if not other or math.isclose(units.factor(other, "s"), factor):
         return ()
     if stated:
-        words = f"taken in {stated}, as the file says, and not in {time.unit}"
+        words = f"taken in {stated}, as the file says, not in {time.unit}"
     else:
         words = f"taken in {time.unit}, though its name says {named}; if the name is right, state"
         words += f" unit: {named} beside it"
@@ -299,7 +299,7 @@ def require_increasing(table: Table, name: str, stamps: np.ndarray) -> None:
     if row > 1 and stamps[row - 2] < stamps[row] < stamps[row - 1]:
         remedy = f"{table.place(row - 1)} is out of order: delete it"
     elif (starts := restarts(stamps)).size:
-        runs = f"{starts.size + 1} runs in one file"
+        runs = f"the file holds {starts.size + 1} runs"
         remedy = f"there are {runs}: gaps: split beside log: makes a flight of each"
     else:
         remedy = shared_stamps(stamps) or "sort the rows by time, or delete those that go back"

@@ -242,8 +242,10 @@ def _as_logged(
     if len(clocks) > 1:
         few = ", ".join(clock.words for clock in list(clocks.values())[:4])
         more = ", ..." if len(clocks) > 4 else ""
-        problem = f"the signals have {len(clocks)} clocks ({few}{more}), expected --rate, to which"
-        raise wrong(log.path, f"{problem} they are resampled, or signals of one topic")
+        problem = (
+            f"the signals have {len(clocks)} clocks ({few}{more}), expected --rate for resampling"
+        )
+        raise wrong(log.path, f"{problem}, or signals of one topic")
     (clock,) = clocks.values()
     columns = {TIME: clock.seconds}
     for name in names:

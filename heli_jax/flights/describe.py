@@ -362,9 +362,9 @@ def _clock_problem(seconds: np.ndarray, steps: np.ndarray) -> str:
         return "a single sample"
     bad = int(np.count_nonzero(~np.isfinite(seconds)))
     if bad:
-        return f"{bad} stamps are empty or no finite numbers"
+        return f"{bad} time stamps are empty or not finite"
     if not np.all(np.abs(seconds) <= LATEST):
-        return "the stamps are too large for times"
+        return "the time stamps are too large"
     back = not_increasing(seconds)
     if back is not None:
         row, fault = back

@@ -362,6 +362,6 @@ def own_instruments(flights: Sequence[Flight], names: Sequence[str]) -> tuple[st
 def own_said(names: Sequence[str]) -> str:
     """Return the note about instruments that are the input itself."""
     return (
-        f"instrument of {', '.join(names)}: it is the input itself, into which feedback "
-        "brings gusts; expected the excitation alone, before pilot or autopilot add to it"
+        f"instrument of {', '.join(names)}: it is the input itself, which feedback correlates "
+        "with gusts; expected the excitation alone, before pilot or autopilot add to it"
     )

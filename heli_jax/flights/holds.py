@@ -49,7 +49,7 @@ def decide(values: np.ndarray) -> Decision:
         return _of_few_values(np.diff(values), moved, share)
     weight = weights(values)
     if not weight.any():
-        return Decision("linear", f"moves by one count of the log at a time, {_percent(share)}")
+        return Decision("linear", f"moves by single counts of the log, {_percent(share)}")
     held = jumps(values)
     # A move counts at most as much as the range of nearly all samples. Otherwise a single absurd
     # number would outweigh all steps.
@@ -106,7 +106,7 @@ def _of_few_values(moves: np.ndarray, moved: np.ndarray, share: float) -> Decisi
     # to the mean. Therefore the limit is 0.4.
     onward = (np.diff(at) == 1) & (np.sign(moves[at[1:]]) == np.sign(moves[at[:-1]]))
     if at.size > 1 and onward.mean() > 0.4:
-        return Decision("linear", f"passes through the values between, moves at {_percent(share)}")
+        return Decision("linear", f"takes intermediate values, moves at {_percent(share)}")
     return Decision("zero-order", _steps(moved))
 
 

@@ -90,7 +90,7 @@ class Budget:
         """Refuse more bytes than the file may use."""
         if count <= self.most:
             return
-        problem = f"its content takes {size_words(count)} of memory or more, expected at most"
+        problem = f"its content needs at least {size_words(count)} of memory, expected at most"
         if self.most == _MOST_BYTES:
             remedy = f"{size_words(self.most)}: save fewer signals, or at a lower rate"
         else:

@@ -107,7 +107,7 @@ def mark_notes(channels: Iterable[tuple[str, np.ndarray]]) -> list[Finding]:
             with np.errstate(invalid="ignore"):
                 x = x.astype(np.float64)
             if (at := at_marks(x)).any():
-                done = "a fit takes them as missing"
+                done = "a fit treats them as missing"
                 notes.append(marks_note(shown(name), x, at, done, name))
     return notes
 
@@ -124,7 +124,7 @@ def mark_words(numbers: np.ndarray, at: np.ndarray) -> str:
     """Return `10 samples of -9999 and 1 of 1e+10, far outside of all others`, and a large share."""
     share = np.count_nonzero(at) / np.count_nonzero(~np.isnan(numbers))
     often = f" ({100 * share:.0f} % of all)" if share > _MOST else ""
-    return f"{value_words(numbers[at])}{often}, far outside of all others"
+    return f"{value_words(numbers[at])}{often}, far outside the other values"
 
 
 def value_words(values: np.ndarray) -> str:
@@ -177,7 +177,7 @@ def strays(seconds: np.ndarray, numbers: np.ndarray, kind: str) -> tuple[Strays,
     They are isolated samples that no motion reaches, or samples larger than any measurement.
     """
     absurd, (alone, far) = is_absurd(numbers), _unreached(seconds, numbers, kind)
-    off = f"unreachable by motion: more than {far:g} times the range of all others away"
+    off = f"impossible as motion: more than {far:g} times the range of the other values away"
     kinds = ((absurd, "larger than any measurement"), (alone & ~absurd, off))
     return tuple(Strays(seconds[at], numbers[at], words) for at, words in kinds if at.any())
 
@@ -339,8 +339,8 @@ def repeats_removed(
             made[name] = np.where(again, np.nan, y)
             count = int(np.count_nonzero(again))
             words = (
-                f"{count} samples of {name} repeat the one before, as its noise never does: they "
-                "are missing (`repeats: keep` keeps them)"
+                f"{count} samples of {name} repeat the previous value, which its noise never "
+                "does: they are treated as missing (`repeats: keep` keeps them)"
             )
             notes.append(note("repeats.missing", words, name, value=count))
         if stated[name] == "keep" or usual is None or usual < 2:
@@ -355,8 +355,8 @@ def repeats_removed(
             continue
         made[name] = without_repeats(y, usual)
         words = (
-            f"{name} keeps each value for {usual} samples: the first is used, the others are "
-            "missing (`repeats: keep` keeps them)"
+            f"{name} keeps each value for {usual} samples: only the first is used (`repeats: "
+            "keep` keeps all)"
         )
         notes.append(note("repeats.missing", words, name, value=usual))
     return made, notes

@@ -147,7 +147,7 @@ def topic_clock(log: ChannelLog, topic: Topic, window: tuple[float, float] | Non
     place = () if topic.rows else (f"topic {shown(topic.name)}",)
     elapsed = topic.times - log.first_time
     if elapsed.size and not np.all(np.abs(elapsed) <= LATEST):
-        raise wrong(log.path, "got times that are no finite numbers, expected a clock", *place)
+        raise wrong(log.path, "the times are not finite numbers, expected a clock", *place)
     # Stamps that go back outside the window do no harm.
     if window is not None and np.any(np.diff(elapsed) <= 0):
         inside = np.flatnonzero((elapsed >= window[0]) & (elapsed <= window[1]))
@@ -344,7 +344,7 @@ def _times(
         row = int(np.argmax(steps))
         # Rounding is tolerated for a step of exactly the limit.
         if steps[row] > most * (1 + 1e-9):
-            problem = f"a gap of {steps[row]:.6g} s, expected none longer than {most:.3g} s; give a"
+            problem = f"a gap of {steps[row]:.6g} s, expected at most {most:.3g} s; give a"
             problem += " window without it, or `gaps: split`; it ends"
             raise clock.wrong(path, problem, row + 1)
     outputs = (s.clock for (_, kind), s in signals.items() if kind == "output")
@@ -356,7 +356,7 @@ def _uneven(path: str, clock: TopicClock, uneven: Uneven) -> InputError:
     """Return the error for stamps that are no uniform grid, with the remedy."""
     problem = f"a step of {uneven.step:.6g} s where {uneven.usual:.6g} s is usual"
     if uneven.drift is not None:
-        problem = f"the times leave a uniform grid by {uneven.drift:.2g} samples"
+        problem = f"the times deviate from a uniform grid by {uneven.drift:.2g} samples"
     # If a gap is too long to be bridged, a rate would only cause the next error. The parts beside
     # the gap may be uniform.
     bridged = np.diff(clock.seconds).max() <= longest_gap(clock.seconds) * (1 + 1e-9)
@@ -368,8 +368,8 @@ def _uneven(path: str, clock: TopicClock, uneven: Uneven) -> InputError:
 def _several(path: str, clocks: Sequence[TopicClock]) -> InputError:
     slowest = min(1 / clock.usual for clock in clocks)
     words = ", ".join(clock.words for clock in clocks)
-    problem = f"the signals have {len(clocks)} clocks ({words}), expected a rate to which"
-    return wrong(path, f"{problem} they are resampled, such as `rate: {slowest:.3g}`")
+    problem = f"the signals have {len(clocks)} clocks ({words}), expected a rate for resampling"
+    return wrong(path, f"{problem}, such as `rate: {slowest:.3g}`")
 
 
 def common_times(
@@ -403,7 +403,7 @@ def common_times(
     # Otherwise one wrong stamp at the end of a damaged log would fill the memory.
     most = _MOST_GAPS * max(clock.seconds.size * max(1.0, rate * clock.usual) for clock in clocks)
     if count > most:
-        problem = f"the times go over {end - start:.6g} s, of which samples cover less than 5 %"
+        problem = f"the times cover {end - start:.6g} s, but samples cover less than 5 % of it"
         raise wrong(path, f"{problem}, expected a window without such gaps")
     # Multiplied, not summed: the sum of 1e6 rounded steps would drift.
     return start + np.arange(int(count + 1e-6) + 1) / rate
@@ -453,8 +453,8 @@ def at_times(
                 outputs = ", ".join(alike[key])
                 follow = "follow" if len(alike[key]) > 1 else "follows"
                 words = (
-                    f"{key} is low-passed too and linear between samples, because {outputs} "
-                    f"{follow} it within a sample and is low-passed"
+                    f"{key} is also low-passed and taken as linear between samples, because "
+                    f"{outputs} {follow} it within a sample and is low-passed"
                 )
                 notes.append(note(LOW_PASSED, words, key))
             else:
@@ -466,8 +466,8 @@ def at_times(
             words = (
                 f"{shown(request.signals[key, kind].name)} at about "
                 f"{1 / usual_step(own_clock(signal).seconds):.4g} Hz is slower than the grid of "
-                f"{rate:.6g} Hz: {count} samples, each at the nearest instant; between "
-                "them it is missing"
+                f"{rate:.6g} Hz: its {count} samples are placed at the nearest instants, and the "
+                "others are missing"
             )
             notes.append(note("resampling.slower", words, key, value=count))
         else:

@@ -174,10 +174,10 @@ _PICKLE = (
     "arrays, numpy.savez(FILE, t=t, p=p)"
 )
 _TOPICS = "export its topics to CSV (PlotJuggler does)"
-_ARCHIVE = "is an archive; unpack it and name the log in it"
+_ARCHIVE = "is an archive; unpack it and name a log from it"
 _TELEMETRY = (
-    "is MAVLink telemetry with a reduced rate; use the autopilot's own log "
-    "(.bin, .ulg), or export messages: mavlogdump.py --format csv --types ATTITUDE FILE"
+    "is MAVLink telemetry at a reduced rate; use the autopilot's own log (.bin, .ulg), or export "
+    "messages: mavlogdump.py --format csv --types ATTITUDE FILE"
 )
 _BY_ENDING = {
     **dict.fromkeys((".xlsx", ".xlsm", ".xls", ".xlsb", ".ods", ".numbers"), _SHEET),
@@ -198,7 +198,7 @@ _BY_MARK = (
         "is a pointer of Git LFS; run git lfs pull",
     ),
     (b"/annex/objects/", "is a pointer of git-annex; git annex get fetches the log"),
-    (b"FEA1", "is of the first version of Feather; write it anew, frame.to_feather(FILE)"),
+    (b"FEA1", "is a file of the first version of Feather; write it again, frame.to_feather(FILE)"),
 )
 _ZIP = b"PK\x03\x04"
 

@@ -141,7 +141,9 @@ def read_parts(
         whole = {n: d.reason for n, d in holds.items() if d.reason and flight.hold[n] == d.hold}
         parts.append(dataclasses.replace(flight, hold_reason={**flight.hold_reason, **whole}))
     if not parts:
-        problem = f"{len(intervals)} parts between gaps, expected one that is long enough; the last"
+        problem = (
+            f"{len(intervals)} parts between gaps, expected one of sufficient length; the last"
+        )
         raise wrong(request.path, f"{problem}: {left_out[-1]}") from why
     gap = max(after - before for (_, before), (after, _) in itertools.pairwise(intervals))
     words = f"gaps of up to {gap:.3g} s split the run into {len(intervals)} parts"
@@ -184,7 +186,7 @@ def _enough_measured(flight: Flight) -> Flight:
     sd = {n: v for n, v in flight.sd.items() if n not in few}
     flight = dataclasses.replace(flight, outputs=outputs, sd=sd)
     words = (
-        f"{flight.name}: without {', '.join(few)}, of which fewer than {FEWEST} samples are seen"
+        f"{flight.name}: without {', '.join(few)}, which has fewer than {FEWEST} measured samples"
     )
     return _with_notes(flight, note(LEFT_OUT, words, *few))
 
@@ -238,7 +240,7 @@ def _opened(
         signals |= {(n, "output"): s for n, s in also.outputs.items()}
         twice = next((key for key in signals if key in everything.signals), None)
         if twice is not None:
-            raise wrong(also.path, f"{twice[1]} {twice[0]!r} is taken from two logs, expected one")
+            raise wrong(also.path, f"{twice[1]} {twice[0]!r} comes from two logs, expected one")
         one, asked = _beside(log, request, also)
         everything.signals = {**everything.signals, **asked.signals}
         beside.append(one)
@@ -367,9 +369,9 @@ def _aligned(
         what = f"{also.same} of {Path(request.path).name} and {shown(also.to)}"
         raise wrong(also.path, f"cannot be aligned by {what}: {e}") from e
     words = (
-        f"{name}: {lag.lag:.6g} s (sd {1e3 * lag.sd:.2g} ms) were added to its times, counted from "
-        f"its start: {shown(also.to)} agrees best with {also.same} (correlation "
-        f"{lag.correlation:.3f} over {lag.overlap:.4g} s)"
+        f"{name}: its times were shifted by {lag.lag:.6g} s (sd {1000.0 * lag.sd:.2g} ms), "
+        f"counted from its start, so that {shown(also.to)} agrees best with {also.same} "
+        f"(correlation {lag.correlation:.3f} over {lag.overlap:.4g} s)"
     )
     return lag.lag, Finding(
         "clock.aligned", "note", words, lag.lag, "seconds added to its times", (also.same,)
@@ -389,8 +391,8 @@ def _as_one(
         raise wrong(
             also.path,
             f"its times go from {theirs[0]:.6g} s to {theirs[1]:.6g} s and those of {first} from "
-            f"{ours[0]:.6g} s to {ours[1]:.6g} s, so they have different clocks; state a "
-            "motion that both logs have, align: {with: ..., to: ...}",
+            f"{ours[0]:.6g} s to {ours[1]:.6g} s, so that their clocks differ; state a motion "
+            "that both logs have, align: {with: ..., to: ...}",
         )
     words = (
         f"{name}: its times are taken as those of {first} ({shared:.4g} s in common); if "
@@ -435,5 +437,7 @@ def require_moving_outputs(flight: Flight) -> None:
         return
     path = flight.source.path if flight.source else flight.name or "flight"
     values = ", ".join(f"{n} at {value:.6g}" for n, value in still.items())
-    problem = f"every output stays at one value (SI: {values}) for all of {flight.duration:.6g} s"
-    raise wrong(path, f"{problem}; expected an output that moves: check that the sensor was logged")
+    problem = f"every output is constant (SI: {values}) for all of {flight.duration:.6g} s"
+    raise wrong(
+        path, (f"{problem}; expected an output that changes: check that the sensor was logged")
+    )

@@ -58,8 +58,8 @@ def load_table(table: Table, request: Request) -> ChannelLog:
         problem = "no time is stated, expected the name of the column of time stamps"
         raise wrong(table.path, problem)
     if isinstance(table, ArrayTable) and SEGMENT in table.names and time.name == ROWS and not runs:
-        problem = f"its rows are of several runs, which {SEGMENT!r} numbers"
-        remedy = f"expected time: {{rate: HZ, runs: {SEGMENT}}}, which makes a flight of each"
+        problem = f"its rows belong to several runs, numbered by {SEGMENT!r}"
+        remedy = f"expected time: {{rate: HZ, runs: {SEGMENT}}}, which makes each run a flight"
         raise wrong(table.path, f"{problem}; {remedy}")
     names, known = [time.name, *([runs] if runs else [])], frozenset(table.names)
     for signal in request.signals.values():

@@ -146,7 +146,7 @@ class Request:
             use = (kind, f"{kind} {key!r}")
             before = uses.setdefault(signal.name, use)
             if before != use and not before[0] == kind == "input":
-                problem = f"serves both as {before[1]} and as {use[1]}, expected one use"
+                problem = f"is used both as {before[1]} and as {use[1]}, expected one use"
                 raise wrong(self.path, problem, column(signal.name))
 
 

@@ -38,7 +38,9 @@ def rate_notes(seconds: np.ndarray, rate: float) -> list[Finding]:
     notes = [note("resampling.rate", words, value=1 / usual)]
     if rate * usual < _GOES_DOWN:
         passed = PASSED * rate
-        words = f"low-pass filtered first: {passed:.3g} Hz and below pass, not held inputs"
+        words = (
+            f"low-pass filtered first: {passed:.3g} Hz and below pass; held inputs are not filtered"
+        )
         notes.append(note("resampling.low-passed", words, value=passed))
     return notes
 

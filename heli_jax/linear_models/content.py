@@ -113,7 +113,10 @@ def _section(mapping: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     """Return a section of named items, which must not be empty; check the names."""
     section = as_mapping(mapping[key], key)
     if not section:
-        hint = ": for a free decay name one that does not act, and signals.inputs: {} of the flight"
+        hint = (
+            ": for a free decay name an input that does not act, and state signals.inputs: {} in "
+            "the flight"
+        )
         raise InputError(f"{key}: empty, expected at least one{hint if key == 'inputs' else ''}")
     # Parameters do not enlarge matrices, so they have no limit.
     if len(section) > _MOST and key != "parameters":
@@ -126,7 +129,9 @@ def _section(mapping: Mapping[str, Any], key: str) -> Mapping[str, Any]:
             )
         # A sweep's axis with such a name would be ambiguous.
         if name in _TAKEN:
-            raise InputError(f"{key}.{name}: taken by sweeps and disturbances, expected another")
+            raise InputError(
+                f"{key}.{name}: this name is reserved for sweeps and disturbances, expected another"
+            )
     return section
 
 
@@ -142,7 +147,9 @@ def _once(sections: Mapping[str, Mapping[str, Any]]) -> None:
     for key, section in sections.items():
         for name in section:
             if name in seen:
-                raise InputError(f"{key}.{name}: stands in {seen[name]} too, expected another name")
+                raise InputError(
+                    f"{key}.{name}: also a name in {seen[name]}, expected another name"
+                )
             seen[name] = key
 
 

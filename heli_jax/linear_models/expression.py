@@ -160,8 +160,8 @@ def dimension(node: Node, of: Mapping[str, Dimension], plain: Dimension) -> Dime
             if a != b:
                 sign = "+" if isinstance(op, ast.Add) else "-"
                 raise ExpressionError(
-                    f"{sign!r} joins terms of different kinds, expected the same unit on both "
-                    "sides (a number with a unit is a parameter)"
+                    f"{sign!r} combines terms of different units, expected the same unit on both "
+                    "sides (a number with a unit must be a parameter)"
                 )
             return a
     return plain

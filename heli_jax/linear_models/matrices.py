@@ -64,10 +64,10 @@ def not_possible(
     # vehicle's or a configuration's.
     for name, quantity in content.parameters.items():
         if quantity.positive and not values[name] > 0:
-            return f"{name}: expected more than zero (positive: true), got {values[name]:g}"
+            return f"{name}: expected a value above zero (positive: true), got {values[name]:g}"
     for entry in (one for entries in matrices.values() for one in entries):
         if not math.isfinite(_value(entry, values)):
-            return f"{entry.place}: not finite with the parameters' values"
+            return f"{entry.place}: not finite for the values of the parameters"
     return _not_invertible(content, matrices["E"], values)
 
 
@@ -96,7 +96,7 @@ def _not_invertible(
         # A zero row stays zero and lowers the rank, without a division by zero.
         E = E / np.maximum(np.max(np.abs(E), axis=axis, keepdims=True), 1e-300)
     singular = np.linalg.matrix_rank(E) < len(names)
-    return "E: has no inverse with the parameters' values" if singular else ""
+    return "E: singular for the values of the parameters" if singular else ""
 
 
 class _Matrices:

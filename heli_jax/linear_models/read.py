@@ -131,7 +131,7 @@ def _text(file: str | Path, folder: Path) -> tuple[str, str]:
         # Windows editors may add a byte-order mark, which would belong to the first key.
         return data.decode("utf-8-sig"), str(path)
     except UnicodeDecodeError as e:
-        raise InputError(f"{path}: is not text, expected a linear model in YAML") from e
+        raise InputError(f"{path}: not a text file, expected a linear model in YAML") from e
 
 
 def model_of(content: Content, matrices: Mapping[str, tuple[Entry, ...]]) -> Model:

@@ -104,7 +104,7 @@ def write_config(
     lacking = [] if signals is None else [n for n, g in signals.inputs.items() if g is None]
     if signals is not None and not signals.outputs:
         outputs = ", ".join(naming.names(chosen.model.Outputs))
-        words = f"no column name matches {outputs}: name the columns of those that were logged"
+        words = f"no column name matches {outputs}: name the columns of the logged outputs"
         notes.append(note("channels.lacking", words, *naming.names(chosen.model.Outputs)))
     if lacking:
         words = (

@@ -74,7 +74,7 @@ def read_log(path: Path, number: int | None, rate: float | None = None) -> Log:
         raise wrong(str(path), problem)
     first, *others = opened
     if not any(topic.clock for topic in first.topics):
-        problem = "its rows have an order and no times, which no fit can use, expected a log with a"
+        problem = "its rows have no times, which a fit needs, expected a log with a"
         raise wrong(str(path), f"{problem} clock, of ArduPilot one with TimeUS")
     series = {
         name: Series(topic.times, without_marks(as_floats(values)), topic.units.get(name, ""))
@@ -136,7 +136,7 @@ def _read_table(table: Table, rate: float | None) -> Log:
     if others:
         listed = ", ".join(map(shown, others[:6]))
         words = shown(clock) if clock != ROWS else "the others"
-        words = f"left out, since they are not as long as {words}: {listed}"
+        words = f"left out, because they are not as long as {words}: {listed}"
         notes += (note(LEFT_OUT, words, *others),)
     return Log(table.path, table.format, series, time, None, False, notes, _unread(table, info))
 

@@ -105,17 +105,19 @@ class ComparedRuns(NamedTuple):
     def notes(self) -> tuple[Finding, ...]:
         """Notes and doubts; their subjects are labels of runs."""
         words = (
-            "± is one standard deviation (sd), a 95 % interval about twice as far. Differences are "
-            "from the first run, in the joint sd of independent estimates: runs that share a log "
-            "have correlated estimates, which differ by less by chance."
+            "± is one standard deviation (sd); a 95 % interval is about twice as wide. "
+            "Differences are from the first run, in the joint sd of independent estimates. Runs "
+            "that share a log have correlated estimates, which by chance differ less."
         )
         notes, first = [note("compared.joint-sd", words)], self.runs[0]
         for label, run in zip(self.labels, self.runs, strict=True):
             doubts = {}
             if not _converged(run):
-                doubts["not-converged"] = " did not converge: its numbers are no result."
+                doubts["not-converged"] = " did not converge: its numbers are not a result."
                 if run is first:
-                    doubts["not-converged"] += " Name one first that did: differences are from it."
+                    doubts["not-converged"] += (
+                        " Name a converged run first: differences are from the first."
+                    )
             elif run.distrust:
                 doubts["not-trusted"] = f": {run.distrust}"
             if _converged(run) and run.adequate is False:

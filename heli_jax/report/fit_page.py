@@ -117,19 +117,19 @@ def render(
 
 # A group must not be a prefix of another.
 GROUPS = {
-    "response": "From above, over time: measured and simulated, what is left between them, inputs.",
-    "residual": "From above, by lag: its correlation with itself, then with each input; of white "
-    "noise 99 % of the lags lie within the band.",
-    "match": "From above: gain and phase of model and data with 95 % intervals, and of the "
-    "recursive least squares without their hold; partial coherence of the data; data over model. "
-    "Grey: envelopes of what pilots of full-size aeroplanes did not notice (Wood and Hodgkinson, "
-    "1980).",
-    "held": "The same of all flights held out together: gain and phase of model and data with 95 % "
-    "intervals, partial coherence of the data, and data over model.",
-    "rls": "Each coefficient while the record goes by: one to be trusted settles.",
-    "pairs": "Dots and bars: the samples. Blue: the fit's Gaussian approximation with its "
-    "intervals' sd; 95 % of it lie within a curve. Where the dots do not follow it, neither do "
-    "intervals and correlations.",
+    "response": "From the top, over time: measured and simulated signals, residual, inputs.",
+    "residual": "From the top, by lag: correlation of the residual with itself, then with each "
+    "input; for white noise 99 % of the lags lie in the band.",
+    "match": "From the top: gain and phase of model and data with 95 % intervals, and of the "
+    "recursive least squares without their hold; partial coherence of the data; data "
+    "over model. Grey: envelopes of differences that pilots of full-size aeroplanes did "
+    "not notice (Wood and Hodgkinson, 1980).",
+    "held": "The same for all held-out flights together: gain and phase of model and data with "
+    "95 % intervals, partial coherence of the data, and data over model.",
+    "rls": "Each coefficient over the record: a trustworthy one becomes constant.",
+    "pairs": "Dots and bars: the samples. Blue: the fit's Gaussian approximation with its sd; "
+    "each curve encloses 95 % of it. Where the dots deviate from it, intervals and "
+    "correlations are wrong.",
 }
 """Caption after a figure's title, by the beginning of its name."""
 
@@ -260,7 +260,7 @@ _SPEAK_AGAINST = ("adequacy", "dynamics", "units", "timing", "quality")
 def lines(fit: Fit) -> tuple[Line, Line, Line]:
     """Return the statements on convergence, identifiability and adequacy."""
     if fit.status == "not-converged":
-        stopped = "The optimiser stopped before an optimum, and these numbers are no result."
+        stopped = "The optimiser stopped before an optimum: these numbers are not a result."
         return (
             Line("bad", "Not converged", stopped),
             Line("none", "Identifiability not judged", "The analysis needs an optimum."),
@@ -305,7 +305,7 @@ def model_remark(problem: Problem) -> str:
     factor = float(np.asarray(problem.vehicle.cyclic_moment))
     return (
         "Ixx and If are numbers of the paper's model, not of the vehicle: eqs 14-15 have the "
-        f"factor 1/2 (cyclic_moment, here {factor:g}) where blade-element theory averaged over a "
-        "turn gives 1/8 for two blades, and the inertia that is found grows and shrinks with it. "
-        "Compare an estimate with a weighed or swung inertia only with that in mind."
+        f"factor 1/2 (cyclic_moment, here {factor:g}), but blade-element theory averaged over a "
+        "turn gives 1/8 for two blades, and the estimated inertia is proportional to it. Keep "
+        "this in mind when you compare it with a measured inertia."
     )

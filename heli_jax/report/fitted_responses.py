@@ -94,7 +94,7 @@ def fitted_responses(
     try:
         responses = flight_responses(problem.training, settings)
     except ValueError as e:
-        words = f"no responses of the flights, nor handling qualities: {e}"
+        words = f"no responses of the flights and no handling qualities: {e}"
         return FittedResponses((), 0, (), "", (note(NO_RESPONSES, words),))
     known = problem.training[0].known
     params = naming.replace(fit.params, **{n: jnp.asarray(v) for n, v in known.items()})
@@ -243,13 +243,13 @@ def _of_held_out(
     try:
         responses = flight_responses(held, settings)
     except ValueError as e:
-        return (), (note("responses.none-held-out", f"no responses of the flights held out: {e}"),)
+        return (), (note("responses.none-held-out", f"no responses of the held-out flights: {e}"),)
     pairs = tuple(_pairs(responses, curves, _octave_means(responses))[:MOST_PAIRS])
     if pairs:
         return pairs, ()
     words = (
-        f"no figure of the flights held out: none of their responses, taken together, has a "
-        f"coherence of {COHERENT:g} in the mean over an octave"
+        "no figure of the held-out flights: none of their joint responses has a mean coherence "
+        f"of {COHERENT:g} over an octave"
     )
     return (), (note("responses.none-held-out", words),)
 
@@ -262,7 +262,7 @@ def _of_model(curves: _Curves, pair: HandlingPair) -> HandlingQualities:
         return qualities
     beyond = "w180" if w180.value > last else "2 w180"
     words = (
-        f"{beyond} lies beyond the band of the flights' responses, {last / (2.0 * np.pi):.3g} Hz: "
-        "values there are the model's, extrapolated"
+        f"{beyond} is above the band of the flights' responses, {last / (2.0 * np.pi):.3g} Hz: "
+        "the values there are extrapolated by the model"
     )
     return qualities._replace(sentences=(*qualities.sentences, words))

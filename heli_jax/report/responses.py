@@ -204,38 +204,36 @@ def fit_sentences(fit: TransferFit | str, window: float) -> list[str]:
     if isinstance(fit, str):
         return [f"not fitted: {fit}"]
     if not fit.determined:
-        return ["the response does not determine it: fewer poles, or more excitation, is needed"]
+        return ["the response does not determine it: use fewer poles, or more excitation"]
     if not fit.converged:
-        return ["the search did not converge: these numbers are no result"]
+        return ["the optimiser did not converge: these numbers are not a result"]
     said = []
     if fit.chi_squared > _TOO_LARGE:
         said.append(
-            f"squared errors are {number(fit.chi_squared, 2)} times what the random errors let "
-            "expect: the order is too low, the vehicle is not linear, or a window of "
-            f"{window:.3g} s does not resolve it"
+            f"squared errors are {number(fit.chi_squared, 2)} times their expected value: the "
+            f"order is too low, the vehicle is not linear, or a window of {window:.3g} s is too "
+            "short"
         )
     if not forgets(fit, window):
         last = max(fit.poles, key=lambda p: p.real)
         # A window resolves a period only if it contains two of them.
         slow = abs(last) * window < 4.0 * np.pi
         said.append(
-            f"a pole of {number(last.real, 2)} 1/s is not forgotten within a window of "
-            f"{window:.3g} s, so what the windows cut off of answers is not taken off, and "
-            "intervals may be too narrow"
-            + ("; it is not told from an integrator's or a slower one" if slow else "")
-            + ": of an angle fit the rate's response, or a model by frequency-error"
+            f"a pole of {number(last.real, 2)} 1/s does not decay within a window of {window:.3g} "
+            "s; the windows cut off part of its response, so that intervals may be too narrow"
+            + ("; it cannot be distinguished from an integrator or a slower pole" if slow else "")
+            + ": for an angle fit the response of its rate, or a model by frequency-error"
         )
     known = all(c.determined for c in fit.denominator)
     if known and (growing := [p.real for p in fit.poles if p.real > 0.0]):
         said.append(
-            f"it is unstable (a pole with the real part +{number(max(growing), 3)} rad/s): where "
-            "the vehicle is not, a stick logged late, feedback or a wrong order makes it so"
+            f"it is unstable (a pole with the real part +{number(max(growing), 3)} rad/s); if the "
+            "vehicle is stable, a late stick, feedback or a wrong order can cause this"
         )
     if known and all(c.determined for c in fit.numerator) and (beside := _cancelled(fit)):
         said.append(
-            f"beside {_root_words(beside)} lie zeros, within a tenth, that all but cancel them: "
-            "they may be no modes of the vehicle, and a lower order may say as much "
-            "(see whether chi² stays)"
+            f"zeros lie within a tenth of {_root_words(beside)} and nearly cancel them: these "
+            "poles may not be modes of the vehicle; try a lower order and compare chi²"
         )
     return said
 
@@ -347,7 +345,7 @@ def write_netcdf(path: Path, responses: FlightResponses, units: Mapping[str, str
         return np.array([getattr(o, name) for o in outputs.values()])
 
     H, parts = stacked("H"), "in the coordinate unit, output over input"
-    sd = f"of the real and of the imaginary part, {parts}"
+    sd = f"of the real and the imaginary part, {parts}"
     # The attribute has a unit only if all pairs share it.
     every = {u for row in unit for u in row}
     one = every.pop() if len(every) == 1 else None
@@ -360,7 +358,12 @@ def write_netcdf(path: Path, responses: FlightResponses, units: Mapping[str, str
         "coherence": (of_pairs, stacked("coherence"), "partial coherence", "1"),
         "half95": ("output", stacked("half95")[:, 0], "half of a 95 % interval in sd", "1"),
         "multiple_coherence": (of_outputs, each("multiple"), together, "1"),
-        "noise": (of_outputs, each("noise"), "density of what the inputs leave", "SI^2/Hz"),
+        "noise": (
+            of_outputs,
+            each("noise"),
+            ("density of the part that the inputs do not explain"),
+            "SI^2/Hz",
+        ),
     }
     data = xr.Dataset(
         {

@@ -21,21 +21,21 @@ if TYPE_CHECKING:
 
 POSTERIOR, BOOTSTRAP = "posterior.nc", "bootstrap.nc"
 _WHAT = {
-    POSTERIOR: "Draws from the posterior by the No-U-Turn sampler, warm-up left out. The prior is "
-    "flat in the optimiser's coordinates (the logarithm of a parameter of one sign) beside the "
-    "priors of the configuration; the scale of the noise is integrated out (Jeffreys' prior), so "
-    "that it has no draws.",
-    BOOTSTRAP: "Estimates from records that were drawn about the fit's response (in time simulated "
-    "with its estimates, in frequency of its residual's lines): how the estimator scatters about "
-    "them. These are no draws from a posterior.",
+    POSTERIOR: "Draws from the posterior by the No-U-Turn sampler, without warm-up. The prior is "
+    "flat in the optimiser's coordinates (the logarithm of a parameter of fixed "
+    "sign), times the priors of the configuration. The noise scale is integrated out "
+    "(Jeffreys' prior) and has no draws.",
+    BOOTSTRAP: "Estimates from records that were drawn from the fit (in time simulated with its "
+    "estimates, in frequency from its residuals): the scatter of the estimator. They "
+    "are not draws from a posterior.",
 }
 _STATISTICS = {
-    "diverging": "whether the energy error of the trajectory was too large",
-    "energy": "of the trajectory, but for a constant",
+    "diverging": "true if the energy error of the trajectory was too large",
+    "energy": "of the trajectory, up to a constant",
     "acceptance_rate": "mean acceptance probability over the trajectory",
     "n_steps": "steps of the integrator",
     "tree_depth": "doublings of the trajectory",
-    "lp": "log density in the optimiser's coordinates, but for a constant",
+    "lp": "log density in the optimiser's coordinates, up to a constant",
     "step_size": "of the integrator, in units of the Gaussian approximation's sd",
 }
 type _Variables = dict[str, tuple[Any, np.ndarray, dict[str, str]]]

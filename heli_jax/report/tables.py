@@ -533,10 +533,7 @@ _WORDS = {
     "phase_margin": "phase margin",
     "gain_margin": "gain margin",
 }
-_NO_RESULT = (
-    "the parameters that it depends on are not determined or not trusted, or no optimum was "
-    "reached."
-)
+_NO_RESULT = "the parameters in it are not determined or not trusted, or no optimum was reached."
 _AS_READ = {"s": ("ms", 1e3)}
 """Displayed unit by SI unit, with its factor."""
 

@@ -131,7 +131,7 @@ def _method_with_extras(
     method, args, term = per_sample(model, params, inputs, options, linear)
     if isinstance(method, Adaptive) and options.key is not None:
         # A step of the controller would need noise of another covariance.
-        raise ValueError("key: expected fixed steps to draw noise with, got a step-size controller")
+        raise ValueError("key: drawing noise needs fixed steps, got a step-size controller")
     if options.feedback is not None:
         _check_feedback(args.delays, linear)
         method = StateFeedback(method, options.feedback)
@@ -148,7 +148,7 @@ def _check_feedback(delays: Delays | None, linear: tuple[bool, ...]) -> None:
         raise ValueError("feedback: expected a run without a delay, got one with delay")
     if linear:
         raise ValueError(
-            "feedback acts once a sample and is held until the next: expected inputs with "
+            "feedback acts once per sample and is held until the next: expected inputs with "
             "hold='zero-order', got hold='linear' or 'mixed'"
         )
 
@@ -262,9 +262,7 @@ def with_process_noise(
         )
     # A delay of all inputs is for fits to records, which draw no noise.
     if options.delay is not None:
-        raise ValueError(
-            "key: expected a run without a delay to draw noise for, got one with delay"
-        )
+        raise ValueError("key: drawing noise needs a run without delay, got one with delay")
     n = jax.tree.leaves(args.inputs)[0].shape[0]
     dtype, states = jax.tree.leaves(args.inputs)[0].dtype, len(naming.names(model.State))
     # All samples are drawn at once, so that a key gives the same record with any solver.

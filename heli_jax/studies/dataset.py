@@ -95,7 +95,7 @@ _WORDS = {
     "status": "converged, not-converged, not-identifiable, failed or not run",
     "verdict": "what the data determine",
     "untrusted": "parameters whose intervals may not be used",
-    "adequate": "whether the model explains what was measured",
+    "adequate": "true if the model explains the measured signals",
     "sentence": "why there is no fit",
     "run": "directory of the fit, within the study's",
 }

@@ -42,8 +42,8 @@ _LOOK_S = 2.0
 _WAIT_S = 0.02
 """Time [s] between two checks for finished tasks."""
 _IMPORTS = (
-    "expected modules of your own to be there too: begin scheduler and workers with PYTHONPATH set "
-    "to their folder"
+    "your own modules must exist there too: start scheduler and workers with PYTHONPATH set to "
+    "their folder"
 )
 
 # Compiled programs in a worker process, by sweep, and the lock of their compilation. Without it,
@@ -127,7 +127,7 @@ def _local_cluster(workers: int | None) -> LocalCluster:
         security = Security.temporary()
     except ImportError as e:
         raise InputError(
-            "--workers: cryptography is not installed, by which only this process reaches its "
+            "--workers: cryptography is not installed, which secures the connection to the "
             "workers, expected the extra distributed: pip install 'heli_jax[distributed]'"
         ) from e
     no_pages = {f"distributed.{who}.http.routes": [] for who in ("scheduler", "worker")}
@@ -190,8 +190,8 @@ def _answering() -> Iterator[None]:
         yield
     except (CancelledError, CommClosedError, KilledWorker, TimeoutError) as e:
         raise InputError(
-            f"dask: the scheduler or its workers are lost ({type(e).__name__}), expected "
-            "them to run to the end; what is finished is kept: --resume goes on"
+            f"dask: lost the scheduler or its workers ({type(e).__name__}); finished elements are "
+            "kept: --resume continues"
         ) from e
     except ImportError as e:
         raise InputError(f"dask: {e} on the scheduler or a worker, {_IMPORTS}") from e
@@ -293,10 +293,10 @@ def _as_they_end(client: Client, running: Any) -> Iterator[tuple[Any, Callable[[
             there = client.scheduler_info()["workers"].values()
         seen = now if any(map(_works, there)) else seen
         if now - seen > _ALONE_S:
-            paused = f"no worker but {len(there)} that lack memory" if there else "no worker"
+            paused = f"no worker except {len(there)} that lack memory" if there else "no worker"
             raise InputError(
-                f"dask: the scheduler has had {paused} for {now - seen:.0f} s, expected one at "
-                "least to run to the end; what is finished is kept: --resume goes on"
+                f"dask: the scheduler has had {paused} for {now - seen:.0f} s, expected at least "
+                "one until the end; finished elements are kept: --resume continues"
             )
 
 

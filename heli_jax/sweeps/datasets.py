@@ -45,7 +45,7 @@ def as_grid(dataset: xr.Dataset) -> xr.Dataset:
         counts = " x ".join(map(str, shape))
         raise ValueError(
             f"as_grid: expected every combination of the axes' values once ({counts}), got {size} "
-            "elements: of a sample there is no grid"
+            "elements: a sample has no grid"
         )
     ordered = dataset.isel(element=np.argsort(cells))
     variables = {

@@ -336,8 +336,8 @@ def _of_function(name: str, function: Callable[[Trajectory], Any], run: Trajecto
         first = str(e).partition("\n")[0]
         raise ValueError(
             f"reduce.{name}: {called} cannot be computed ({type(e).__name__}: {first:.200}), "
-            "expected a function of a Trajectory, of jax.numpy and without branches on its "
-            "values, that gives a number or numbers by name"
+            "expected a function of a Trajectory that uses jax.numpy, does not branch on its "
+            "values, and returns a number or numbers by name"
         ) from e
     for n, v in results.items():
         if not (jnp.issubdtype(v.dtype, jnp.number) or v.dtype == jnp.bool_) or (

@@ -51,13 +51,13 @@ def refusal(job: Job, devices: Sequence[Any], lanes: int) -> str | None:
     if not job.streamed or not job.simulated:
         return "its runs are kept whole, or none is made"
     if job.solver not in _SOLVERS:
-        return f"there is no translation of the solver {job.solver}"
+        return f"the solver {job.solver} cannot be translated"
     try:
         # The compiled program is cached for the sweep that follows.
         for index in range(len(job.flights)):
             FusedProgram(job, index, devices, lanes)
     except UnsupportedError as e:
-        return f"there is no translation of {e}"
+        return f"{e} cannot be translated"
     return None
 
 

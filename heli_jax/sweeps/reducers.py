@@ -181,7 +181,7 @@ def _check_signal(where: str, reduce: Reduce, outputs: tuple[str, ...]) -> None:
     whole = callable(reducer) and not isinstance(reducer, Streaming)
     if signal is not None and (whole or reducer == "modes"):
         what = "modes are" if reducer == "modes" else "a function of a Trajectory is"
-        raise ValueError(f"{where}.signal: {what} of no one signal, expected none")
+        raise ValueError(f"{where}.signal: {what} needs no signal, expected none")
 
 
 def _check_loop(where: str, reduce: Reduce, inputs: tuple[str, ...]) -> None:
@@ -194,10 +194,10 @@ def _check_loop(where: str, reduce: Reduce, inputs: tuple[str, ...]) -> None:
             f"{where}.input: the model has no input {reduce.input!r}{nearest(reduce.input, inputs)}"
         )
     if reduce.input is not None and not margins:
-        raise ValueError(f"{where}.input: only margins take one, got {reduce.input!r}")
+        raise ValueError(f"{where}.input: only margins have an input, got {reduce.input!r}")
     # Refused, not ignored: a user expects a stated gain to act.
     if reduce.gain != 1.0 and not margins:
-        raise ValueError(f"{where}.gain: only margins take one, got {reduce.gain}")
+        raise ValueError(f"{where}.gain: only margins have a gain, got {reduce.gain}")
     # A gain of zero is no loop: its margins would be infinite for any vehicle.
     if margins and not (np.isfinite(reduce.gain) and reduce.gain != 0):
         raise ValueError(f"{where}.gain: expected a number that is not zero, got {reduce.gain}")

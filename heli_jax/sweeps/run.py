@@ -171,7 +171,7 @@ def _notes(job: Job) -> list[Finding]:
     without_effect = [
         note(
             "sweep.axis-without-effect",
-            f"axes.{n}: {name} does not read {n}: no run depends on it",
+            f"axes.{n}: {name} does not use {n}: it changes no run",
             n,
         )
         for n in unread(job)
@@ -196,7 +196,7 @@ def _resume(job: Job, out: Path, options: Options) -> xr.Dataset:
         # With the lock held, so that no other process finishes a chunk between check and use.
         done = store.whole()
         if damaged := int(np.count_nonzero(store.done() & ~done)):
-            options.say(Note(f"{where}: damaged chunks that are computed again: {damaged}"))
+            options.say(Note(f"{where}: damaged chunks are computed again: {damaged}"))
         _same_cut(store, job, options, where)
         # Reported, not refused: a difference in the fifteenth digit does not justify a new start.
         if changed := changed_since(store.attributes.get("versions", {})):

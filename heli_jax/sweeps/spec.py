@@ -266,9 +266,9 @@ def _check_single(model: Model) -> None:
         for name, value in values.items():
             if value.dtype == np.float64:
                 raise ValueError(
-                    f"precision: the {function} of model {model.name!r} gives {name} in float64 "
-                    "though all it is given is float32; expected float64, or its arrays made as "
-                    "jnp.asarray(table, x.dtype), x a state"
+                    f"precision: the {function} of model {model.name!r} returns {name} in float64 "
+                    "although all its arguments are float32; expected float64, or its arrays "
+                    "made as jnp.asarray(table, x.dtype), x a state"
                 )
 
 
@@ -285,24 +285,25 @@ def _check_axes(model: Model, design: Design, flights: tuple[Flight, ...]) -> No
                     # The axis would silently override the flight's known value.
                     raise ValueError(
                         f"axes.{name}: the flight {flight.name!r} states it as known, expected "
-                        "one of the two"
+                        "either"
                     )
         elif name not in special:
             # 'gain.x_rol' is a slip in the input's name, so no parameter is suggested.
             kind = name.partition(".")[0]
             among = [n for n in special if n.startswith(f"{kind}.")] or [*params, *special]
             raise ValueError(
-                f"axes.{name}: model {model.name} has nothing of that name{nearest(name, among)}"
+                f"axes.{name}: model {model.name} has no parameter or input of that "
+                f"name{nearest(name, among)}"
             )
     # A model's own parameter of this name is an axis like any other.
     if "seed" in design.names and "seed" not in params:
         if model.noise_intensity is None:
             raise ValueError(
-                f"axes.seed: model {model.name} draws nothing at random, expected a disturbance"
+                f"axes.seed: model {model.name} has no random part, expected a disturbance"
             )
         if "delay" in design.names and "delay" not in params:
             raise ValueError(
-                "axes.seed: noise is drawn without a delay only, got an axis delay too"
+                "axes.seed: noise cannot be drawn with an axis delay, expected one of the two"
             )
         whole_seeds(design.values(0, min(design.size, _LOOKED_AT))["seed"])
 
@@ -328,20 +329,20 @@ def _check_results(
 ) -> None:
     outputs, inputs = naming.names(model.Outputs), naming.names(model.Inputs)
     if not reduce and trajectories is None:
-        raise ValueError("reduce: nothing is to be kept, expected a result or trajectories")
+        raise ValueError("reduce: no result is kept, expected a result or trajectories")
     for name, reducer in reduce.items():
         reducers.check(name, reducer, outputs, inputs)
         # Reserved names of the store; names that its format cannot have are refused where it is
         # created.
         if name in design.names or name in ("status", "element"):
-            raise ValueError(f"reduce.{name}: the name is taken, expected another")
+            raise ValueError(f"reduce.{name}: the name exists already, expected another")
         stream = reducers.streaming(reducer)
         signal = str(reducer.signal)
         for flight in flights if stream is not None and stream.against_flight else ():
             if signal not in flight.outputs:
                 raise ValueError(
-                    f"reduce.{name}: flight {flight.name!r} measured no {signal!r}"
-                    f"{nearest(signal, flight.outputs)}"
+                    f"reduce.{name}: flight {flight.name!r} did not measure "
+                    f"{signal!r}{nearest(signal, flight.outputs)}"
                 )
     if trajectories is not None:
         _check_trajectories(trajectories, outputs, flights)

@@ -76,8 +76,8 @@ class Store:
                 there = self._arrays[name].nchunks_initialized
                 if there < finished:
                     raise InputError(
-                        f"{self.where}: {name} has {there} chunks of {finished} that are finished, "
-                        "expected a store from which nothing was taken, or another --out"
+                        f"{self.where}: {name} has {there} of {finished} finished chunks, "
+                        "expected a complete store, or another --out"
                     )
         for chunk in np.flatnonzero(done):
             which = slice(chunk * self.split.chunk, (chunk + 1) * self.split.chunk)
@@ -134,9 +134,9 @@ def _words(where: str) -> Iterator[None]:
     except OSError as e:
         # No space, no quota, or a file too large for the file system: these have a remedy.
         full = e.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        hint = ", expected room for the rest" if full else ""
+        hint = ", expected space for the rest" if full else ""
         raise InputError(
-            f"{where}: cannot be written ({e.strerror or e}){hint}; what is finished is kept"
+            f"{where}: cannot be written ({e.strerror or e}){hint}; finished elements are kept"
         ) from e
 
 
@@ -232,12 +232,14 @@ def reopen(path: Path, job: Job, where: str) -> Store:
         store = Store(zarr.open_group(str(path), mode="r+"), where)
         old = json.loads(store.attributes["description"])
     except (OSError, KeyError, ValueError, TypeError) as e:
-        raise InputError(f"{where}: {path} is no store of a sweep ({e})") from e
-    require_same(old, described(job), f"{where}: {path} is of another sweep")
+        raise InputError(f"{where}: {path} is not a store of a sweep ({e})") from e
+    require_same(old, described(job), f"{where}: {path} belongs to another sweep")
     # A variable's folder may have been removed since the store was made.
     missing = sorted(variables(job).keys() - store.names)
     if missing:
-        raise InputError(f"{where}: {path} is no whole store of a sweep, it lacks {missing[0]}")
+        raise InputError(
+            f"{where}: {path} is not a complete store of a sweep: {missing[0]} is missing"
+        )
     return store
 
 
@@ -265,7 +267,7 @@ def require_files(directory: Path, where: str) -> None:
         try:
             entries = list(os.scandir(folder))
         except OSError as e:
-            raise InputError(f"{where}: {folder} is no store of a sweep ({e.strerror})") from e
+            raise InputError(f"{where}: {folder} is not a store of a sweep ({e.strerror})") from e
         for entry in entries:
             # Links to folders are not followed, because one may lead back here.
             if entry.is_dir(follow_symlinks=False):

@@ -128,7 +128,7 @@ def _result_variables(job: Job) -> Iterator[tuple[str, _Sized]]:
 def _margin_variables(name: str, loop: str) -> Iterator[tuple[str, _Sized]]:
     yield f"{name}_gain", ((), "float64", _words("dB", f"gain margin, {loop}"))
     yield f"{name}_phase", ((), "float64", _words("deg", f"phase, {loop}"))
-    words = {"long_name": f"whether the loop {loop} is stable", "flag_values": [0, 1]}
+    words = {"long_name": f"true if the loop {loop} is stable", "flag_values": [0, 1]}
     yield f"{name}_stable", ((), "uint8", words | {"flag_meanings": "unstable stable"})
 
 
@@ -156,7 +156,7 @@ def _axis_words(job: Job, name: str) -> dict[str, Any]:
             "initial": f"{of} at the first sample",
             "offset": f"added to {of}",
             "gain": f"factor of {of}",
-            "delay": "the inputs act this much later",
+            "delay": "delay of the inputs",
             "seed": "seed of the disturbance",
         }[kind]
     words = _words(axis_unit(job.model, name), meaning)

@@ -272,7 +272,7 @@ def _unstacked(
         or any(x.shape[:2] != shape for x in cubes.values())
         or any(x.shape != shape and x.size != shape[1] for x in clocks.values() if x.size > 1)
     ):
-        why = "runs are read from arrays (run, sample, channel) with a time for each sample"
+        why = "runs are read only from arrays (run, sample, channel) with a time for each sample"
         shapes = listed(f"{shown(n)} {x.shape}" for n, x in cubes.items())
         said = note(LEFT_OUT, f"left out, since {why}: {shapes}", *cubes)
         return {n: x for n, x in arrays.items() if n not in cubes}, (said,)

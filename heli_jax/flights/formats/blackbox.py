@@ -149,13 +149,13 @@ def _signed(values: np.ndarray, has_sign: bool) -> np.ndarray:
 def _losses(frames: Frames, main: MainFrames) -> tuple[Finding, ...]:
     notes = []
     if "G" in frames.starts and (count := frames.starts["G"].size):
-        words = f"left out: {count} positions of GPS, as differences from a home that is set anew"
+        words = f"left out: {count} GPS positions, because their reference position changes"
         notes.append(note(LEFT_OUT, words, value=count))
     if frames.damage or main.dropped:
         places = len(frames.damage)
         words = f"{places} damaged frame{'' if places == 1 else 's'} skipped"
         if main.dropped:
-            words += f", {main.dropped} more frames lost that were differences from a lost one"
+            words += f", and {main.dropped} more frames that are differences from a lost one"
         notes.append(note("damage.skipped", words, value=places + main.dropped))
     return tuple(notes)
 

@@ -107,7 +107,7 @@ def open_csv(path: Path) -> "CsvTable":
     head = _find_head(where, data, (*_DELIMITERS, " ") if blanks else _DELIMITERS)
     line = f"line {head.number}"
     if not data[head.begin : head.begin + _LOOKED_AT].strip() and not data[head.begin :].strip():
-        raise wrong(where, "holds a header alone, expected rows of numbers", line)
+        raise wrong(where, "has only a header, expected rows of numbers", line)
     rows = memoryview(data)[head.begin :]
     if head.delimiter == " ":
         lines = (b"\t".join(row.split()) for row in bytes(rows).split(b"\n"))
@@ -510,7 +510,7 @@ class CsvTable:
                 problem = f"{count} cell{'' if count == 1 else 's'}, expected"
                 problem += f" {len(self.names)} as in the header in line {self._head.number}"
                 if not self._head.is_fitting:
-                    problem += "; no line of names is right above rows of as many cells"
+                    problem += "; no line of names is directly above rows with as many cells"
                 return wrong(self.path, problem, f"line {line}")
         return wrong(self.path, "holds no rows that can be read, expected rows of numbers")
 

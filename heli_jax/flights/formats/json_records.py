@@ -52,7 +52,7 @@ def _parsed(where: str, data: bytes) -> Any:
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as e:
-        raise wrong(where, "is no text in UTF-8, as JSON is") from e
+        raise wrong(where, "is not UTF-8 text, as JSON must be") from e
     try:
         return json.loads(text)
     except RecursionError as e:

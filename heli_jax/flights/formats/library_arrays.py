@@ -120,7 +120,7 @@ def read_matlab(path: Path, budget: Budget) -> Content:
             take(name, value, 0)
     if objects and sets.longest < 2:
         name, kind = next(iter(objects.items()))
-        problem = f"holds {shown(name)}, a {kind} of MATLAB, not an array; save its numbers"
+        problem = f"holds {shown(name)}, a MATLAB {kind}, not an array; save its numbers"
         way = f"writetable or writetimetable({name}, 'flight.csv') writes what is read"
         raise wrong(str(path), f"{problem} as arrays, or of a table {way}")
     if objects:

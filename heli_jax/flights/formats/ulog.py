@@ -88,7 +88,7 @@ def read_ulog(path: Path, budget: Budget) -> Content:
         )
     if log.dropouts:
         lost = 1e-3 * sum(d.duration for d in log.dropouts)
-        words = f"times the logger dropped data: {len(log.dropouts)}, {lost:.3g} s in all"
+        words = f"logger dropouts: {len(log.dropouts)}, {lost:.3g} s in all"
         notes.append(note("damage.dropouts", words, value=lost))
     facts = {
         "topics": topics,

@@ -242,7 +242,7 @@ def _over_time(run: Trajectory, title: str, groups: Sequence[_Shown]) -> Chart:
     t, note, shades = np.asarray(run.times), "", []
     left = [name for name, out in run.outside.items() if np.any(out)]
     if left:
-        note = f"shaded where the model's range is left: {', '.join(left)}"
+        note = f"shaded: outside of the model's range: {', '.join(left)}"
         outside = np.any([np.asarray(run.outside[name]) for name in left], axis=0)
         shades = [
             (float(t[stretch.start]), float(t[min(stretch.stop, t.size - 1)]))
