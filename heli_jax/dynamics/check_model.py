@@ -69,13 +69,13 @@ def check_model(model: Any, *, traceable: bool = True) -> None:
     """
     if isinstance(model, str):
         raise TypeError(
-            "model: expected a heli_jax.Model, as heli_jax.models.by_name or heli_jax.linear_model "
-            f"gives one of a name, got the name {model!r:.60}"
+            "model: expected a heli_jax.Model, from heli_jax.models.by_name or "
+            f"heli_jax.linear_model, got the name {model!r:.60}"
         )
     if not isinstance(model, Model):
         raise TypeError(
-            f"model: expected a heli_jax.Model, as Model(name, vector_field, output, Params, "
-            f"State, Inputs, Outputs) makes one, got {what_instead(model)}"
+            "model: expected a heli_jax.Model, made by Model(name, vector_field, output, Params, "
+            f"State, Inputs, Outputs), got {what_instead(model)}"
         )
     # Models of this package are tested, and wrapped functions were checked when they were wrapped.
     if str(getattr(_bare(model.vector_field), "__module__", "")).startswith("heli_jax."):
@@ -98,7 +98,7 @@ def what_instead(value: Any) -> str:
     # The function is not called, since a user's function may have side effects.
     if getattr(function, "__annotations__", {}).get("return") in (Model, "Model"):
         name = function.__name__
-        return f"the function {name}, which makes one; expected what it returns, as {name}()"
+        return f"the function {name}, which makes one; expected its result, {name}()"
     return _kind(value)
 
 
@@ -173,7 +173,7 @@ def _check(model: _Parts, traceable: bool) -> None:
 def _check_record(model: _Parts, role: str) -> None:
     """Refuse a class of parameters, states, ... that cannot be built by keyword."""
     record = getattr(model, role)
-    expected = "expected a class with one number a field, such as a NamedTuple"
+    expected = "expected a class with one number per field, such as a NamedTuple"
     if not isinstance(record, type):
         raise ValueError(f"model {model.name!r}: {role}: {expected}, got {_kind(record)}")
     try:
@@ -181,8 +181,8 @@ def _check_record(model: _Parts, role: str) -> None:
     except Exception as e:
         said = " ".join(str(e).split())[:200]
         raise ValueError(
-            f"model {model.name!r}: {role}: {expected}, got {record.__name__}, whose fields "
-            f"cannot be told ({type(e).__name__}: {said})"
+            f"model {model.name!r}: {role}: {expected}, got {record.__name__}, whose fields are "
+            f"unknown ({type(e).__name__}: {said})"
         ) from e
     # A vehicle without inputs may fall, but one without states has nothing to integrate.
     if not names and role != "Inputs":
@@ -302,25 +302,21 @@ def _words(e: Exception) -> str:
     """Return the error of a function in words, with a remedy if there is one."""
     if isinstance(e, jax.errors.TracerBoolConversionError):
         return (
-            "branches on a value that is traced (if, while, and, or, min, max); expected "
+            "branches on a traced value (if, while, and, or, min, max); expected "
             "jnp.where(condition, a, b) or jax.lax.cond in its place"
         )
     if isinstance(e, jax.errors.TracerArrayConversionError):
-        return (
-            "uses NumPy on a value that is traced; expected jax.numpy, as jnp.sin in place of "
-            "np.sin"
-        )
+        return "uses NumPy on a traced value; expected jax.numpy, as jnp.sin in place of np.sin"
     if isinstance(e, jax.errors.ConcretizationTypeError | jax.errors.TracerIntegerConversionError):
         return (
-            "makes a Python number of a value that is traced (float, int, the functions of math, "
-            "an index); expected the value itself, and jax.numpy, as jnp.sin in place of math.sin"
+            "makes a Python number of a traced value (float, int, the functions of math, an "
+            "index); expected the value itself, and jax.numpy, as jnp.sin in place of math.sin"
         )
     said = " ".join(str(e).split())[:200]
     order = ""
     if isinstance(e, AttributeError | TypeError):
         order = (
-            "; the arguments come as (params, state, inputs), start and noise_intensity take "
-            "params alone"
+            "; the arguments are (params, state, inputs), for start and noise_intensity only params"
         )
     return f"expected a return value, got {type(e).__name__}{f' ({said})' if said else ''}{order}"
 
@@ -393,7 +389,7 @@ def check_names(model: Any) -> None:
     _check_delays(model)
     for axis in _tuple(model, "axes", model.axes if model.axes is not None else ()):
         if not isinstance(axis, Axis):
-            _refuse(model, "axes", f"expected every one an Axis, got {axis!r:.60}")
+            _refuse(model, "axes", f"expected only Axis records, got {axis!r:.60}")
         for key, role, name in _names_of(model, axis):
             _known(model, f"axes: {axis.name!s:.30}.{key}", role, name)
     for name in _tuple(model, "positive", model.positive):
@@ -528,8 +524,8 @@ def cannot_start(model: Model, params: Record, inputs: Mapping[str, float] | Non
     where = ", ".join(f"{n} = 0" for n in cause)
     example = ", ".join(f"{n}: 1.0" for n in cause)
     return (
-        f"{what}, where {where}; expected a Model.start that begins elsewhere, or in a "
-        f"configuration initial_state: {{{example}}} with the value of the record"
+        f"{what}, where {where}; expected another Model.start, or in a configuration "
+        f"initial_state: {{{example}}} with the value of the record"
     )
 
 

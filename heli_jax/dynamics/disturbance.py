@@ -165,7 +165,7 @@ def _disturbances(model: Model, on: tuple[str, ...], poles: int) -> tuple[Distur
         for other in (*model.disturbances, *added):
             if other.state == state:
                 same = "twice" if other.name == name else f"by {other.name!r} as well"
-                raise ValueError(f"{name!r} names state {state!r}, which is disturbed {same}")
+                raise ValueError(f"{name!r} disturbs state {state!r}, which is disturbed {same}")
         # A single disturbance has the plain names, which `disturbances_of` also finds in a user's
         # model. Further ones need a suffix.
         ending = f"_{name}" if len(on) > 1 or model.disturbances else ""
@@ -176,8 +176,8 @@ def _disturbances(model: Model, on: tuple[str, ...], poles: int) -> tuple[Distur
     for d in added:
         for clash in sorted(taken & {d.sigma, d.tau, *d.lags}):
             raise ValueError(
-                f"model {model.name} has {clash!r} already, the name that a disturbance on "
-                f"{d.name!r} gives to one of its own"
+                f"model {model.name} has {clash!r} already, a name that a disturbance on "
+                f"{d.name!r} needs"
             )
     return tuple(added)
 
@@ -191,8 +191,8 @@ def _check_pushed(model: Model, name: str, state: str, rates: dict[str, str]) ->
         return
     if state in naming.names(model.State):
         raise ValueError(
-            f"model {model.name}: the derivative of {name!r} is kinematics, another state and "
-            f"nothing else, which nothing can push; {expected}"
+            f"model {model.name}: the derivative of {name!r} is kinematics, equal to another "
+            f"state, so that no disturbance can act on it; {expected}"
         )
     raise ValueError(f"model {model.name} has no axis or state {name!r} to disturb, {expected}")
 
@@ -386,7 +386,7 @@ def with_sensor_noise(model: Model, outputs: tuple[str, ...]) -> Model:
     more = {}
     for p in added:
         unit = naming.unit(model.Outputs, p.output) or "1"
-        meaning = f"sd of the noise of {p.output} that came through its filters"
+        meaning = f"sd of the noise of {p.output} that passed its filters"
         more[sensor_noise(p.output)] = (Annotated[Scalar, unit, meaning], 0.0)
     noisy = _Noisy(model, added)
     return dataclasses.replace(

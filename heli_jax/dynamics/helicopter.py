@@ -93,8 +93,8 @@ def helicopter(
     if corrections.measured_speed:
         if switches.get("governor"):
             raise ValueError(
-                "corrections: expected governor or measured_speed, got both: a rotor speed that is "
-                "measured has no governor"
+                "corrections: expected governor or measured_speed, got both: a measured rotor "
+                "speed has no governor"
             )
         corrections = corrections._replace(governor=False)
     State, Inputs = _state_class(corrections), _inputs_class(corrections, wind)

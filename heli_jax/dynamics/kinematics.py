@@ -59,7 +59,7 @@ class KinematicErrors(NamedTuple):
     lambda_ay: Annotated[Scalar, "1", "scale, accelerometer right"] = 0.0
     lambda_az: Annotated[Scalar, "1", "scale, accelerometer down"] = 0.0
     x_imu: Annotated[Scalar, "m", "IMU ahead of the velocity sensor"] = 0.0
-    y_imu: Annotated[Scalar, "m", "IMU to the right of it"] = 0.0
+    y_imu: Annotated[Scalar, "m", "IMU to the right of the velocity sensor"] = 0.0
     z_imu: Annotated[Scalar, "m", "IMU below it"] = 0.0
     delay_accel: Annotated[Scalar, "s", "outputs behind accelerometers"] = 0.0
     noise_accel: Annotated[
@@ -348,13 +348,13 @@ def kinematics(inputs: set[str], outputs: set[str]) -> Model:
     if not moving:
         raise ValueError(
             f"{min(forces)} is logged, expected a velocity (vn, ve, vd or u, v, w), an airspeed V "
-            "or a position (N, E, D) to compare it with, got none: leave the accelerometers out, "
-            "and the rates are compared with the angles"
+            "or a position (N, E, D) for comparison, got none: leave the accelerometers out to "
+            "compare only rates and angles"
         )
     if not forces:
         raise ValueError(
             f"{min(moving)} is an output, expected the specific forces ax, ay, az among the "
-            "inputs, got none: leave it out, and the rates are compared with the angles"
+            "inputs, got none: leave it out to compare only rates and angles"
         )
     return position if outputs & {*POSITION} else velocity
 

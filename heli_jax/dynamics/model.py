@@ -258,7 +258,7 @@ def correlation_of(model: Model, params: Record, dtype: DTypeLike) -> Array:
         if not set(pair) <= set(random):
             raise ValueError(
                 f"model {model.name}: correlation of {' and '.join(pair)}: expected two of the "
-                f"states that initial_sd names ({', '.join(random) or 'none'})"
+                f"states in initial_sd ({', '.join(random) or 'none'})"
             )
         i, j = (names.index(n) for n in pair)
         value = jnp.asarray(value, dtype)

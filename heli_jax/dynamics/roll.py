@@ -166,7 +166,7 @@ def on_stand(model: Model) -> Model:
     # The stand has springs only about roll and pitch, so yaw stays free.
     axes = [a for a in axes_of(model) if a.angle and a.inertia and a.added_inertia]
     if not axes:
-        raise ValueError(f"model {model.name!r} has no roll or pitch axis to put on a stand")
+        raise ValueError(f"model {model.name!r} has no roll or pitch axis for a stand")
 
     def vector_field(p: Record, s: Record, u: Record) -> Record:
         """Return the model's derivatives with the stand's moments."""

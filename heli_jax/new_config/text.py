@@ -356,7 +356,7 @@ def _missing(chosen: Chosen, signals: Signals) -> list[str]:
     first, unit = next(iter(units.items()))
     listed = ", ".join(f"{n} [{u}]" for n, u in units.items())
     return [
-        f"        # Not found by name: {listed}. Add what was logged,",
+        f"        # No column name matches {listed}. Add what was logged,",
         f"        # as {first}: {{signal: NAME, unit: {_value(unit)}}}",
     ]
 

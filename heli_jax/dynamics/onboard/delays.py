@@ -112,8 +112,8 @@ def on_time(model: Model, names: Iterable[str]) -> None:
     for name in names:
         if name in late:
             raise ValueError(
-                f"input {name!r} of model {model.name} is late by {late[name]} already, expected "
-                "one delay"
+                f"input {name!r} of model {model.name} has the delay {late[name]} already, "
+                "expected one delay"
             )
 
 
@@ -274,8 +274,8 @@ def require_past(model: Model, params: Record) -> None:
         delay = float(getattr(params, parameter))
         if delay < 0:
             raise ValueError(
-                f"{parameter} of model {model.name}: {name!r} is late by a delay line, expected "
-                f"0 s or more, got {delay:g} s"
+                f"{parameter} of model {model.name}: {name!r} has a delay line, expected 0 s or "
+                f"more, got {delay:g} s"
             )
 
 

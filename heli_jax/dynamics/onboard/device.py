@@ -174,8 +174,7 @@ def _check_new(model: Model, parts: Parts) -> None:
         for name in more:
             if name in naming.names(record):
                 raise ValueError(
-                    f"model {model.name} has a {kind} {name!r} already, expected a device that it "
-                    "has not"
+                    f"model {model.name} has a {kind} {name!r} already, expected another device"
                 )
 
 

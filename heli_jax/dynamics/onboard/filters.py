@@ -59,12 +59,13 @@ class Filter(NamedTuple):
         if self.kind == "notch" and self.q is None:
             raise ValueError("q: a notch needs its quality factor, got none")
         if self.kind not in ("notch", "biquad") and self.q is not None:
-            raise ValueError(f"q: {self.kind} has none, expected it for a biquad or a notch")
+            raise ValueError(f"q: only for a biquad or a notch, got {self.kind}")
         if self.q is not None and not (math.isfinite(self.q) and self.q > 0):
             raise ValueError(f"q: expected a number above zero, got {self.q:g}")
         if not self.attenuation > 0 or (self.kind != "notch" and self.attenuation != math.inf):
             raise ValueError(
-                f"attenuation: expected decibels above zero, of a notch, got {self.attenuation:g}"
+                "attenuation: expected for a notch, in decibels above zero, got "
+                f"{self.attenuation:g}"
             )
         return self
 
@@ -159,8 +160,8 @@ def with_filters(
         check_delay(delay, f"delay of {name}")
         if delay and name in dict(model.delay_lines):
             raise ValueError(
-                f"delay of {name}: it is late by {dict(model.delay_lines)[name]} already, expected "
-                "one delay"
+                f"delay of {name}: it has the delay {dict(model.delay_lines)[name]} already, "
+                "expected one"
             )
     # A filter or delay without effect adds no device, so model and compiled program stay.
     channels = tuple(
@@ -182,8 +183,9 @@ def check_delay(delay: float, where: str) -> None:
     """
     if not delay >= 0:
         raise ValueError(
-            f"{where}: expected 0 s or more, since no log has an output before it happened, got "
-            f"{delay:g}; if the inputs are logged late, give them a negative delay (onboard.delays)"
+            f"{where}: expected 0 s or more, because no output is logged before it happens, got "
+            f"{delay:g}; if the inputs are logged late, give them a negative delay "
+            "(onboard.delays)"
         )
     if not delay <= LONGEST_DELAY:
         raise ValueError(

@@ -103,8 +103,8 @@ def _loops(model: Model, on: Loops, axes: tuple[str, ...]) -> tuple[tuple[str, s
         own = [a for a in own if a.stick in naming.names(model.Inputs)]
         if not own:
             raise ValueError(
-                f"model {model.name} says no stick of its {' or '.join(axes)} axis, expected "
-                "on: {STICK: RATE} with an input and a state"
+                f"model {model.name} names no stick of its {' or '.join(axes)} axis, expected on: "
+                "{STICK: RATE} with an input and a state"
             )
         return _checked(model, {str(a.stick): _measured_by_gyro(model, a) for a in own})
     require(on, model.Inputs, "input", model)
@@ -113,8 +113,8 @@ def _loops(model: Model, on: Loops, axes: tuple[str, ...]) -> tuple[tuple[str, s
     for stick in on:
         if stick not in known:
             raise ValueError(
-                f"model {model.name} does not say which rate {stick!r} commands, expected "
-                f"on: {{{stick}: RATE}} with one of its states"
+                f"model {model.name} does not name the rate that {stick!r} commands, expected on: "
+                f"{{{stick!r}: RATE}} with one of its states"
             )
     return _checked(model, {stick: known[stick] for stick in on})
 
@@ -185,8 +185,8 @@ def _check_free(model: Model, stick: str) -> None:
     if looped and f"Kp_{stick}" in naming.names(model.Params):
         # Both would be proportional and integral of the same rate, exchangeable in any log.
         raise ValueError(
-            f"{stick} drives a rate loop already, expected it in one of rate_loop and gyro: "
-            "name the sticks of each (on: [...])"
+            f"{stick} has a rate loop already, expected one of rate_loop and gyro: name the "
+            "sticks of each (on: [...])"
         )
 
 
@@ -207,7 +207,7 @@ class _RateLoop(Device):
                 # a rate loop.
                 states[f"{stick}_integral"] = Quantity(angle, f"integral of the error of {rate}")
             if law.lag:
-                states[f"{stick}_gyro"] = Quantity(unit[1], f"{rate} as the gyro has it")
+                states[f"{stick}_gyro"] = Quantity(unit[1], f"{rate} as measured by the gyro")
         linear = not any(_is_of_body(model, rate) for _, rate in loops)
         super().__init__(model, Parts(params, states, linear=linear))
         self.loops, self.law = loops, law

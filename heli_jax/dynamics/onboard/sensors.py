@@ -177,8 +177,8 @@ class _MotionSensors(Device):
     def _accelerations(self, model: Model) -> dict[str, Quantity]:
         if not self.body_rates:
             raise ValueError(
-                f"model {model.name} has no rates of its body, expected states or outputs p, q, r "
-                "or axes named roll, pitch, yaw"
+                f"model {model.name} has no body rates, expected states or outputs p, q, r or "
+                "axes named roll, pitch, yaw"
             )
         words = {"p": "roll", "q": "pitch", "r": "yaw"}
         quantities = {}
@@ -194,8 +194,8 @@ class _MotionSensors(Device):
         windy = "wind_x" in naming.names(model.Inputs)
         if self.motion.kind != "ground" and windy and "psi" not in naming.names(model.State):
             raise ValueError(
-                f"model {model.name} has a wind over the ground and speeds along its body, "
-                "expected a state psi that tells where it heads"
+                f"model {model.name} has wind over the ground and speeds along its body, expected "
+                "a state psi for its heading"
             )
         speeds = {
             f"{'uvw'['xyz'.index(axis)]}_air": Quantity("m/s", f"airspeed {_ALONG[axis]}")
@@ -278,9 +278,9 @@ def motion_of(model: Model) -> MotionKind:
     ):
         return MotionKind("ground", ("ax", "ay", "az"))
     raise ValueError(
-        f"model {model.name} does not know its velocities, expected states u, v, w (with p, q, r, "
-        "phi, theta), or dx, dy, dz, phi, theta, psi with states dphi, dtheta, dpsi or outputs p, "
-        "q, r"
+        f"model {model.name} has no velocities, expected states u, v, w (with p, q, r, phi, "
+        "theta), or dx, dy, dz, phi, theta, psi with states dphi, dtheta, dpsi or outputs p, q, "
+        "r"
     )
 
 

@@ -116,7 +116,7 @@ def _one_unit(model: Model, on: tuple[str, ...]) -> str | None:
     units = {naming.unit(model.Inputs, n) for n in on}
     if len(units) > 1:
         raise ValueError(
-            f"rate_limit: expected inputs of one unit, since they share the limit, got "
-            f"{', '.join(on)} in {', '.join(sorted(str(u) for u in units))}"
+            f"rate_limit: expected inputs of one unit for a common limit, got {', '.join(on)} in "
+            f"{', '.join(sorted(str(u) for u in units))}"
         )
     return units.pop()
