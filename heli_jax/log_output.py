@@ -142,7 +142,8 @@ def _clock_lines(clock: TimeInfo | None) -> Iterator[str]:
         yield (
             f"time: {name}, {terse(clock.duration, 6)} s at {terse(clock.rate, 6)} Hz, {uniform}"
         )
-        yield f"jitter {_percent(clock.jitter)} of a step, {_gap_words(clock)}"
+        most = "" if clock.uniform else " (95 % of the steps)"
+        yield f"jitter {_percent(clock.jitter)} of a step{most}, {_gap_words(clock)}"
     if clock.guessed and clock.counted is None:
         yield f"the unit {clock.unit} is a guess; --time-unit states it"
     # The longest gaps come first, since they affect a fit. A single lost row is bridged.
