@@ -231,11 +231,10 @@ def _notes(flights: Sequence[Flight], inputs: list[str], by: tuple[str, ...]) ->
     # No number below reveals the sign of this bias, so a note states it.
     without = [n for n in inputs if n not in by]
     if without:
-        taken = "inputs that do not follow" if len(without) > 1 else "an input that does not follow"
         words = (
-            f"{', '.join(without)}: the outputs are divided by {taken}. If a pilot or an "
-            "autopilot closes a loop, the response is biased towards minus one over its gain: "
-            "log the excitation (signals.instruments), or fit by filter error"
+            f"{', '.join(without)}: assumed not to follow the outputs. If a pilot or an autopilot "
+            "closes a loop, the response is biased towards minus one over its gain: log the "
+            "excitation (signals.instruments), or fit by filter error"
         )
         notes.append(note("loop.responses-direct", words, *without))
     return notes
