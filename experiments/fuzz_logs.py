@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from heli_jax import log_output
+from heli_jax.cli import logs as printed
 from heli_jax.errors import InputError
 from heli_jax.flights.convert import Selection, convert_log
 from heli_jax.flights.describe import describe_flights
@@ -80,9 +80,9 @@ def outcome(path: Path, converts: bool = True) -> str:
         for flight in flights:
             shown = io.StringIO()
             with contextlib.redirect_stdout(shown):
-                log_output.print_flights([flight])
+                printed.print_flights([flight])
             assert "\x1b" not in shown.getvalue()
-        log_output.as_json(flights)
+        printed.as_json(flights)
         if not converts:
             return "noted" if any(f.notes for f in flights) else "flight"
         number = flights[0].flight[0] if flights[0].flight[1] > 1 else None

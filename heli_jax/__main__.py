@@ -59,7 +59,7 @@ def _leave(code: int) -> None:
 
 
 def _end(number: int, frame: FrameType | None) -> None:
-    # `heli_jax.interrupts` would have to be imported first.
+    # `heli_jax.cli.interrupts` would have to be imported first.
     os.write(2, b"heli-jax: interrupted; nothing was written\n")
     os._exit(130)
 

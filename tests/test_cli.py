@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import yaml
 
-from heli_jax import cli, run_directory
-from heli_jax.cli import main
+from heli_jax import run_directory
+from heli_jax.cli import commands, main
 from heli_jax.errors import InputError
 
 ROOT = Path(__file__).parents[1]
@@ -297,7 +297,7 @@ def test_an_interrupt_is_one_whatever_a_library_makes_of_it(monkeypatch, capsys)
         except KeyboardInterrupt as e:
             raise InputError("bench.yaml: fit: cannot be lowered") from e
 
-    monkeypatch.setattr(cli, "_info", lowered)
+    monkeypatch.setattr(commands, "_info", lowered)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         assert main(["info", "log.csv"]) == 130
@@ -351,9 +351,14 @@ def as_program(script, arguments, folder):
     head = (
         "import hashlib, pathlib, signal, sys, threading, time\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "from heli_jax import cli, run_directory\n"
+        "from heli_jax import run_directory\nfrom heli_jax.cli import commands\n"
     )
-    command = [sys.executable, "-c", f"{head}{script}\nsys.exit(cli.main())", *map(str, arguments)]
+    command = [
+        sys.executable,
+        "-c",
+        f"{head}{script}\nsys.exit(commands.main())",
+        *map(str, arguments),
+    ]
     return subprocess.Popen(
         command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
@@ -362,7 +367,7 @@ def as_program(script, arguments, folder):
 @pytest.mark.parametrize("moment", MOMENTS)
 def test_an_interrupt_ends_a_command_at_any_moment(tmp_path, moment):
     body = textwrap.indent(textwrap.dedent(MOMENTS[moment]), "    ")
-    script = f"def busy(options):\n{body}\ncli._info = busy"
+    script = f"def busy(options):\n{body}\ncommands._info = busy"
     process = as_program(script, ["info", "log.csv"], tmp_path)
     out, err = process.communicate(timeout=30)
     done = moment == "after the work"
@@ -390,7 +395,9 @@ def test_an_interrupt_while_the_command_is_imported(tmp_path):
 def test_interrupts_after_the_end_are_nothing(tmp_path):
     """Python takes a second to take itself down, in which an interrupt would show a traceback."""
     script = "import atexit; atexit.register(signal.raise_signal, signal.SIGINT)\n"
-    process = as_program(f"{script}cli._info = lambda options: 0", ["info", "log.csv"], tmp_path)
+    process = as_program(
+        f"{script}commands._info = lambda options: 0", ["info", "log.csv"], tmp_path
+    )
     assert process.communicate(timeout=30) == ("", "")
     assert process.returncode == 0
 
@@ -420,7 +427,7 @@ def test_who_stops_reading_is_no_failure_and_a_full_disk_is(tmp_path):
 
 def test_the_style_of_the_working_folder_is_passed_over(tmp_path):
     os.mkfifo(tmp_path / "matplotlibrc")
-    script = "cli._info = lambda options: int(not __import__('matplotlib').__version__)"
+    script = "commands._info = lambda options: int(not __import__('matplotlib').__version__)"
     process = as_program(script, ["info", "log.csv"], tmp_path)
     assert process.communicate(timeout=60)[1] == ""
 
@@ -439,10 +446,10 @@ def test_a_finished_fit_is_shown_where_its_directory_cannot_be_written(bench, ca
 def test_what_was_compiled_is_kept_for_its_owner_alone(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     (tmp_path / "heli_jax").mkdir(mode=0o777)
-    assert cli._private_cache() == str(tmp_path / "heli_jax")
+    assert commands._private_cache() == str(tmp_path / "heli_jax")
     assert (tmp_path / "heli_jax").stat().st_mode & 0o777 == 0o700
     monkeypatch.setattr(os, "getuid", lambda: 12345)
-    assert cli._private_cache() is None
+    assert commands._private_cache() is None
 
 
 def test_two_fits_of_one_directory_are_both_kept(tmp_path):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from heli_jax import Flight
-from heli_jax.log_responses import between_samples
+from heli_jax.cli.responses import between_samples
 
 
 def _flight(hold: str, reason: dict[str, str]) -> Flight:

@@ -6,7 +6,8 @@ import time
 
 import pytest
 
-from heli_jax import stages, terminal
+from heli_jax import stages
+from heli_jax.cli import terminal
 from heli_jax.stages import Stage
 
 

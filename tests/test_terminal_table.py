@@ -5,9 +5,9 @@ import sys
 
 import pytest
 
-from heli_jax import output
+from heli_jax.cli import fits as output
+from heli_jax.cli.terminal import print_table, tell
 from heli_jax.identification.result import Estimate
-from heli_jax.terminal import print_table, tell
 
 HEAD = ("parameter", "estimate", "95 % (autocorrelated residuals)", "unit", "of another method")
 ROWS = [

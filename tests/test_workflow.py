@@ -9,10 +9,10 @@ import pytest
 
 import heli_jax
 from heli_jax.cli import main
+from heli_jax.cli.fits import print_check
 from heli_jax.errors import InputError
 from heli_jax.identification.design.accuracy import starting_at_zero
 from heli_jax.identification.problem import Free, Prior
-from heli_jax.output import print_check
 
 CONFIG = """
 model: roll-on-stand

@@ -176,13 +176,13 @@ def _fit_keys() -> str:
 
 
 def _commands() -> str:
-    from heli_jax import cli
+    from heli_jax.cli import commands
 
     # Of the terminal in which the site is built nothing may show.
     before = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = "88"
     try:
-        parser = cli._parser()
+        parser = commands._parser()
         [commands] = parser._subparsers._group_actions  # type: ignore[union-attr]
         texts = {name: command.format_help() for name, command in commands.choices.items()}  # type: ignore[union-attr]
     finally:

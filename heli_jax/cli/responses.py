@@ -12,6 +12,7 @@ from heli_jax.analysis.attitude_responses import (
 )
 from heli_jax.analysis.flight_responses import FlightResponses, Settings, Wanted, flight_responses
 from heli_jax.analysis.spectra import COHERENT, octave_mean
+from heli_jax.cli.terminal import print_table, tell, tell_table
 from heli_jax.config.experiment import Experiment, resolved
 from heli_jax.config.frequency import asked_handling, check_pairs, missing_handling, units_of
 from heli_jax.config.frequency_section import FrequencyConfig
@@ -22,7 +23,6 @@ from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import is_low_passed
 from heli_jax.numbers import plain_words
 from heli_jax.stages import Note
-from heli_jax.terminal import print_table, tell, tell_table
 from heli_jax.yaml_file import as_yaml
 
 _HOLDS = {

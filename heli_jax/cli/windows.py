@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from heli_jax import config as configuration
+from heli_jax.cli.terminal import print_table, tell
 from heli_jax.config import Experiment
 from heli_jax.config.logs import require_flights, with_log
 from heli_jax.errors import located
@@ -18,7 +19,6 @@ from heli_jax.identification.design.windows import (
 )
 from heli_jax.identification.fit import windows
 from heli_jax.stages import Note
-from heli_jax.terminal import print_table, tell
 
 _MOST = 40
 """Most windows in the table; the selected ones are always shown."""

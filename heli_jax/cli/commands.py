@@ -15,13 +15,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from heli_jax import import_path, interrupts, run_directory, terminal
+from heli_jax import import_path, run_directory
+from heli_jax.cli import interrupts, terminal
+from heli_jax.cli.interrupts import resumable
+from heli_jax.cli.terminal import print_table, tell, tell_table
 from heli_jax.errors import InputError, located
-from heli_jax.interrupts import resumable
 from heli_jax.numbers import ADEQUATE
 from heli_jax.regular_file import read_regular
 from heli_jax.stages import Note
-from heli_jax.terminal import print_table, tell, tell_table
 from heli_jax.versions import version
 
 if TYPE_CHECKING:
@@ -359,7 +360,8 @@ def _fit(options: argparse.Namespace) -> int:
                 f"study in {options.config}"
             )
     out = _new_directory(options)
-    from heli_jax import output, workflow
+    from heli_jax import workflow
+    from heli_jax.cli import fits
 
     experiment = workflow.load_config(options.config, options.set)
     failure = None
@@ -371,7 +373,7 @@ def _fit(options: argparse.Namespace) -> int:
     if options.json and run.directory is not None:
         print((run.directory / "fit.json").read_text(encoding="utf-8"), end="")
     else:
-        output.print_fit(run, verbose=options.verbose)
+        fits.print_fit(run, verbose=options.verbose)
     if failure is not None:
         raise failure
     return run.fit.exit_code
@@ -379,7 +381,7 @@ def _fit(options: argparse.Namespace) -> int:
 
 def _fit_study(options: argparse.Namespace, study: "Study") -> int:
     """Run a study, print it, and return the exit code of the worst fit."""
-    from heli_jax import simulation_output
+    from heli_jax.cli import simulations
     from heli_jax.studies import directory
     from heli_jax.studies import run as studies
 
@@ -394,9 +396,9 @@ def _fit_study(options: argparse.Namespace, study: "Study") -> int:
     with _dask_client(options) if options.scheduler else contextlib.nullcontext() as client:
         how = {"workers": options.workers, "client": client, "reports": options.reports}
         result = studies.run(study, out, studies.Options(options.resume, **how, say=options.say))
-    simulation_output.print_study(result)
+    simulations.print_study(result)
     tell(f"fits: {out / 'fits'}\nDataset: {out / studies.STORE}")
-    return simulation_output.study_exit_code(result)
+    return simulations.study_exit_code(result)
 
 
 def _require_out(options: argparse.Namespace) -> None:
@@ -428,7 +430,8 @@ def _discard_output() -> None:
 
 def _check(options: argparse.Namespace) -> int:
     _prepare_jax()
-    from heli_jax import output, workflow
+    from heli_jax import workflow
+    from heli_jax.cli import fits
     from heli_jax.report import files
 
     config = workflow.load_config(options.config, options.set)
@@ -436,19 +439,20 @@ def _check(options: argparse.Namespace) -> int:
     if options.json:
         print(files.as_json(files.check_json(check)))
     else:
-        output.print_check(check, verbose=options.verbose)
+        fits.print_check(check, verbose=options.verbose)
     hopeless = any(f.severity == "refuse" for f in check.findings)
     return DONE if check.verdict.identifiable and not hopeless else NOT_DETERMINED
 
 
 def _windows(options: argparse.Namespace) -> int:
     _prepare_jax()
-    from heli_jax import log_windows, workflow
+    from heli_jax import workflow
+    from heli_jax.cli import windows
 
     experiment = workflow.load_config(options.config, options.set)
-    ranking = log_windows.rank_log(experiment, options.log, options.length, progress=options.say)
-    log_windows.print_ranking(ranking)
-    if log_windows.cannot_be_fitted(ranking) or log_windows.not_determined(ranking):
+    ranking = windows.rank_log(experiment, options.log, options.length, progress=options.say)
+    windows.print_ranking(ranking)
+    if windows.cannot_be_fitted(ranking) or windows.not_determined(ranking):
         return NOT_DETERMINED
     return DONE
 
@@ -456,22 +460,24 @@ def _windows(options: argparse.Namespace) -> int:
 def _compatibility(options: argparse.Namespace) -> int:
     out = _new_directory(options)
     _prepare_jax()
-    from heli_jax import compatibility, output
+    from heli_jax import compatibility
+    from heli_jax.cli import fits
 
     result = compatibility.run_compatibility(
         options.config, out, overrides=options.set, progress=options.say
     )
-    output.print_compatibility(result)
+    fits.print_compatibility(result)
     return DONE if result.compatible else NOT_CONVERGED
 
 
 def _frf(options: argparse.Namespace) -> int:
     out = _new_directory(options)
     _prepare_jax()
-    from heli_jax import log_responses, workflow
+    from heli_jax import workflow
+    from heli_jax.cli import responses
 
     experiment = workflow.load_config(options.config, options.set)
-    statuses = log_responses.run_responses(experiment, out, options.log, options.say)
+    statuses = responses.run_responses(experiment, out, options.log, options.say)
     # Responses are written even if a transfer function fails. The exit code shows scripts that its
     # numbers are missing.
     codes = {"converged": DONE, "not-identifiable": NOT_DETERMINED}
@@ -494,7 +500,8 @@ def _simulate(options: argparse.Namespace) -> int:
             run_directory.require_place(place, f"{option} {place}")
     _prepare_jax()
     from heli_jax import config as configuration
-    from heli_jax import generate, simulation_output
+    from heli_jax import generate
+    from heli_jax.cli import simulations
 
     experiment = configuration.load(options.config, options.set)
     if experiment.config.simulate is not None:
@@ -503,11 +510,11 @@ def _simulate(options: argparse.Namespace) -> int:
         simulated = generate.follow(experiment)
     for found in simulated.notes:
         options.say(Note(found.of(options.config).sentence))
-    simulation_output.write_table(out, simulated.columns)
+    simulations.write_table(out, simulated.columns)
     if out is not None:
         options.say(f"wrote {len(next(iter(simulated.columns.values())))} samples to {out}")
     if view is not None:
-        simulation_output.write_view(view, experiment, simulated, out)
+        simulations.write_view(view, experiment, simulated, out)
         whole = "" if simulated.whole else ", figures only: 3D needs the whole helicopter"
         options.say(f"wrote {view}{whole}")
     return DONE
@@ -523,7 +530,8 @@ def _sweep(options: argparse.Namespace) -> int:
     import jax
 
     from heli_jax import config as configuration
-    from heli_jax import simulation_output, sweep_workflow
+    from heli_jax import sweep_workflow
+    from heli_jax.cli import simulations
     from heli_jax.sweeps.store import FINISHED
 
     experiment = configuration.load(options.config, options.set)
@@ -541,20 +549,20 @@ def _sweep(options: argparse.Namespace) -> int:
             client=client,
             say=options.say,
         )
-    simulation_output.print_sweep(out)
+    simulations.print_sweep(out)
     return DONE
 
 
 def _info(options: argparse.Namespace) -> int:
-    from heli_jax import log_output
+    from heli_jax.cli import logs
     from heli_jax.flights.describe import describe_flights
 
     clock = (options.time, options.time_unit, options.flight, options.time_rate)
     flights = list(describe_flights(options.log, *clock))
     if options.json:
-        print(log_output.as_json(flights))
+        print(logs.as_json(flights))
     else:
-        log_output.print_flights(flights, options.channels, options.flight is not None)
+        logs.print_flights(flights, options.channels, options.flight is not None)
     return DONE
 
 

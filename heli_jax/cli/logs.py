@@ -10,12 +10,12 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from heli_jax.cli.terminal import print_table, tell
 from heli_jax.finding import as_data
 from heli_jax.flights.clock import ROWS
 from heli_jax.flights.describe import ColumnInfo, LogInfo, TimeInfo, TopicInfo
 from heli_jax.flights.preset import fitting_presets
 from heli_jax.numbers import terse
-from heli_jax.terminal import print_table, tell
 
 _WIDEST = 44
 """Longest name in a table [characters]."""

@@ -12,10 +12,10 @@ import numpy as np
 
 from heli_jax import config as configuration
 from heli_jax import run_directory
+from heli_jax.cli.terminal import print_table, tell
 from heli_jax.finding import sentences
 from heli_jax.flights import write as tables
 from heli_jax.numbers import rounded, terse
-from heli_jax.terminal import print_table, tell
 from heli_jax.yaml_file import as_yaml
 
 if TYPE_CHECKING:

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from heli_jax import compatibility
+from heli_jax.cli.terminal import print_table, tell, tell_table
 from heli_jax.compatibility import Compatibility
 from heli_jax.config.frequency import missing_handling
 from heli_jax.finding import Finding
@@ -26,7 +27,6 @@ from heli_jax.report.card import card, summary
 from heli_jax.report.fit_page import lines
 from heli_jax.report.fitted_responses import NO_RESPONSES
 from heli_jax.summaries import cells_of, of_estimates
-from heli_jax.terminal import print_table, tell, tell_table
 from heli_jax.workflow import FitRun
 
 
