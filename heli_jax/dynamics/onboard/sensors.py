@@ -363,7 +363,7 @@ def _at(p: Record) -> Vector:
 
 
 def _linear(model: Model, p: Record, s: Record, u: Record, rates: Record) -> Vector:
-    """Return the specific force about hover, to first order; states that the model lacks are zero."""
+    """Return the specific force about hover, to first order; states the model lacks are zero."""
 
     def of(record: Record, name: str) -> Any:
         return getattr(record, name, 0.0)
