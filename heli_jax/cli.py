@@ -238,7 +238,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if seen.seen:
                 terminal.say("interrupted")
                 return INTERRUPTED
-            # Any other error is a bug, and a report of it needs the traceback.
+            # Any other error is a bug, and its report needs the traceback.
             if not isinstance(e, InputError | OSError):
                 raise
             if isinstance(e, OSError):
@@ -279,7 +279,7 @@ def _prepare_jax(cpu_devices: int | None = None) -> None:
     Args:
         cpu_devices: number of processors that are devices; default: JAX decides.
     """
-    # Commands import JAX and its users themselves. That takes seconds, which a wrong option, --help
+    # Commands import JAX and its users themselves. It takes seconds, which a wrong option, --help
     # and `info` do not need.
     import jax
 

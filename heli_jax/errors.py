@@ -10,7 +10,7 @@ _END = 1000
 
 
 def shortened(text: str) -> str:
-    """Return a message, cut in the middle if a long value makes it too long."""
+    """Return a message, with its middle cut out if it is too long."""
     left = len(text) - 2 * _END
     return text if left <= 0 else f"{text[:_END]} [{left} letters] {text[-_END:]}"
 

@@ -352,7 +352,6 @@ def write_report(run: FitRun, out: str | Path) -> FitRun:
 
     Args:
         run: result of `run_fit`.
-        out: the directory.
 
     Raises:
         InputError: `out` cannot be written to, or the extra `bayes` is missing.

@@ -132,7 +132,7 @@ def _branch(x: np.ndarray, points: Point) -> tuple[int, np.ndarray]:
     phase = np.unwrap(points.phase)
     # Bode's relation: a gain that falls with the n-th power of frequency has n right angles of lag,
     # for any sign of the stick. It fails near a growing mode, and delays add lag at high
-    # frequencies. So the majority in the lower half of the band decides.
+    # frequencies. The majority in the lower half of the band therefore decides.
     low = slice(0, x.size // 2)
     turns = np.round((phase - 0.5 * np.pi * np.gradient(points.log_gain, x))[low] / np.pi)
     values, counts = np.unique(turns, return_counts=True)

@@ -65,13 +65,12 @@ def margins(
     An element that is not finite, or has 1 + gain D = 0, gives NaN, NaN and False. Elements do not
     affect each other.
 
-    A loop is stable if all eigenvalues of A - gain B C / (1 + gain D) have negative real parts,
-    apart from those that the loop does not move. An unobserved position or heading has an
-    eigenvalue of zero at any gain, which does not concern the loop. So an eigenvalue that is not
-    negative is ignored if A has it at least as often, to 1e-9 of the fastest (or of 1/s), and it
-    grows no faster than that. Rounding spreads zeros that form a chain, as a speed and its position
-    do. Those count as zeros within 1e-6 if their mean is zero to 1e-9. An unobserved chain of three
-    or more, in coordinates that mix its states with others, is not recognised, and such a loop
+    A loop is stable if all eigenvalues of A - gain B C / (1 + gain D) have negative real parts.
+    Eigenvalues that the loop does not move are ignored, such as the zero of an unobserved position
+    or heading. This requires that A has the eigenvalue at least as often, and that it grows no
+    faster than 1e-9 of the fastest (or of 1/s). Rounding spreads the zeros of a chain, such as a
+    speed and its position. They count as zeros within 1e-6 if their mean is zero to 1e-9. An
+    unobserved chain of three or more in mixed coordinates is not recognised, and the loop then
     counts as unstable. An unobserved growing mode makes a loop unstable.
 
     Args:
@@ -184,7 +183,7 @@ def _stable(before: _Complex, after: _Complex, size: np.ndarray) -> np.ndarray:
     """True if the eigenvalues `after` (m, n) are stable, apart from those also in `before`."""
     n = after.shape[1]
     limit = _SAME * size[:, None]
-    # At least as many before as after, and growing no faster than the limit.
+    # A must have it at least as often, and it must grow no faster than the limit.
     there = np.abs(after[:, :, None] - before[:, None, :]) <= limit[:, :, None]
     here = np.abs(after[:, :, None] - after[:, None, :]) <= limit[:, :, None]
     unmoved = (there.sum(2) >= here.sum(2)) & (after.real <= limit)

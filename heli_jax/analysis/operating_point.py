@@ -115,7 +115,7 @@ def _mean(
     dtype = jnp.result_type(float)
     mean = model.Inputs(**{n: jnp.asarray(u.mean(), dtype) for n, u in acting.items()})
     driven = model.Inputs(**{n: jnp.asarray(u, dtype) for n, u in acting.items()})
-    # Not the equilibrium of the mean inputs, which a user's model may lack.
+    # A user's model may lack an equilibrium of the mean inputs.
     state = _mean_state(model, params, driven, jnp.asarray(dt, dtype), substeps)
     if all(bool(np.isfinite(v)) for v in jax.tree.leaves(state)):
         return OperatingPoint(state, mean, "the record's mean")

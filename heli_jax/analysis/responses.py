@@ -66,12 +66,12 @@ def responses(
 ) -> Responses:
     """Return the responses of each output to each input, with the other inputs accounted for.
 
-    A response is NaN if inputs move as one, if an input does not move, or if an instrument is too
-    weak compared with other causes of its input (`sd_of_ratio`).
+    A response is NaN if inputs move as one or not at all, or if an instrument explains too little
+    of its input (`sd_of_ratio`).
 
     Args:
-        instruments: one excitation for each input, outside all feedback; without them, inputs are
-            assumed not to depend on the outputs.
+        instruments: an excitation of each input, outside all feedback. Without it, inputs must not
+            depend on the outputs.
 
     Raises:
         TooFewAveragesError: there are too few averages for the number of inputs.
@@ -138,18 +138,13 @@ def _left(S: np.ndarray, u: list[int], y: list[int], H: np.ndarray) -> np.ndarra
     return np.maximum(power - 2.0 * crossed + explained, _ROUNDING * power)
 
 
-# Intervals of responses by instrument.
-#
-# These are ratios of two uncertain numbers. With w_j the combination of the instruments for input j
-# alone, H_j = S_wy / S_wu. A response H' agrees with the record in the disc
-#
-#     |H' - H|^2 <= c (S_ee - 2 Re(conj(H' - H) S_ue) + |H' - H|^2 S_vv),  c = t^2 S_ww / (2 n),
-#
-# with Student's t, and v the part of the input that no instrument explains. If the excitation is
-# weak beside v, the disc is larger than the first-order error and off centre. If c S_vv reaches 1,
-# it is unbounded: the response is unknown.
-#
-# Sources: Fieller (1954); Anderson and Rubin (1949) for instruments.
+# Intervals of responses by instrument. These are ratios of two uncertain numbers. With w_j the
+# combination of the instruments for input j alone, H_j = S_wy / S_wu. A response H' agrees with the
+# record in a disc: |H' - H|^2 <= c (S_ee - 2 Re(conj(H' - H) S_ue) + |H' - H|^2 S_vv), c = t^2 S_ww
+# / (2 n). Here t is Student's t, and v the part of the input that no instrument explains. If the
+# excitation is weak beside v, the disc is larger than the first-order error and off centre. If c
+# S_vv reaches 1, it is unbounded: the response is unknown. Sources: Fieller (1954); Anderson and
+# Rubin (1949) for instruments.
 
 
 def sd_of_ratio(
@@ -180,7 +175,7 @@ def sd_of_ratio(
         # Cross-density of y - H u with each input.
         crossed = S[:, u][:, :, y] - np.einsum("kja,kla->kjl", S[:, u][:, :, u], H)
         c = 0.5 * half95**2 * spread
-        # An input that is its own instrument has no part of its own, apart from rounding.
+        # Apart from rounding, such an input equals its instrument.
         direct = np.array([a == b for a, b in zip(u, z, strict=True)])
         room = np.where(direct, 1.0, 1.0 - c * own)[:, None, :]
         aside = np.where(direct, 0.0, np.abs(np.swapaxes(crossed, 1, 2)) * c[:, None, :]) / room

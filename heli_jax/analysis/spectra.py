@@ -150,7 +150,7 @@ def cross_spectra(
     """Transform all records in Hann windows, each segment without its mean, to any frequencies.
 
     Args:
-        records: the same c signals in each, (c, N) with any N; no sample missing.
+        records: the same c signals in each, (c, N) with any N, without missing samples.
         dt: time between samples [s].
         omega: (k,) [rad/s], above zero and below the Nyquist frequency.
         seconds: length of a segment [s]; shorter records are left out.

@@ -375,9 +375,8 @@ def signals(
     """Return the columns of the model's inputs or outputs, with units checked.
 
     Args:
-        model: the model.
         role: `inputs` or `outputs`.
-        stated: their sections by name.
+        stated: sections of the signals, by name.
         where: place of the section, for messages.
         gain: True if an input with a unit may be a plain number.
 

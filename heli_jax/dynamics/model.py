@@ -88,8 +88,7 @@ class Model(eqx.Module):
     `State` of derivatives per second. For batches use `jax.vmap`.
 
     `linear=True` states that `vector_field` and `output` are linear in (state, inputs) and zero at
-    zero. The exact zero-order-hold discretisation is then possible, with matrices from
-    differentiation.
+    zero. Discretisation is then exact, with matrices from differentiation.
 
     `axes`, `steady_flight` and `without_stand` are optional. By default they follow from the names
     of states and inputs: see `axes_of`.

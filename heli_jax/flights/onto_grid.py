@@ -432,7 +432,6 @@ def at_times(
     between samples.
 
     Args:
-        request: names of the signals, and options.
         signals: signals by key, SI, each on its own clock.
         holds: hold by input.
         times: times of the grid (M,) [s].

@@ -78,8 +78,8 @@ def wanders(signal: np.ndarray) -> bool:
     white noise; smoothed signals have more. Too few samples give False.
 
     Args:
-        signal: (N,), NaN where nothing is measured. Of repeated values, as from a slower sensor,
-            only the first counts.
+        signal: (N,), NaN where nothing is measured. Only the first of repeated values counts, as
+            from a slower sensor.
     """
     known = signal[np.isfinite(signal)]
     repeated = np.diff(known) == 0.0

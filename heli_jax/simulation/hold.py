@@ -79,7 +79,7 @@ def delays_of(
         floor = jnp.floor(jax.lax.stop_gradient(samples))
         whole.append(floor.astype(int))
         rest.append(samples - floor)
-    # Which inputs are delayed is static; the delays are not, so a fit changes them without
+    # The set of delayed inputs is static; the delays are not, so a fit changes them without
     # compiling.
     groups = tuple(distinct.index(k) if k in distinct else None for k in keys)
     return Delays(groups, tuple(whole), tuple(rest))

@@ -127,7 +127,7 @@ def _is_trimmed(trim: Trim) -> jax.Array:
 
 
 _Run = tuple[Scalars, dict[str, jax.Array], Any, list[jax.Array]]
-"""Results, trajectories (samples kept,), the last State, and whether each limit was left."""
+"""Results, trajectories (samples kept,), the last State, and True for each exceeded limit."""
 
 OK, DIVERGED, OUT_OF_RANGE, NOT_RUN = 0, 1, 2, 255
 MEANINGS = {OK: "ok", DIVERGED: "diverged", OUT_OF_RANGE: "out_of_range", NOT_RUN: "not_run"}

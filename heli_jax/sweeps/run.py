@@ -134,9 +134,7 @@ def run_sweep(
     """Run a checked sweep.
 
     Args:
-        job: the checked sweep.
         out: a directory for the store, or None for one in memory.
-        options: options for the execution.
         files: texts by name, written beside the store when it is made.
         attributes: attributes of the store; `seed` is 0 by default.
         notes: notes to report and to store.

@@ -122,8 +122,8 @@ def _sections(filter: Filter) -> tuple[_Section, ...]:
         return (_Section(2, omega, filter.q, 10.0 ** (-filter.attenuation / 20.0)),)
     if filter.kind == "biquad":
         return (_Section(2, omega, filter.q or _BUTTERWORTH),)
-    # n equal lags are 3 dB down together where each is 3/n dB down, so each is faster by this
-    # factor (CUTOFF_CORRECTION_PT2 and PT3 of Betaflight's filter.c).
+    # n equal lags are 3 dB down together where each is 3/n dB down. Each is therefore faster by
+    # this factor (CUTOFF_CORRECTION_PT2 and PT3 of Betaflight's filter.c).
     n = int(filter.kind[-1])
     return (_Section(1, omega / math.sqrt(2.0 ** (1.0 / n) - 1.0)),) * n
 

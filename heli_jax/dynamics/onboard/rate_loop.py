@@ -198,8 +198,8 @@ class _RateLoop(Device):
         params: dict[str, Quantity] = {}
         states: dict[str, Quantity] = {}
         for stick, rate in loops:
-            # The loop's stick has the name and unit of the input that it drives, so a log of sticks
-            # fits the model with and without the loop.
+            # The loop's stick has the name and unit of the input that it drives. A log of sticks
+            # therefore fits the model with and without the loop.
             unit = naming.unit(model.Inputs, stick), _unit_of(model, rate)
             params |= _gains(stick, *unit, law)
             if law.integral:
