@@ -144,8 +144,8 @@ def logged(
 def compare(
     model: Model, flight: Flight, truth: dict[str, float], method: str
 ) -> dict[str, tuple[bool, float]]:
-    """Return for each error whether its interval contains the truth, and the
-    estimate's error [sd].
+    """Return for each error: True if its interval contains the truth, and the estimate's error
+    [sd].
     """
     params = model.Params()
     noise = free_noise(model, params, (flight,)) if method == "filter-error" else {}

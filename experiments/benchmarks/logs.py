@@ -6,9 +6,9 @@ reader has a process of its own, in turn with the other library's:
 
     python experiments/benchmarks/logs.py --minutes 10 --megabytes 50
 
-prints the best elapsed and processor times, their ratios to the other library's, and the largest
-memory beyond the imports in multiples of the file size. On a busy computer use the processor time.
-Use --minutes 120 for two hours.
+prints the best elapsed and processor times, and their ratios to the other library's. It also prints
+the largest memory beyond the imports, in multiples of the file size. On a busy computer use the
+processor time. Use --minutes 120 for two hours.
 """
 
 import argparse
