@@ -173,7 +173,7 @@ def doublet(model: Any, stick: str, N: int) -> Any:
 
 
 def doublet_tic(found: dict[str, float]) -> float:
-    """Return the worse of Theil's coefficients for a doublet on each cyclic stick, without gusts."""
+    """Return the worse of Theil's coefficients for a doublet on each cyclic stick, in still air."""
     model, vehicle = models()[0], naming.asdict(linear_vehicle())
     N, worst = round(4.0 / DT), 0.0
     for stick in ("lat", "lon"):

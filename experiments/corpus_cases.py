@@ -1,4 +1,4 @@
-"""Cases of corpus.py: each has a name, a group that shares compiled programs, and the right answer."""
+"""Cases of corpus.py, with names, the right answers, and groups that share compiled programs."""
 
 import contextlib
 import functools

@@ -174,7 +174,7 @@ def _silent(case: Any, result: Result) -> bool:
 
 
 def firing_table(cases: Sequence[Any], results: Mapping[str, Result]) -> list[str]:
-    """Return a row per code: rank, sound cases, wrong ones, unsound cases, alone, expected words."""
+    """Return a row per code: rank, sound cases, wrong ones, unsound cases, alone, expected."""
     ranks = ("exit", "doubt", "note")
     rows: dict[str, list[int]] = {}
     where: dict[str, str] = {}

@@ -72,7 +72,7 @@ def stated(seed: int, method: str) -> np.ndarray:
 
 @functools.cache
 def doublets() -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return for each stick the outputs (k,) at the truth over their noise, and derivatives (k, q)."""
+    """Return by stick the outputs (k,) at the truth over their noise, and derivatives (k, q)."""
     model, vehicle = study.models()[0], naming.asdict(study.linear_vehicle())
     names, N, made = list(study.truths()), round(4.0 / study.DT), []
     for stick in ("lat", "lon"):

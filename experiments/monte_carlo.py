@@ -97,7 +97,7 @@ def undisturbed(params: Any) -> Any:
 
 
 def fisher(params: Any, records: int = 5) -> dict[str, float]:
-    """Return the relative Cramer-Rao sd of filter error at the truth, a bound for unbiased methods."""
+    """Return the relative Cramer-Rao sd of filter error at the truth (for unbiased methods)."""
     free = {n: Free(float(getattr(params, n))) for n in FREE}
     sds = []
     for seed in range(records):

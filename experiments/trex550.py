@@ -75,7 +75,9 @@ def first_order() -> tuple[Model, Any, dict[str, Free]]:
 
 
 def flybarless(path: str, *, feedforward: bool) -> tuple[Model, Any, dict[str, Free]]:
-    """Return the configuration's rotor, servo, rate loop and delay, with feed-forward if requested."""
+    """Return the configuration's rotor, servo, rate loop and delay, optionally with
+    feed-forward.
+    """
     changes: dict[str, Any] = {f"flights.{i}.log": str(Path(path).resolve()) for i in range(3)}
     if feedforward:
         changes["onboard.rate_loop.feedforward"] = True

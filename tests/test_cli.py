@@ -239,7 +239,7 @@ def test_an_input_that_never_moves(bench):
 
 
 def test_missing_samples(bench, capsys):
-    """Test that a few missing samples are skipped with a note, and that too few left are an error."""
+    """Test that a few missing samples are skipped with a note; too few left are an error."""
     log = bench.parent / "bench.csv"
     head, *rows = log.read_text().splitlines()
     at = head.replace('"', "").split(",").index("phi")
@@ -388,7 +388,7 @@ def test_an_interrupt_while_the_command_is_imported(tmp_path):
 
 
 def test_interrupts_after_the_end_are_nothing(tmp_path):
-    """Test an interrupt while Python shuts down, which takes a second and could show a traceback."""
+    """Test an interrupt while Python shuts down, which takes a second."""
     script = "import atexit; atexit.register(signal.raise_signal, signal.SIGINT)\n"
     process = as_program(f"{script}cli._info = lambda options: 0", ["info", "log.csv"], tmp_path)
     assert process.communicate(timeout=30) == ("", "")

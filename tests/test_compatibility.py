@@ -140,9 +140,7 @@ def test_what_a_fit_says_of_the_sensors(folder):
     assert [d.code for d in sound.doubts[1:]] == ["of.fit"]
     assert sound.corrections["signals"]["roll"]["delay"] == 0.04
     assert sound.corrections["not_determined"] == ["b_r"]
-    assert (
-        compatibility._agreement(sound).doubts == sound.doubts[:1]
-    )  # the page has those of the fit
+    assert compatibility._agreement(sound).doubts == sound.doubts[:1]  # also on the fit's page
     bad = judged({"phi": 0.99, "psi": 0.2})
     assert not bad.compatible
     assert not bad.corrections["signals"]

@@ -18,7 +18,7 @@ XCELL = str(ROOT / "configs" / "vehicles" / "x-cell-60.yaml")
 
 @pytest.fixture
 def made(tmp_path):
-    """Return made(key=value, ...), the table of a run of two seconds with these keys in `simulate`."""
+    """Return made(key=value, ...), the table of two seconds with these keys in `simulate`."""
 
     def made(model="helicopter-consistent", disturbance=None, **simulate):
         path = tmp_path / "xcell.yaml"

@@ -188,9 +188,7 @@ def test_degrees_that_are_read_as_radians_are_said(config, tmp_path):
 
 def test_what_chance_makes_of_few_averages_sets_no_axes():
     omega = np.geomspace(1.0, 100.0, 120)
-    coherence = np.where(
-        omega < 20.0, 0.9, 0.15
-    )  # eight averages have a coherence of an eighth by chance
+    coherence = np.where(omega < 20.0, 0.9, 0.15)  # 1/8 by chance
     pair = Pair(1.0 / (1j * omega), np.full(120, 1e-3), coherence)
     few, many = (seen_of(omega, pair, averages) for averages in (8.0, 100.0))
     assert few[omega < 15.0].all()

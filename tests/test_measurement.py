@@ -126,7 +126,7 @@ def test_a_filter_that_is_not_modelled_is_a_caution(load, tmp_path):
             False,
             ["sigma_y"],
             False,
-        ),  # intervals of frequency error allow for it
+        ),  # its intervals allow for it
     ],
 )
 def test_given_noise_that_a_low_pass_coloured_is_a_caution(

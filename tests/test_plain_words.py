@@ -36,7 +36,9 @@ def docstrings() -> Iterator[tuple[str, str]]:
 
 
 def prose(page: Path) -> Iterator[str]:
-    """Yield paragraphs, items and cells of a page without headings, with code replaced by `code`."""
+    """Yield paragraphs, items and cells of a page without headings; code becomes the word
+    `code`.
+    """
     text = page.read_text("utf-8")
     text = re.sub(r"^ *```.*?^ *```|<!--.*?-->", "", text, flags=re.DOTALL | re.MULTILINE)
     text = re.sub(r"^(?:    |#).*$", "", text, flags=re.MULTILINE)
