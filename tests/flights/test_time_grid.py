@@ -197,11 +197,10 @@ def test_a_flight_at_a_lower_rate_keeps_the_impulse_of_its_stick(tmp_path):
 
 
 def _heave(tmp_path, fine, rate, follows):
-    """Return stick, acceleration and vertical rate of a heaving rotor with inflow, and its
-    response.
+    """Return a flight of a heaving rotor with inflow, and its response to the logged stick.
 
-    The flight is at `rate` [Hz], from a log of `fine` [Hz] whose stick jumps; the response is to
-    that stick.
+    The flight is at `rate` [Hz], from a log of `fine` [Hz] whose stick jumps. Outputs are
+    acceleration and vertical rate.
     """
     A, B = np.array([[-0.55, 6.0], [0.0, -1 / 0.11]]), np.array([[-28.0], [1.26 / 0.11]])
     # The acceleration, and its integral.
