@@ -112,7 +112,7 @@ def test_what_cannot_be_ends_in_a_sentence(written, content):
 
 
 def test_the_log_of_a_model_with_a_delay_holds_what_was_commanded(written, tmp_path):
-    """Test that the delay of inputs is kept in a fit."""
+    """Test that a log has commanded inputs; with delayed ones a fit would find no delay."""
     content = yaml.safe_load((FILES / "heave.yaml").read_text())
     content["parameters"]["tau"] = {"value": 0.13, "unit": "s"}
     content["delays"] = {"col": "tau"}

@@ -80,7 +80,7 @@ def test_a_large_matrix_of_parameters_is_made_once():
     p, u = jnp.arange(4.0).reshape(2, 2), jnp.arange(100.0)
     values, rest = hoisted(function, p, u, jnp.asarray(0.0))
     left = str(jax.make_jaxpr(rest)(values, u, jnp.asarray(0.0)))
-    # Delayed operations repeat their number, as do additions to a record: neither is hoisted.
+    # Arrays that repeat one number are not stored, only the number.
     assert "scatter" not in left
     assert "dot_general" not in left
     assert sorted(np.shape(v) for v in values) == [(), (9,)]
