@@ -35,7 +35,7 @@ def truth(seed):
 
 
 def record(seed, *, slow):
-    """Return a flight whose roll is measured every 0.2 s with jitter, at `slow`."""
+    """Return a flight whose roll is measured every 0.2 s with jitter, if `slow`."""
     u, made = truth(seed)
     rng = np.random.default_rng(seed + 1000)
     rate = made["roll_rate"][::FINE] + NOISE["roll_rate"] * rng.standard_normal(N)

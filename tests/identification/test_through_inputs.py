@@ -81,7 +81,7 @@ def verdicts(problem):
     at = Solution(*guess[:4])
     e = evaluate(at.layout, at.data, at.noise, at.z)
     inputs = through_inputs(at, e)
-    # Directions without information would scale rounding up to the size of the others.
+    # Noise parameters need exact zeros, since scaling would enlarge rounding.
     assert not inputs.J[:, [at.layout.disturbance_at(n) for n in ("sigma_w", "tau_w")]].any()
     return verdict_of(problem, at.layout, e), verdict_of(problem, at.layout, inputs)
 

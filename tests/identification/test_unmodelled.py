@@ -142,7 +142,7 @@ CHANGES = "dynamics.changes-over-record"
         (with_payload, "output-error", 0.3, FOLLOWS, True),
         (with_payload, "frequency-error", 0.3, FOLLOWS, True),
         (saturated, "frequency-error", 0.02, AMPLITUDE, True),
-        # Powers of stick and response do not show play, so the cause of the residual is open.
+        # Powers of stick and response do not describe play, so the result is open.
         (through_play, "output-error", 0.02, AMPLITUDE, None),
         (to_one_side, "output-error", 0.02, AMPLITUDE, None),
         (with_dry_friction, "output-error", 0.02, AMPLITUDE, None),
@@ -225,7 +225,7 @@ def drawn(rng, noise):
 
 
 def of_lines(rng):
-    """Test a turning rotor: two lines above white noise."""
+    """Return noise of a turning rotor: two lines above white noise."""
     t = np.arange(N) * DT
     return rng.standard_normal(N) + 3.0 * np.sin(31.0 * t) + 2.0 * np.sin(6.1 * t + 1.0)
 
@@ -275,7 +275,7 @@ def test_the_answer_through_a_filter_is_found_where_it_is():
 
 
 def wandering(rng):
-    """Return a gust residual: slow, and far larger than its change per sample."""
+    """Return a residual of gusts: slow, and far larger than each sample's innovation."""
     return scipy.signal.lfilter([1.0], [1.0, -1.99, 0.9905], rng.standard_normal(N))
 
 
@@ -293,7 +293,7 @@ def test_a_hole_in_the_record_makes_no_answer():
         p.append(strongest([lines_of(*columns, [700])], STICK).p_value)
         joined.append(strongest([lines_of(*columns)], STICK).p_value)
     assert np.sum(np.array(p) < 0.01) < 3
-    # As if no sample were missing, most are responses.
+    # Without the gap's position most are taken for responses.
     assert np.sum(np.array(joined) < 0.01) > 10
 
 
