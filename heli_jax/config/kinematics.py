@@ -145,7 +145,6 @@ def prepared(model: Model, flight: Flight, where: str) -> Flight:
 
     Args:
         model: any model; only a kinematic one changes the flight.
-        flight: the flight.
         where: place in the configuration, for messages.
 
     Raises:
@@ -210,7 +209,6 @@ def noise_of(model: Model, flights: Sequence[Flight]) -> dict[str, float]:
 
     Args:
         model: from `heli_jax.dynamics.kinematics`.
-        flights: the flights.
     """
     known, noise = naming.names(model.Params), {}
     for parameter, names in NOISES.items():
@@ -238,8 +236,6 @@ def free_noise(model: Model, params: Record, flights: Sequence[Flight]) -> dict[
 
     Args:
         model: any model; empty unless it is kinematic.
-        params: its parameters.
-        flights: the flights.
     """
     if not is_kinematic(model):
         return {}
@@ -258,7 +254,6 @@ def sharpened(model: Model, flight: Flight) -> Flight:
 
     Args:
         model: any model; only a kinematic one changes the flight.
-        flight: the flight.
     """
     if not is_kinematic(model):
         return flight
@@ -284,7 +279,6 @@ def substeps_of(model: Model, flights: Sequence[Flight]) -> int:
 
     Args:
         model: from `heli_jax.dynamics.kinematics`, bare or with devices around it.
-        flights: the flights.
     """
     step = _EXPLICIT if model.explicit else _STEP
     return max(1, *(math.ceil(f.dt / step - 1e-9) for f in flights))

@@ -71,7 +71,6 @@ def read_flights(experiment: Experiment, *, gain: bool = False) -> tuple[Flight,
     """Read the flights of a configuration, in SI.
 
     Args:
-        experiment: the configuration.
         gain: True if an input with a unit may be a plain number: an estimated gain then carries the
             unit.
 
@@ -227,7 +226,6 @@ def as_configured(experiment: Experiment, selection: Selection) -> Selection:
     """Return the selection of a log, completed by a configuration's first flight.
 
     Args:
-        experiment: the configuration.
         selection: overrides the configuration's rate, flight and clock. Without signals of its own,
             the columns are the model's inputs and outputs, in SI.
 
@@ -497,7 +495,6 @@ def _with_instruments(flight: Flight, instruments: Mapping[str, Signal]) -> Flig
     """Separate the instruments of a flight from its inputs.
 
     Args:
-        flight: the flight.
         instruments: names from `_instrument_signals`.
     """
     if not instruments:

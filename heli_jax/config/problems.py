@@ -284,8 +284,6 @@ def _first_guesses(
     """Return the free parameters with their starts, and the equation-error result or None.
 
     Args:
-        experiment: the configuration.
-        flights: its flights.
         free: free parameters of the configuration; NaN where a start is left out.
     """
     config, path = experiment.config.fit, experiment.path
@@ -345,7 +343,6 @@ def _instrument_for(config: FitConfig, method: str) -> tuple[str, ...] | None:
 
     Args:
         config: section whose `instrument` may apply to the start, or to a method of `also`.
-        method: the method.
     """
     others = [m for m in (config.start, *config.also) if m in METHODS]
     if objective_of(method).noise_model == "spectrum" or not any(

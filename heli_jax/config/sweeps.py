@@ -53,7 +53,6 @@ def sweep_job(
     """Return the sweep of a configuration, checked, with its logs and tables read.
 
     Args:
-        experiment: the configuration.
         made: flight made by `simulate`; by default the logs are read.
         trimmed: steady flight in which each run of `made` begins.
         pilot: attitude feedback of the simulated pilot, if any.

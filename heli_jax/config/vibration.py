@@ -155,7 +155,6 @@ def _rotor_doubt(vibration: VibrationConfig, speed: float) -> tuple[Finding, ...
     """Return a finding if a rotor's stated speed is implausible, or its unit is not stated.
 
     Args:
-        vibration: the section.
         speed: stated speed [rad/s].
     """
     if speed > _FASTEST_ROTOR:

@@ -193,7 +193,6 @@ def table_clock(
     """Return the clock, None without one, and True if its unit is a guess.
 
     Args:
-        table: the table.
         surveys: surveys of its columns.
         time: column of time stamps, if stated.
         unit: unit of the time stamps, if stated.
@@ -372,7 +371,6 @@ def with_runs(
     The columns are unchanged if the table has only one run.
 
     Args:
-        table: the table.
         clock: name of the clock.
         columns: columns of the table, with the clock.
         scale: unit of the stamps [s].

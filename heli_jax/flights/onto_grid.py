@@ -520,7 +520,6 @@ def _resampled_with(
     The output's samples alone would put it half a step early.
 
     Args:
-        signal: the output.
         inputs: held inputs that the output follows without delay, each with the result of
             `held_low_passed`.
         times: (M,) [s].

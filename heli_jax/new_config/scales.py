@@ -35,7 +35,6 @@ def scaled(
 
     Args:
         channel: name of the channel.
-        series: its samples.
         si: SI unit of the model's signal.
         full: count of the log's sticks at their stops, if known.
         is_input: True for a stick or a servo.

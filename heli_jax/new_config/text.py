@@ -60,8 +60,6 @@ def filtered_outputs(
 
     Args:
         name: name of the preset.
-        model: the model.
-        log: the log.
         asked: outputs to take from the preset; all if empty.
     """
     table, known = preset(name).signals, model_outputs()

@@ -150,7 +150,6 @@ def check(name: str, reduce: Reduce, outputs: tuple[str, ...], inputs: tuple[str
 
     Args:
         name: name of the result.
-        reduce: the result.
         outputs: names of the model's outputs.
         inputs: names of its inputs.
 
