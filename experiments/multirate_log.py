@@ -7,8 +7,8 @@ SciPy, and logged as an autopilot does. The gyro is at 400 Hz, after a digital l
 and 3 ms late. Attitude and stick are at 50 Hz; GPS velocity is at 5 Hz and 120 ms late. Stamps are
 off by a fifth of a step, and a fiftieth of the samples is lost. Each log is fitted with and without
 filter and delays in the measurement model; the filter is read from the log's parameters. The table
-has the mean error over the runs, its chance deviation from zero, and the scatter of the estimates,
-all in units of the stated sd. It also has the number of 95 % intervals with the truth.
+has the mean error, its chance deviation from zero, and the scatter of the estimates, in units of
+the stated sd. It also has the number of 95 % intervals with the truth.
 """
 
 import math

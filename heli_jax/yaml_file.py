@@ -60,8 +60,8 @@ def read_mapping(path: str | Path) -> dict[str, Any]:
     """Return the mapping in a YAML file.
 
     Raises:
-        InputError: the file is missing, above 1 MB, not a regular file, not a YAML mapping, has a
-            duplicate key, or is too deeply nested or too large with its aliases expanded.
+        InputError: the file is missing, above 1 MB, not a YAML mapping, has a duplicate key, or is
+            too large or too deeply nested (aliases expanded).
     """
     data = read_regular(path, "a YAML file (a configuration or a vehicle)", _LIMIT_BYTES)
     try:

@@ -8,18 +8,15 @@ Definitions for the response of an attitude to a stick, from ADS-33E-PRF (2000),
   that at w180;
 - bandwidth: the lesser of both for rate responses, the phase bandwidth for attitude command;
 - phase delay: (lag at 2 w180 - 180) / (57.3 * 2 w180), angles in degrees. If the phase is not
-  straight between w180 and 2 w180, the lag is that of a least-squares line.
+  straight between w180 and 2 w180, a least-squares line gives the lag.
 
-Intervals come from the delta method, with finite differences by all that the response depends on:
-the parameters of a fit, or the random errors of a measured response. The interval of a frequency is
-where the response's own interval contains the defining level.
+Intervals come from the delta method, with finite differences by a fit's parameters or by a measured
+response's random errors. The interval of a frequency is where the response's interval contains the
+defining level.
 
-Checked against publications about the standard, not against its text. Ham, Gardner and Tischler
-(1993), Flight testing and frequency domain analysis for rotorcraft handling qualities
-characteristics: the attitude's response to the stick, or a rate's over s; the phase delay by two
-points or by least squares from the neutral stability frequency to its double (CIFER weights that
-line by coherence; here it is not weighted). Frost and others (2002), AIAA 2002-4869: 45 deg of
-phase margin for attitude command, the lesser of that and 6 dB of gain margin for rate responses.
+These were checked against publications, not against the standard's text. Ham, Gardner and Tischler
+(1993) give the response and the phase delay; CIFER also weights the line by coherence. Frost and
+others (2002), AIAA 2002-4869, give both bandwidths.
 """
 
 from typing import Literal, NamedTuple

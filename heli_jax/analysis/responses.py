@@ -252,24 +252,16 @@ def student95(freedom: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     return scipy.special.stdtrit(np.maximum(freedom, 1.0), 0.975)
 
 
-# Errors that windows add to a response at the ends of a record.
-#
-# For a response y = h * u, a window w gives, by Taylor's series of w(t + tau),
-#
-#     Y_w = H U_w + i H' U_w' + ...,
-#
-# where U_w' is the input with the window's derivative and H' the derivative of H by frequency. In
-# windows that overlap by two thirds the second terms cancel, with two exceptions. One is the ends
-# of a record and of each part between missing samples. The other is input power that a window's
-# width brings from another frequency (the flanks of a sine, frequencies beyond a sweep). Only H' is
-# unknown.
-#
-# Let e be the part of U_w' that counts as the input. To first order, a measured response is that at
-# omega + i e. H' is the slope of a straight line through responses at such points. For a single
-# sine the points coincide and H' is unknown: it may be anything that windows of that length
-# resolve.
-#
-# Source: Pintelon and Schoukens (2012), chapter 6.
+# Errors that windows add to a response at the ends of a record. For y = h * u, Taylor's series of
+# the window w(t + tau) gives Y_w = H U_w + i H' U_w' + ... . U_w' is the input with the window's
+# derivative, H' the derivative of H by frequency. In windows that overlap by two thirds the second
+# terms cancel, with two exceptions. One is the ends of a record and of each part between missing
+# samples. The other is input power that a window's width brings from another frequency (the flanks
+# of a sine, frequencies beyond a sweep). Only H' is unknown. Let e be the part of U_w' that counts
+# as the input. To first order, a measured response is that at omega + i e. H' is the slope of a
+# straight line through responses at such points. For a single sine the points coincide and H' is
+# unknown: it may be anything that windows of that length resolve. Source: Pintelon and Schoukens
+# (2012), chapter 6.
 
 
 _LINES = 2.5
@@ -297,8 +289,8 @@ def without_ends(
     ends: Complex[np.ndarray, "k m m"],
     seconds: float,
 ) -> tuple[Complex[np.ndarray, "k l m"], Float[np.ndarray, "k l m"]]:
-    """Return, to first order, the errors that windows add at the ends of records and on the flanks
-    of held inputs, and the responses' standard deviation.
+    """Return the errors from windows at the ends of records and on the flanks of held inputs, to
+    first order, and the responses' sd.
 
     Args:
         omega: frequencies [rad/s], rising.

@@ -12,8 +12,8 @@ effect of a stiff hub. It raises the blade's frequency above $\Omega$, and a fre
 against the rotor's sense.
 
 Two effects are neglected: the blade's second derivative, at most $\gamma/16$ of the other terms,
-and coning. The rotor is a seesaw, whose blades do not cone. With a coning angle $a_0$, speed v to
-the right and u forward, a rotor tilts further by $-\tfrac43\frac{v}{R\Omega}a_0$ in a1 and
+and coning, which a seesaw rotor does not have. With a coning angle $a_0$, speed v to the right and
+u forward, a rotor tilts further by $-\tfrac43\frac{v}{R\Omega}a_0$ in a1 and
 $-\tfrac43\frac{u}{R\Omega}a_0$ in b1. The X-Cell 60's thrust would cone free blades by 1.3 degrees.
 At 10 m/s this adds -0.17 degrees of b1 to the modelled -0.15. In trim the lateral stick compensates
 it.

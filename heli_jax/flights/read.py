@@ -94,7 +94,7 @@ def read_parts(
 
     Returns:
         The unchanged run if it has no such gap, else its parts, named `NAME, part 1` and so on.
-        Parts of less than 2 s or 50 samples are left out, and so are parts without a moving input
+        Parts of less than 2 s or 50 samples are left out. Parts without a moving input are left out
         if an input moves in others. The notes of the first part list what was left out.
 
     Raises:

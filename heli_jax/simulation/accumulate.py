@@ -96,8 +96,8 @@ def accumulated(
             solver, substeps, block, adjoint and hold.
 
     Raises:
-        ValueError: as for `simulate`; a block below 1, or above 1 for a solver that is not exact;
-            an option that only `simulate` has.
+        ValueError: as for `simulate`; a block below 1, or above 1 without the exact solver; an
+            option of `simulate` only.
         TypeError: an unknown option.
     """
     options = keywords.pop("options", DEFAULT).changed(keywords)

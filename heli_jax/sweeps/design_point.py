@@ -146,8 +146,8 @@ _BLOCK = 4
 # each: 7.5 and 8.0 us a vehicle with 2, 7.9 with 3, 8.4 with 4.
 _FUSED_BLOCK = 2
 # Number of states and inputs above which a step is one sample. hybrid-flybarless has 15: 3000
-# samples of a vehicle took 119 us with 1 and 187 with 2, by XLA 116 and 140 (processor time, AVX2,
-# busy computer, medians of four). Values between 5 and 15 were not measured.
+# samples of a vehicle took 119 us with 1 and 187 with 2, by XLA 116 and 140. These are medians of
+# four processor times (AVX2, busy computer). Values between 5 and 15 were not measured.
 _FUSED_BLOCK_FITS = 8
 
 

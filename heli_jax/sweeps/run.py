@@ -96,7 +96,6 @@ def sweep(
     """Run a model once for every element of a design, and keep numbers of each run.
 
     Args:
-        model: the model to simulate.
         params: the model's Params, SI; the axes of the design override them.
         flights: inputs of the runs, and outputs for results that compare with them. With several
             flights each result has a dimension `flight`.

@@ -339,8 +339,8 @@ def states_behind(model: Model) -> frozenset[str]:
 
 @functools.cache
 def line_order(delay: float) -> int:
-    """Return the order of a fixed delay's line: the smallest with error below 0.1 % up to 25 Hz, at
-    most four.
+    """Return the smallest order of a fixed delay's line with an error below 0.1 % up to 25 Hz, at
+    most 4.
 
     Args:
         delay: [s].

@@ -43,14 +43,11 @@ def with_rate_loop(
     feedforward: bool = True,
     lag: bool = False,
 ) -> Model:
-    r"""Return the model with a flybarless unit, whose PI loops and feed-forward track commanded
-    rates.
+    r"""Return the model with a flybarless unit: PI loops and a feed-forward track commanded rates.
 
-    The loop uses the rate that a gyro on the body measures. This is p, q or r if the model has
-    Euler angles (`Model.body_rates`), otherwise the state that is the axis's rate.
-
-    $\delta = K_{ff} r_c + K_p (r_c - r) + K_i \int (r_c - r)\,dt$ with the command $r_c = K_c u$,
-    stick u and rate r. The stick has the unit of the input that it replaces.
+    $\delta = K_{ff} r_c + K_p (r_c - r) + K_i \int (r_c - r)\,dt$ with $r_c = K_c u$, stick u and
+    rate r. The stick has the unit of the input that it replaces. The rate is that of a gyro on the
+    body: p, q or r if the model has Euler angles (`Model.body_rates`), otherwise the axis's rate.
 
     New parameters, with `STICK` the input's name: `Kc_STICK` [the rate's unit per unit of stick],
     `Kp_STICK`, `Ki_STICK`, `Kff_STICK`, with a lag `tau_gyro_STICK` [s]. New states: the integral
