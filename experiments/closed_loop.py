@@ -6,7 +6,7 @@ A pilot flies a vehicle in roll, p' = Lp p + Lda da + gusts. He holds the bank a
 0.1 s and adds test steps. Each record is fitted by output error, and by filter error with a
 disturbance on roll. The table has the mean relative error of Lp and Lda over the runs, and the
 number of runs in which the loop was detected. With `delay` the aileron acts 60 ms after the stick.
-That delay is then free too, with the five starts of a free delay. The frequency domain is in
+The delay is then free too, with the five starts of a free delay. The frequency domain is in
 closed_loop_frequency.py.
 """
 

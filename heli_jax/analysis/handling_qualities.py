@@ -15,8 +15,9 @@ response's random errors. The interval of a frequency is where the response's in
 defining level.
 
 These were checked against publications, not against the standard's text. Ham, Gardner and Tischler
-(1993) give the response and the phase delay; CIFER also weights the line by coherence. Frost and
-others (2002), AIAA 2002-4869, give both bandwidths.
+(1993), Flight testing and frequency domain analysis for rotorcraft handling qualities
+characteristics, give the response and the phase delay. CIFER also weights the line by coherence.
+Frost and others (2002), AIAA 2002-4869, give both bandwidths.
 """
 
 from typing import Literal, NamedTuple

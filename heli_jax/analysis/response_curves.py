@@ -358,11 +358,11 @@ def unnoticeable(omega: Float[np.ndarray, " k"]) -> Envelope:
     Args:
         omega: frequencies (k,) [rad/s].
 
-    Source: Wood and Hodgkinson (1980), Acceptable levels of mismatch for equivalent systems of
-    augmented CTOL aircraft, MDC A6792, as in MIL-STD-1797A and Tischler and Remple (2012). The
-    coefficients are those of LoesBound by C. Regan (2006), which were not compared with the
-    reports. Some sources add a lead and a lag of a few milliseconds to the phase envelopes. They
-    are left out here, which gives narrower envelopes.
+    Source: Wood and Hodgkinson (1980), Definition of acceptable levels of mismatch for equivalent
+    systems of augmented CTOL aircraft, MDC A6792, as in MIL-STD-1797A and Tischler and Remple
+    (2012). The coefficients are those of LoesBound by C. Regan (2006), which were not compared with
+    the reports. Some sources add a lead and a lag of a few milliseconds to the phase envelopes.
+    They are left out here, which gives narrower envelopes.
     """
     s = 1j * omega
     gain = [20.0 * np.log10(np.abs(np.polyval(n, s) / np.polyval(d, s))) for n, d in _GAIN]

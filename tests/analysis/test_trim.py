@@ -190,7 +190,7 @@ def test_hover_banks_so_that_the_side_forces_balance(full, xcell):
     # The tail rotor pulls to the right (it turns the nose to the left), so the vehicle banks left.
     weight = second.FULL["m"] * second.FULL["g"]
     tail = weight * np.sin(-s["phi"]) * np.cos(s["theta"]) - weight * s["b1"]
-    assert tail == pytest.approx(3.52, rel=0.05)  # as models.md has it
+    assert tail == pytest.approx(3.52, rel=0.05)  # as in models.md
     assert np.degrees(-s["phi"]) == pytest.approx(2.3, abs=0.3)
     assert s["Omega"] == pytest.approx(157.1)
     assert u["x_throttle"] == pytest.approx(1.0)

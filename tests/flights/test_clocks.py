@@ -109,7 +109,7 @@ def test_times_in_ms_are_not_taken_in_seconds(tmp_path, step, rows):
         assert f.dt == pytest.approx(scale * step)
 
 
-# Which column is the clock.
+# Choice of the clock's column.
 
 
 @pytest.mark.parametrize(

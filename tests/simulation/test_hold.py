@@ -47,7 +47,7 @@ class Inputs(NamedTuple):
 class Outputs(NamedTuple):
     q: float
     az: float
-    """with direct feed-through"""
+    """Model with direct feed-through."""
 
 
 def field(p, s, u):

@@ -68,7 +68,7 @@ def test_xarray_reads_the_store_by_itself(whole):
     assert json.loads(found.attrs["description"])["design"]["n"] == 300
     np.testing.assert_array_equal(found["a"], DESIGN.values(0, 300)["a"])
     assert not found["status"].any()
-    # An interrupt reads from this whether anything is stored.
+    # An interrupt uses this number to state if anything is stored.
     assert len(list(whole.glob(stores.FINISHED))) == 10
     assert np.isfinite(found["rms"]).all()
 

@@ -102,7 +102,7 @@ class _Section(NamedTuple):
 
     order: int
     omega: float
-    """[rad/s]"""
+    """Corner frequency [rad/s]."""
     q: float = _BUTTERWORTH
     left: float | None = None
     """Gain of a notch at its centre; None for a low-pass."""
