@@ -313,9 +313,7 @@ def _prepare_jax(cpu_devices: int | None = None) -> None:
 
 
 def _private_cache() -> str | None:
-    """Return the cache folder, or None if it does not belong to this user alone. Cached programs
-    are executable code.
-    """
+    """Return the cache folder if this user alone can write it: it contains executable code."""
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "heli_jax"
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)

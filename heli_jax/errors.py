@@ -79,8 +79,7 @@ def nearest(name: str, known: Iterable[str], otherwise: str | None = None) -> st
 
 
 def require_known(names: Iterable[Any], known: Iterable[str], where: str, what: str) -> None:
-    """Refuse unknown names in a file: `fit.yaml: fit.free: model roll has no parameter 'Ixy'; did
-    you mean 'Ixx'?`.
+    """Raise if a file has unknown names, with the nearest known name in the message.
 
     Raises:
         InputError: a name is unknown.

@@ -207,9 +207,7 @@ def _run(
     driven: dict[str, np.ndarray],
     where: str,
 ) -> tuple[Trajectory, dict[str, Any]]:
-    """Return the run as NumPy arrays without measurement noise, and its commanded inputs. All have
-    the same number of samples.
-    """
+    """Return the run as NumPy arrays without measurement noise, and its commanded inputs."""
     # Missing constants are NaN. Without this check the message would only be "not finite".
     with experiment.located(""):
         require_constants(experiment.model, experiment.vehicle.params)

@@ -94,8 +94,7 @@ class HandlingQualities(NamedTuple):
 
 
 def handling_qualities(curve: Curve, kind: Kind = "rate") -> HandlingQualities:
-    """Return bandwidth and phase delay of an attitude's response, or crossover and margins of a
-    loop.
+    """Return bandwidth and phase delay of an attitude, or crossover and margins of a loop.
 
     Args:
         curve: the response of an attitude to a stick, or of an open loop for negative unity
@@ -241,8 +240,7 @@ def _derivatives(kind: Kind, response: _Response) -> dict[str, np.ndarray]:
 def _ends(
     response: _Response, name: str, values: dict[str, float], by: dict[str, np.ndarray]
 ) -> tuple[float, float]:
-    """Return the ends of a frequency's interval [rad/s], where the curve's band (Fieller) leaves
-    the level.
+    """Return a frequency's interval [rad/s], where the curve's band contains the level (Fieller).
 
     An end outside the band is infinite; unknown errors give NaN. The error over the slope is not
     used, since for a noisy curve the slope is less certain than the value.
@@ -350,9 +348,7 @@ def _put_bandwidth(kind: Kind, numbers: dict[str, Number], sentences: list[str])
 
 
 def _explain_loop(response: _Response, values: dict[str, float], sentences: list[str]) -> None:
-    """State why numbers of a loop are missing, and the gain reduction limit around an unstable
-    vehicle.
-    """
+    """State why numbers of a loop are missing, and the gain limit of an unstable vehicle."""
     if "crossover" not in values:
         sentences.append(_missing("crossover", "the gain does not fall through 0 dB in the band"))
     else:

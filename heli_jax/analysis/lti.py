@@ -109,9 +109,7 @@ def _polynomials(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> 
 
 
 def _numerator(A: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Return num of c (s - A)^-1 b by Leverrier's recursion, linear in b and c, without
-    cancellation.
-    """
+    """Return num of c (s - A)^-1 b by Leverrier's recursion, without cancellation."""
     n = A.shape[0]
     den = np.real(np.poly(A))
     num = np.zeros(n + 1)

@@ -74,8 +74,7 @@ class Spectra(NamedTuple):
 
 
 def segment_transforms(signals: Float[np.ndarray, "c N"], dt: float, length: int) -> Spectra:
-    """Transform half-overlapping, detrended segments in a Hann window (Welch 1967) to k = length //
-    2 + 1 frequencies from zero.
+    """Transform half-overlapping, detrended Hann segments (Welch 1967) to length // 2 + 1 lines.
 
     Args:
         dt: time between samples [s].

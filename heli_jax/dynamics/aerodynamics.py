@@ -313,9 +313,7 @@ def _climbing(c: Scalar, t: Scalar, b: Scalar) -> Scalar:
 
 
 def _windmill(c: Scalar, t: Scalar, b: Scalar) -> Scalar:
-    """Return the smaller root v [m/s] of 2 v (-c - v) = t - b v, a fast vertical descent; infinite
-    if there is none.
-    """
+    """Return the smaller root v [m/s] of 2 v (-c - v) = t - b v (fast descent), or infinity."""
     q = b - 2.0 * c
     inside = q * q - 8.0 * t
     there = (q > 0) & (inside > 0)

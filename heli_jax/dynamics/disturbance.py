@@ -203,8 +203,7 @@ def _pushed_unit(model: Model, state: str) -> str:
 
 
 def _felt(model: Model, added: tuple[Disturbance, ...]) -> tuple[tuple[str, str, float], ...]:
-    """Return the outputs that equal the derivative of a disturbed state, or its negative: name,
-    disturbing lag, sign.
+    """Return outputs that are plus or minus a disturbed derivative: name, disturbing lag, sign.
 
     They are found by two evaluations, as kinematics in `disturbable_states`. Units are compared
     too, since an output that is a state may have the same value.
@@ -291,9 +290,7 @@ class _Disturbed(NamedTuple):
         return self.State(**rates)
 
     def output(self, p: Record, s: Record, u: Record) -> Record:
-        """Return the model's outputs. A disturbance acts on them through the motion, and directly
-        on outputs that equal the disturbed derivative.
-        """
+        """Return the model's outputs, with the disturbance on those that equal its derivative."""
         outputs = self.model.output(p, self.undisturbed(s), u)
         # Without the disturbance in an accelerometer's output, a gust would look like
         # autocorrelated noise, and the filter would estimate a wrong size and time.

@@ -133,8 +133,7 @@ class HubLoads(NamedTuple):
 
 
 def hub_loads(p: Helicopter, T: Scalar, tilt: Tilt) -> HubLoads:
-    r"""Return the in-plane forces $-T a_1$ and $T b_1$ at the hub, and the moments $(k_\beta + T
-    h_r)$ times the tilt.
+    r"""Return the hub forces $-T a_1$ and $T b_1$, and the moments $(k_\beta + T h_r)$ times tilt.
 
     Args:
         p: vehicle, SI; k_beta is the stiffness of the whole hub.

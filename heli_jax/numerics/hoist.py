@@ -69,9 +69,7 @@ def hoisted(
 
 
 def _along(equation: Any) -> bool:
-    """True if one number is repeated along a record; reading it is free, but storing it takes a
-    record's memory.
-    """
+    """True if a number is repeated along a record, which is free to read but not to store."""
     return _repeats(equation) and equation.outvars[0].aval.ndim == 1
 
 

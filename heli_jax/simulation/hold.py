@@ -1,5 +1,4 @@
-"""Inputs between samples: constant (zero-order), on a straight line (linear), or mixed. A mixed
-input is held until it jumps and is linear elsewhere.
+"""Inputs between samples: held (zero-order), linear, or mixed (held until a jump, else linear).
 
 A stick that is commanded in steps is constant; one that was sampled while moving is not. Holding
 the latter delays it by half a sample on average.
