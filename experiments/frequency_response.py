@@ -109,8 +109,7 @@ def one_fit(
 def one_run(
     seed: int, move: Callable, sigma: float, window: float
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, float, float]]:
-    """Return for each method: relative errors, coverage, the bound, the time, and chi-squared's
-    result.
+    """Return by method: relative errors, coverage, the bound, the time, chi-squared's result.
 
     The last is 1 if chi-squared is in its expected interval, NaN if there is none.
     """

@@ -65,9 +65,7 @@ def _rate(params: Any, x: Any, u: Any) -> Rate:
 
 
 def first_order() -> tuple[Model, Any, dict[str, Free]]:
-    """Return p = K/(tau s + 1) lat, with a delay that may be negative, since the log's stick is
-    late.
-    """
+    """Return p = K/(tau s + 1) lat; the delay may be negative, since the log's stick is late."""
     bare = Model("first-order", _lag, _rate, Lag, Rate, Stick, Rate, linear=True)
     model = models.with_delays(bare, inputs=["lat"])
     start = model.Params(K=1.0, tau=0.1, delay_lat=0.0)
@@ -75,9 +73,7 @@ def first_order() -> tuple[Model, Any, dict[str, Free]]:
 
 
 def flybarless(path: str, *, feedforward: bool) -> tuple[Model, Any, dict[str, Free]]:
-    """Return the configuration's rotor, servo, rate loop and delay, optionally with
-    feed-forward.
-    """
+    """Return the configuration's rotor, servo, rate loop, delay and optional feed-forward."""
     changes: dict[str, Any] = {f"flights.{i}.log": str(Path(path).resolve()) for i in range(3)}
     if feedforward:
         changes["onboard.rate_loop.feedforward"] = True

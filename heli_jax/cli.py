@@ -313,7 +313,7 @@ def _prepare_jax(cpu_devices: int | None = None) -> None:
 
 
 def _private_cache() -> str | None:
-    """Return the cache folder if this user alone can write it: it contains executable code."""
+    """Return the cache folder if it is this user's own, since it contains executable code."""
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "heli_jax"
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)

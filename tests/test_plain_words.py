@@ -36,9 +36,7 @@ def docstrings() -> Iterator[tuple[str, str]]:
 
 
 def prose(page: Path) -> Iterator[str]:
-    """Yield paragraphs, items and cells of a page without headings; code becomes the word
-    `code`.
-    """
+    """Yield paragraphs, items and cells of a page, without headings and with code replaced."""
     text = page.read_text("utf-8")
     text = re.sub(r"^ *```.*?^ *```|<!--.*?-->", "", text, flags=re.DOTALL | re.MULTILINE)
     text = re.sub(r"^(?:    |#).*$", "", text, flags=re.MULTILINE)

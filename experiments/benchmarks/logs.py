@@ -75,9 +75,7 @@ def write_dataflash(path: Path, megabytes: float) -> None:
 
 
 def write_blackbox(path: Path, megabytes: float, single: bool) -> None:
-    """Write flights of 2 MB, one made frame by frame and then repeated, as on a card; or a `single`
-    one.
-    """
+    """Write a flight of 2 MB, repeated as on a card; or a `single` flight."""
     sys.path.insert(0, str(Path(__file__).parents[2]))
     from tests.flights.log_writers import blackbox
 

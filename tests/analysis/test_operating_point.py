@@ -23,9 +23,7 @@ STILL = dict.fromkeys(("x_roll", "x_pitch", "x_yaw", "x_throttle"), np.zeros(N))
 
 @pytest.fixture(scope="module")
 def hovering():
-    """Return the independent program's response of z to the throttle in hover, as a function of
-    omega.
-    """
+    """Return the independent program's z over throttle in hover, as a function of omega."""
     v = oracle.XCELL
     state, inputs = oracle.hover(v)["consistent"]
     A, h = oracle.jacobian("consistent", v, state, inputs), 1e-6

@@ -197,8 +197,7 @@ def test_hover_banks_so_that_the_side_forces_balance(full, xcell):
 
 
 def test_the_roll_mode_of_the_published_machine(full, xcell):
-    """Test the roll mode with inertias that match k_beta (Gavrilets, 2003): about 20 rad/s, as
-    published.
+    """Test the roll mode with inertias that match k_beta (Gavrilets, 2003): about 20 rad/s.
 
     The shipped file has a simulator's inertias.
     """

@@ -20,9 +20,7 @@ DT, N, L = 0.05, 600, 100
 
 
 def flights(noise: np.ndarray) -> list[Flight]:
-    """Return two inputs that move together and two outputs, one with a missing sample in one
-    flight.
-    """
+    """Return two correlated inputs and two outputs, one with a missing sample in one flight."""
     rng = np.random.default_rng(0)
     out = []
     for i, e in enumerate(noise):

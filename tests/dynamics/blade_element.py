@@ -11,9 +11,7 @@ import numpy as np
 
 
 def _mean(integrand, B, n_r=8, n_psi=64):
-    """Return the integral over r from 0 to B (Gauss-Legendre) of the mean over psi (trapezoid
-    rule).
-    """
+    """Return the integral over r (Gauss-Legendre) to B of the mean over psi (trapezoid rule)."""
     x, weight = np.polynomial.legendre.leggauss(n_r)
     r, psi = np.meshgrid((x + 1) * B / 2, np.arange(n_psi) * 2 * np.pi / n_psi, indexing="ij")
     return float(weight @ integrand(r, psi).mean(axis=1)) * B / 2
@@ -37,9 +35,7 @@ def thrust_coefficient(a, sigma, theta0, lam, mu=0.0, theta_s=0.0, theta_c=0.0, 
 def induced_torque_coefficient(
     a, sigma, theta0, lam, mu=0.0, theta_s=0.0, theta_c=0.0, chi=0.0, B=0.97
 ):
-    """Return the induced part of C_Q = Q / (rho pi R^5 Omega^2): lift tilted by lam/U_T, at arm
-    r.
-    """
+    """Return the induced part of C_Q = Q / (rho pi R^5 Omega^2): tilted lift at arm r."""
 
     def torque(r, psi):
         pitch, flow = _pitch_and_flow(r, psi, theta0, theta_s, theta_c, mu, chi)

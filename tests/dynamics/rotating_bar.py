@@ -22,9 +22,7 @@ XCELL = {
 
 
 def rates(v, t, y, roll, pitch, p, q):
-    """Return the derivatives of (beta, dbeta); `roll` and `pitch` are x/L5 [rad] of the fixed
-    swashplate.
-    """
+    """Return the derivatives of (beta, dbeta); `roll` and `pitch` are x/L5 [rad], not rotating."""
     beta, dbeta = y
     Om, chi = v["Omega"], v["Omega"] * t
     # 90 degrees of lead: roll right is most pitch at the nose, nose up is most pitch on the right
@@ -42,8 +40,7 @@ def rates(v, t, y, roll, pitch, p, q):
 
 
 def simulate(v, duration, roll=0.0, pitch=0.0, p=0.0, q=0.0, start=(0.0, 0.0)):
-    """Return the mean tilt (right, nose up) [rad] of the bar's disk in every turn, for constant
-    input.
+    """Return the mean tilt (right, nose up) [rad] of the disk by turn, for constant input.
 
     The tilt follows from beta = right sin(chi) + up cos(chi) and its derivative; `start` is (beta,
     dbeta).

@@ -21,9 +21,7 @@ def scattered(n, least_b=-1.5):
 
 
 def off(v, V2, W, T0, b):
-    """Return the relative error of roots v (n,): a Newton step in long double, slope by
-    differences.
-    """
+    """Return the relative error of roots v (n,), by a Newton step in long double."""
     v, V2, W, T0, b = (np.asarray(x, np.longdouble) for x in (v, V2, W, T0, b))
 
     def surplus(v):

@@ -17,9 +17,7 @@ LOOP = models.with_rate_loop(LATE, ["lat"], feedforward=False, integral=False)
 
 
 def body_rates(phi, theta, dphi, dtheta, dpsi):
-    """Return the body rates from the rotation matrix: the derivative of R is R times their cross
-    matrix.
-    """
+    """Return the body rates from the rotation matrix: R' = R times their cross matrix."""
 
     def turned(t):
         f, h, y = phi + dphi * t, theta + dtheta * t, dpsi * t

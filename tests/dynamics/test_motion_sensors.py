@@ -43,9 +43,7 @@ def followed(model, p, u, state):
 
 
 def to_earth(phi, theta, psi):
-    """Return the rotation from body axes (forward, right, down) to earth axes (forward, right,
-    down).
-    """
+    """Return the rotation from body to earth axes, both forward, right, down."""
     c, s = np.cos, np.sin
     yaw = np.array([[c(psi), -s(psi), 0], [s(psi), c(psi), 0], [0, 0, 1]])
     pitch = np.array([[c(theta), 0, s(theta)], [0, 1, 0], [-s(theta), 0, c(theta)]])

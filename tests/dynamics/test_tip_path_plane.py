@@ -65,9 +65,7 @@ def test_the_time_constant_is_that_of_the_blades():
 
 @pytest.mark.parametrize("axis", ["p", "q"])
 def test_the_rotor_stays_behind_a_body_that_turns(axis):
-    """Test the tilt about the axis of the turn; across it a tilt of rate over Omega is
-    neglected.
-    """
+    """Test the tilt about the turn's axis; across it a tilt of rate over Omega is neglected."""
     v = FULL | {"k_beta": 0.0}
     wanted = rotating.simulate(v, 12, **{axis: 0.5})[-1]
     found = settled(vehicle(k_beta=0.0), Tilt(0.0, 0.0), Rates(**{axis: 0.5}))

@@ -56,9 +56,7 @@ INPUTS = ("x_roll", "x_pitch", "x_yaw", "x_throttle")
 
 
 def flow_through(vi, V2, W):
-    """Return the flow through a rotor [m/s] as in `heli_jax.dynamics.aerodynamics`, vi above
-    zero.
-    """
+    """Return the flow through a rotor [m/s], as in `heli_jax.dynamics.aerodynamics`, for vi > 0."""
     q = max(0.0, (-W - 0.5 * vi) * (2.2 * vi + W))
     return np.sqrt(V2 + (W + vi) ** 2 + 0.37 * q**2 / (vi**2 + 5.8 * V2))
 

@@ -70,9 +70,7 @@ def test_what_cannot_be_told_is_refused():
 
 
 def written(tmp_path):
-    """Write sticks and p at 100 Hz; roll and p of a motion capture at 30 Hz have their own
-    clock.
-    """
+    """Write sticks and p at 100 Hz, and roll and p of a motion capture at 30 Hz."""
     x, t, s = motion(5), np.arange(4000) / 100, 7.0 + np.arange(900) / 30
     table = np.stack([t, np.sin(t), x(t)], axis=1)
     np.savetxt(tmp_path / "log.csv", table, delimiter=",", header="t,u,p", comments="")
@@ -154,9 +152,7 @@ def test_by_configuration(tmp_path):
 
 
 def one_clock(tmp_path, begins):
-    """Write a flight's sticks and rates, and its attitude in a separate file that starts at
-    `then` [s].
-    """
+    """Write sticks and rates, and the attitude in a separate file that starts at `then` [s]."""
     x = motion(3)
     t, late = 5.0 + np.arange(3000) / 100, begins + np.arange(1200) / 50
     rows = [f"{a:.3f},{np.sign(b):.1f},{b:.9f}" for a, b in zip(t, x(t), strict=True)]

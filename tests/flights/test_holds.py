@@ -40,9 +40,7 @@ def pilot(dt=DT, n=N):
 
 
 def doublets(ramp):
-    """Return a stick that takes `ramp` samples from stop to stop, not synchronous with the
-    clock.
-    """
+    """Return a stick with ramps of `ramp` samples, not synchronous with the clock."""
     corners, values = [0.0], [0.0]
     for start in np.arange(2.0037, T[-1] - 4, 3.0111):
         for level in (1.0, -1.0, 0.0):

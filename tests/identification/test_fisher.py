@@ -45,8 +45,8 @@ def gaussian(u, log_inertia, log_sigma):
 
 
 def information(u, z):
-    """Return the information of (log Ixx, log sigma_w): m_i' S^-1 m_j + 1/2 tr(S^-1 S_i S^-1
-    S_j).
+    """Return the information m_i' S^-1 m_j + 1/2 tr(S^-1 S_i S^-1 S_j) of (log Ixx, log
+    sigma_w).
     """
     h = 1e-4
     solve = np.linalg.inv(gaussian(u, *z)[1])

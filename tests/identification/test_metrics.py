@@ -87,9 +87,7 @@ def test_a_constant_signal_has_no_motion_to_explain():
 
 
 def test_free_initial_states_of_short_windows_do_not_colour_residuals_of_a_right_model():
-    """Test windows of 25 samples of an oscillator, each with two free states, projected out by
-    QR.
-    """
+    """Test windows of 25 samples of an oscillator, with free states projected out by QR."""
     n, window, rng = 1500, 25, np.random.default_rng(6)
     t = 0.02 * np.arange(window)
     free = np.exp(-0.4 * t) * np.stack([np.cos(4.5 * t), np.sin(4.5 * t)])

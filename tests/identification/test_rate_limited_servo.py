@@ -16,9 +16,7 @@ DT = 0.01
 
 
 def stick(n):
-    """Return doublets of random sizes at 1 kHz, whose edges are between the n samples of the
-    log.
-    """
+    """Return random doublets at 1 kHz, with edges between the n samples of the log."""
     rng, u, at = np.random.default_rng(5), np.zeros(10 * n), 200
     while at < 10 * n - 900:
         size, length = rng.uniform(0.15, 0.5) * rng.choice([-1, 1]), int(rng.integers(150, 400))

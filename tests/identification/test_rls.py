@@ -100,9 +100,7 @@ def test_silence_leaves_the_estimate_alone():
 
 @pytest.mark.parametrize("forgetting", [1.0, 0.95])
 def test_equations_31_and_33_agree(forgetting):
-    """Test that the gain with the old P over the denominator equals the new P times the
-    regressor.
-    """
+    """Test that the gain from the old P equals the new P times the regressor."""
     rng = np.random.default_rng(4)
     state, f = rls_init(5, 10.0), jnp.asarray(forgetting)
     step = jax.jit(rls_step)

@@ -46,9 +46,7 @@ def view(tmp_path_factory, vehicles_folder):
 
 
 def over_time(window):
-    """Return the group of figures over the log's time of one flight, checking their axes'
-    titles.
-    """
+    """Return the figures over log time of one flight, after a check of their axes' titles."""
     groups = window.value("[...heliCharts.groups.keys()]")
     [group] = [g for g in groups if g.startswith("time in the log [s], ")]
     label = "heliCharts.groups.get({}).some(u => u.axes[0].label === 'time in the log [s]')"

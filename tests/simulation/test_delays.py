@@ -82,9 +82,7 @@ def read(u, t, hold):
 
 
 def by_hand(u, delays, hold, linear, upto=N):
-    """Return theta and the felt acceleration (N,), integrated from corner to corner of the
-    inputs.
-    """
+    """Return theta and felt acceleration (N,), integrated between corners of the inputs."""
     holds = [hold.get(n, "zero-order") if isinstance(hold, dict) else hold for n in Inputs._fields]
     late = (*delays, 0.0)
 
@@ -116,9 +114,7 @@ def by_hand(u, delays, hold, linear, upto=N):
 
 @pytest.fixture(scope="module")
 def run():
-    """Return theta and the felt acceleration of a delayed model, compiled once per model and
-    hold.
-    """
+    """Return theta and felt acceleration of a delayed model, compiled once per model and hold."""
     compiled = {}
 
     def go(machine, u, delays, hold, **keywords):

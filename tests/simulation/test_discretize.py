@@ -57,9 +57,7 @@ step = jax.jit(van_loan)
 
 @given(st.integers(0, 10**6), st.floats(-6.0, 2.0), st.lists(st.integers(-9, 9), min_size=5))
 def test_a_step_is_the_exponentials(seed, size, powers):
-    """Test mean and covariance against exponentials of augmented matrices, also in extreme
-    units.
-    """
+    """Test mean and covariance against augmented exponentials, also in extreme units."""
     rng = np.random.default_rng(seed)
     d = 2.0 ** np.resize(powers, 5)
     A = (dense(seed) * d[:, None] / d[None, :]) * 10.0**size
