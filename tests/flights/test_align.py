@@ -152,7 +152,7 @@ def test_by_configuration(tmp_path):
 
 
 def one_clock(tmp_path, begins):
-    """Write sticks and rates, and the attitude in a separate file that starts at `then` [s]."""
+    """Write sticks and rates, and the attitude in a separate file that starts at `begins` [s]."""
     x = motion(3)
     t, late = 5.0 + np.arange(3000) / 100, begins + np.arange(1200) / 50
     rows = [f"{a:.3f},{np.sign(b):.1f},{b:.9f}" for a, b in zip(t, x(t), strict=True)]
