@@ -2,11 +2,11 @@
 
     .venv/bin/python experiments/closed_loop.py [RUNS] [delay]
 
-A vehicle in roll, p' = Lp p + Lda da + gusts, is flown by a pilot who holds the bank angle with a
-delay of 0.1 s and adds test steps. Each record is fitted by output error, and by filter error with
-a disturbance on roll. The table has the mean relative error of Lp and Lda over the runs, and the
+A pilot flies a vehicle in roll, p' = Lp p + Lda da + gusts. He holds the bank angle with a delay of
+0.1 s and adds test steps. Each record is fitted by output error, and by filter error with a
+disturbance on roll. The table has the mean relative error of Lp and Lda over the runs, and the
 number of runs in which the loop was detected. With `delay` the aileron acts 60 ms after the stick.
-That delay is then free too, with the five starts of a free delay. The frequency domain is in
+The delay is then free too, with the five starts of a free delay. The frequency domain is in
 closed_loop_frequency.py.
 """
 

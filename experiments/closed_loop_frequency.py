@@ -2,11 +2,11 @@
 
     .venv/bin/python experiments/closed_loop_frequency.py [RUNS] [METHODS]
 
-Each of RUNS (40) runs has four records of 90 s. A pilot barely keeps the hover, a logged sweep of
-0.05 to 4 Hz is added to one cyclic stick, and gusts act on six axes. Free are 14 derivatives of the
-attitude, 6 of the speed and the delays of both sticks, with starts off by up to a factor of 1.5.
-The records are made with SciPy's matrix exponentials. The folder of --out stores a line for each
-fit, so that an interrupted run can continue.
+Each of RUNS (40) runs has four records of 90 s. A pilot barely keeps the hover, and gusts act on
+six axes. A logged sweep of 0.05 to 4 Hz is added to one cyclic stick. Free parameters are 14
+derivatives of the attitude, 6 of the speed and the delays of both sticks. Starts are off by up to a
+factor of 1.5. The records are made with SciPy's matrix exponentials. The folder of --out stores a
+line for each fit, so that an interrupted run can continue.
 """
 
 import functools
@@ -173,9 +173,7 @@ def doublet(model: Any, stick: str, N: int) -> Any:
 
 
 def doublet_tic(found: dict[str, float]) -> float:
-    """Return the worse of Theil's coefficients for a doublet on each cyclic stick,
-    without gusts.
-    """
+    """Return the worse of Theil's coefficients for a doublet on each cyclic stick, in still air."""
     model, vehicle = models()[0], naming.asdict(linear_vehicle())
     N, worst = round(4.0 / DT), 0.0
     for stick in ("lat", "lon"):
@@ -191,7 +189,7 @@ def doublet_tic(found: dict[str, float]) -> float:
 
 
 def one_fit(seed: int, method: str) -> dict[str, Any]:
-    """Return relative errors, errors over the stated sd, and the fit's own findings."""
+    """Return relative errors, errors over the stated sd, and the fit's findings."""
     asked = problem(seed, **METHODS[method])
     begin = time.perf_counter()
     found = fit(asked, starts=1)

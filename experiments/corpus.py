@@ -32,8 +32,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
 STORED = ROOT / "tests" / "reference" / "corpus.json"
 
 MOVED, SD_CHANGED, NUMBER_CHANGED = 0.1, 0.05, 1e-3
-"""Least changes that count: of an estimate [sd], of an sd [relative], of a number without an sd
-[relative].
+"""Least changes that count: of an estimate [sd], an sd [relative], a number without sd [relative].
 """
 DIGITS = 6
 """Significant digits in the file."""
@@ -146,7 +145,7 @@ def rounded(value: Any) -> Any:
 
 
 Entry = tuple[str, str]
-"""A case, and its way: `` is unchanged, others as in `corpus_matrix.way`."""
+"""A case, and its way: `` is unchanged, others are in `corpus_matrix.way`."""
 
 
 def run_group(
@@ -217,7 +216,7 @@ def run_entries(
     if jobs == 1:
         done = [run_group(*each) for each in arguments]
     else:
-        # One process for each group, which ends with its memory and compiled programs.
+        # Each group's process ends with its memory and compiled programs.
         with multiprocessing.get_context("spawn").Pool(jobs, maxtasksperchild=1) as pool:
             done = pool.starmap(run_group, arguments, chunksize=1)
     return dict(one for group in done for one in group)
@@ -225,7 +224,7 @@ def run_entries(
 
 def differences(before: Result, after: Result) -> Iterator[str]:
     """Yield the differences of a case, a line each."""
-    # Files that are absent now, or were when the results were stored, cannot be compared.
+    # Cases cannot be compared if their files are absent, now or when results were stored.
     if "skipped" in before or "skipped" in after:
         return
     if "failed" in before or "failed" in after:

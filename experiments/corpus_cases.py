@@ -1,6 +1,4 @@
-"""Cases of corpus.py: each has a name, a group that shares compiled programs, and the
-right answer.
-"""
+"""Cases of corpus.py, with names, the right answers, and groups that share compiled programs."""
 
 import contextlib
 import functools
@@ -26,9 +24,7 @@ class Case(NamedTuple):
     group: str
     """Cases that run in one process."""
     run: Callable[[Path], Result]
-    """Function that runs the case in a folder of its own; raises LookupError if a
-    file is absent.
-    """
+    """Function that runs the case in its own folder; raises LookupError if a file is absent."""
     sound: bool | None = None
     """True if the right answer is exit code 0 and adequate; None if unknown."""
     ought: tuple[str, ...] = ()

@@ -1,10 +1,10 @@
 """Cases in which each diagnostic fires, and the loss without it: `corpus.py --matrix`.
 
-The first table has a row for each code. It counts the sound and unsound cases in which it fires,
-and the sound ones that end with an exit code other than 0 or not adequate. It also counts unsound
-cases without another finding of its rank or above. The second has a row for each candidate for
-deletion: where its entry function returns something, and what changes without it. Changes concern
-exit code, status, adequacy, estimates and right answers.
+The first table has a row for each code. It counts the sound and unsound cases in which it fires. It
+also counts sound cases that end with an exit code other than 0 or not adequate. Finally it counts
+unsound cases without another finding of its rank or above. The second has a row for each candidate
+for deletion: where its entry function returns something, and what changes without it. Changes
+concern exit code, status, adequacy, estimates and right answers.
 """
 
 import contextlib
@@ -174,9 +174,7 @@ def _silent(case: Any, result: Result) -> bool:
 
 
 def firing_table(cases: Sequence[Any], results: Mapping[str, Result]) -> list[str]:
-    """Return a row for each code: rank, sound cases, wrong ones, unsound cases, alone, expected
-    words.
-    """
+    """Return a row per code: rank, sound cases, wrong ones, unsound cases, alone, expected."""
     ranks = ("exit", "doubt", "note")
     rows: dict[str, list[int]] = {}
     where: dict[str, str] = {}

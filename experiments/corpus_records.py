@@ -23,9 +23,7 @@ N = 1500
 
 
 def linear(A: dict, B: dict, outputs: Mapping[str, str], **sections: Any) -> dict[str, Any]:
-    """Return a model in the form of a file; states take units from `states`,
-    parameters their own.
-    """
+    """Return a model in the form of a file; states take units from `states`."""
     return {"name": "rig", "outputs": dict(outputs), "A": A, "B": B, **sections}
 
 
@@ -207,9 +205,7 @@ def damping() -> Columns:
 
 
 def heave(gust: float, amplitude: float) -> Columns:
-    """Return a minute of collective pulses in gusts with 1 s correlation time; Zw
-    -0.6, Zcol -14.
-    """
+    """Return a minute of collective pulses in gusts of 1 s correlation time; Zw -0.6, Zcol -14."""
     rng, n = np.random.default_rng(0), 3000
     col = amplitude * np.repeat(rng.choice([-1.0, 0.0, 1.0], n // 50), 50)
     keep = np.exp(-DT)

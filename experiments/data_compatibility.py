@@ -144,9 +144,7 @@ def logged(
 def compare(
     model: Model, flight: Flight, truth: dict[str, float], method: str
 ) -> dict[str, tuple[bool, float]]:
-    """Return for each error whether its interval contains the truth, and the
-    estimate's error [sd].
-    """
+    """Return by error: True if its interval contains the truth, and the estimate's error [sd]."""
     params = model.Params()
     noise = free_noise(model, params, (flight,)) if method == "filter-error" else {}
     problem = Problem(

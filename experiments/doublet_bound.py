@@ -3,10 +3,11 @@
     .venv/bin/python experiments/doublet_bound.py [RECORDS] [RUNS]
 
 Records, unknowns and doublets are those of experiments/closed_loop_frequency.py. Parameters are
-drawn about the truth with the covariance of the Cramér-Rao bound (a Kalman filter with known gusts
-and noise, at the truth), and with those stated by fits with instruments and direct fits. Each draw
-gives Theil's coefficient (TIC) of the worse of both doublets, to first order. There are RECORDS
-(10) sets of four flights. The largest of RUNS (40) draws compares with the largest of as many fits.
+drawn about the truth with three covariances. One is the Cramér-Rao bound (a Kalman filter with
+known gusts and noise, at the truth). The others are those of fits with instruments and of direct
+fits. Each draw gives Theil's coefficient (TIC) of the worse of both doublets, to first order. There
+are RECORDS (10) sets of four flights. The largest of RUNS (40) draws compares with the largest of
+as many fits.
 """
 
 import functools
@@ -71,9 +72,7 @@ def stated(seed: int, method: str) -> np.ndarray:
 
 @functools.cache
 def doublets() -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return for each stick the outputs (k,) at the truth over their noise, and the derivatives (k,
-    q).
-    """
+    """Return by stick the outputs (k,) at the truth over their noise, and derivatives (k, q)."""
     model, vehicle = study.models()[0], naming.asdict(study.linear_vehicle())
     names, N, made = list(study.truths()), round(4.0 / study.DT), []
     for stick in ("lat", "lon"):

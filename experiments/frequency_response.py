@@ -58,9 +58,7 @@ def bound(u: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def whitened(s: np.ndarray, sigma: float) -> np.ndarray:
-    """Return signals (N, q) after the filter that whitens gusts and noise, over the innovations'
-    sd.
-    """
+    """Return signals (N, q), whitened for gusts and noise, over the innovations' sd."""
     A = np.zeros((5, 5))
     A[:4, :4] = matrices(VEHICLE)[0]
     A[1, 4], A[4, 4] = 1.0, -1.0 / TAU
@@ -88,8 +86,9 @@ def record(rng: np.random.Generator, u: np.ndarray, sigma: float) -> Flight:
 def one_fit(
     flight: Flight, method: str, window: float | None
 ) -> tuple[Fit, np.ndarray, np.ndarray]:
-    """Return a fit from 1.3 times the truth, relative errors, and whether the 95 % intervals
-    contain the truth (NaN if not stated).
+    """Return a fit from 1.3 times the truth, relative errors, and coverage of the 95 % intervals.
+
+    Coverage is NaN if no interval is stated.
     """
     truth = np.array([float(getattr(VEHICLE, n)) for n in NAMES])
     free = {n: Free(1.3 * t) for n, t in zip(NAMES, truth, strict=True)}
@@ -110,8 +109,9 @@ def one_fit(
 def one_run(
     seed: int, move: Callable, sigma: float, window: float
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, float, float]]:
-    """Return for each method: relative errors, intervals with the truth, the bound, the time, and
-    whether chi-squared is in its expected interval (NaN if there is none).
+    """Return by method: relative errors, coverage, the bound, the time, chi-squared's result.
+
+    The last is 1 if chi-squared is in its expected interval, NaN if there is none.
     """
     rng = np.random.default_rng(seed)
     u = move(rng)

@@ -25,7 +25,7 @@ NAMES = ("Ixx", "If", "kappa")
 
 
 def arrives(problem: Problem) -> tuple[bool, int, float]:
-    """Return whether output error converges to the truth, its steps, and its time [s]."""
+    """Return True if output error converges to the truth, its steps, and its time [s]."""
     began = time.perf_counter()
     found = fit(problem)
     near = all(abs(found.estimates[n].value / STAND[n] - 1.0) < 0.02 for n in NAMES)

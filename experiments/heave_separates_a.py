@@ -2,13 +2,13 @@
 
     .venv/bin/python experiments/heave_separates_a.py [CASES | --quick] [--out FOLDER]
 
-Six two-second records of the X-Cell 60 about hover, all sticks moving, with position, attitude and
-rotor speed measured to 2 mm, 2 mrad and 0.5 rad/s. The roll angle alone determines none of the
-parameters, since it does not show the rotor speed, the climb and the other initial states. Position
-shows the thrust, which depends on a and the mass, and a balance gives the mass. Moving the throttle
-by 3 % also separates the rotor's inertia from the motor's gain; with 0.2 % only their product is
-known. In rolling gusts, the extended Kalman filter estimates five parameters from one record.
-FOLDER (runs/heave) gets results.json and page.md.
+There are six two-second records of the X-Cell 60 about hover, with all sticks moving. Position,
+attitude and rotor speed are measured to 2 mm, 2 mrad and 0.5 rad/s. The roll angle alone determines
+none of the parameters, since it does not show the rotor speed, the climb and the other initial
+states. Position shows the thrust, which depends on a and the mass, and a balance gives the mass.
+Moving the throttle by 3 % also separates the rotor's inertia from the motor's gain; with 0.2 % only
+their product is known. In rolling gusts, the extended Kalman filter estimates five parameters from
+one record. FOLDER (runs/heave) gets results.json and page.md.
 """
 
 import json

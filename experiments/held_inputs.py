@@ -4,10 +4,10 @@
 
 SciPy simulates the roll stand (eqs 21-22, by hand) in steps of 1 ms, with a stick that steps at any
 of them. It is logged at 100 Hz with a jitter of a fifth of a step. Each log is fitted by output
-error at 50 and 100 Hz: with the stick's value at the grid's times, with its mean over the grid's
-steps (as the reader does), and with the mean and a free time shift. A second stick steps at the
-log's stamps, so it is logged when it acts. The first is 5 ms late on average in any log. The table
-has the mean error of If in percent, its chance deviation from zero, and the mean shift.
+error at 50 and 100 Hz, in three ways: with the stick's value at the grid's times, with its mean
+over the grid's steps, and with the mean and a free time shift. A second stick steps at the log's
+stamps, so it is logged when it acts. The first is 5 ms late on average in any log. The table has
+the mean error of If in percent, its chance deviation from zero, and the mean shift.
 """
 
 import dataclasses

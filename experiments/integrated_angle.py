@@ -5,9 +5,8 @@
 A flybarless roll in gusts is simulated in steps of 1 ms; a pilot holds it level, slowly. The gyro
 is read at 1 kHz with white noise and logged at 100 Hz. The angle is logged twice: from a separate
 sensor with white noise, and from an autopilot. The autopilot integrates the gyro and follows an
-accelerometer within five seconds. For each set of signals, the table has the number of 95 %
-intervals with the truth, the mean error in units of the stated sd, and the estimates' mean and
-scatter.
+accelerometer within five seconds. The table has a row for each set of signals: the number of 95 %
+intervals with the truth, the mean error [stated sd], and the estimates' mean and scatter.
 """
 
 from typing import Any

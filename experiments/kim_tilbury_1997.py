@@ -173,7 +173,7 @@ def sampled_35() -> tuple[np.ndarray, np.ndarray]:
 def fastest_rotor() -> float:
     """Return the largest Omega [rpm] that eq. 23, on any stand, allows with the s^2 of eq. 35.
 
-    That coefficient is Omega^2 + zeta c1 + kappa, and no term is negative.
+    The coefficient is Omega^2 + zeta c1 + kappa, and no term is negative.
     """
     return float(np.sqrt(float(EQ_35[1][2])) * 30.0 / np.pi)
 

@@ -2,10 +2,9 @@
 
     .venv/bin/python experiments/misfits.py [--quick] [--only WORDS] [--size N]
 
-A fit of a faulty record must not end with exit code 0 if an estimate's 95 % interval misses the
-truth by more than three standard deviations. At most one of the forty sound records may end with a
-code other than 0. The records are integrated here, at 1 ms, by NumPy. The exit code is 1 if a fit
-fails.
+A fit of a faulty record must not end with exit code 0 if a 95 % interval misses the truth by more
+than 3 sd. At most one of the forty sound records may end with a code other than 0. The records are
+integrated here, at 1 ms, by NumPy. The exit code is 1 if a fit fails.
 
 With --size N (20: 200 records) `check` and `fit` get N sound records of each kind, and a table
 shows how often each code is a false doubt. At most 2 % of the records may have one, and none may

@@ -2,10 +2,10 @@
 
     .venv/bin/python experiments/monte_carlo.py [RUNS] [--out FOLDER]
 
-The disturbed bench is the 30-class vehicle on its stand (kappa free, zeta known), 6000 samples at
-50 Hz, 2 mrad of measurement noise, random steps, and a disturbance whose response is as large as
-the driven one. FOLDER (runs/monte-carlo) stores a line for each run, so that an interrupted study
-can continue. table.md and monte_carlo.svg cover all runs.
+The disturbed bench is the 30-class vehicle on its stand (kappa free, zeta known). Records have 6000
+samples at 50 Hz, random steps and 2 mrad of measurement noise. The response to the disturbance is
+as large as the driven one. FOLDER (runs/monte-carlo) stores a line for each run, so that an
+interrupted study can continue. table.md and monte_carlo.svg cover all runs.
 """
 
 import json
@@ -97,9 +97,7 @@ def undisturbed(params: Any) -> Any:
 
 
 def fisher(params: Any, records: int = 5) -> dict[str, float]:
-    """Return the relative Cramer-Rao sd of filter error at the truth, a bound for
-    unbiased methods.
-    """
+    """Return the relative Cramer-Rao sd of filter error at the truth (for unbiased methods)."""
     free = {n: Free(float(getattr(params, n))) for n in FREE}
     sds = []
     for seed in range(records):

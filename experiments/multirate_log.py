@@ -3,13 +3,12 @@
     .venv/bin/python experiments/multirate_log.py [RUNS]
 
 A helicopter's lateral motion in hover (flapping, roll, drift) is simulated in steps of 0.25 ms with
-SciPy, and logged as an autopilot does. The gyro is at 400 Hz after a digital low-pass of 90 Hz and
-3 ms late, attitude at 50 Hz, GPS velocity at 5 Hz and 120 ms late, and the stick at 50 Hz. Stamps
-are off by a fifth of a step, and a fiftieth of the samples is lost. Each log is fitted twice: with
-the filter, read from the log's own parameters, and the delays in the measurement model, and
-without. The table has the mean error over the runs in units of the stated sd, its chance deviation
-from zero, the scatter of the estimates in the same unit, and the number of 95 % intervals with the
-truth.
+SciPy, and logged as an autopilot does. The gyro is at 400 Hz, after a digital low-pass of 90 Hz,
+and 3 ms late. Attitude and stick are at 50 Hz; GPS velocity is at 5 Hz and 120 ms late. Stamps are
+off by a fifth of a step, and a fiftieth of the samples is lost. Each log is fitted with and without
+filter and delays in the measurement model; the filter is read from the log's parameters. The table
+has the mean error, its chance deviation from zero, and the scatter of the estimates, in units of
+the stated sd. It also has the number of 95 % intervals with the truth.
 """
 
 import math

@@ -2,9 +2,10 @@
 
     .venv/bin/python experiments/response_weights.py [RUNS] [WINDOW] [FIRST]
 
-The records of experiments/frequency_response.py with gusts and pilot steps. `frequency-response` is
-given the spectrum, the mean of that of gusts and noise alone over 150 records in the same windows;
-estimates it; and estimates it by a mean over two lines of the window whatever the averages.
+The records are those of experiments/frequency_response.py with gusts and pilot steps.
+`frequency-response` runs with a known spectrum, with its estimate, and with a mean over two lines
+of the window at any number of averages. The known one is the mean over 150 records of gusts and
+noise alone.
 """
 
 from unittest import mock

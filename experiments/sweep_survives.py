@@ -69,9 +69,7 @@ def command(config: Path, out: Path, *more: str) -> list[str]:
 
 
 def finished(out: Path) -> dict[str, tuple[int, int]]:
-    """Return the status files of finished chunks, with marks that change if one is
-    written again.
-    """
+    """Return the status files of finished chunks, with marks that change if one is rewritten."""
     marks = {}
     for path in (out / "sweep.zarr" / "status" / "c").glob("*"):
         if path.suffix != ".partial":

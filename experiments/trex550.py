@@ -1,5 +1,4 @@
-"""Roll of a flybarless helicopter from a real log: servo, rate loop and delay against a first-order
-lag.
+"""Roll of a flybarless T-Rex from a real log: servo, rate loop and delay, or a first-order lag.
 
     .venv/bin/python experiments/trex550.py LOG [FURTHER ...]
 
@@ -66,9 +65,7 @@ def _rate(params: Any, x: Any, u: Any) -> Rate:
 
 
 def first_order() -> tuple[Model, Any, dict[str, Free]]:
-    """Return p = K/(tau s + 1) lat, with a delay that may be negative, since the log's stick is
-    late.
-    """
+    """Return p = K/(tau s + 1) lat; the delay may be negative, since the log's stick is late."""
     bare = Model("first-order", _lag, _rate, Lag, Rate, Stick, Rate, linear=True)
     model = models.with_delays(bare, inputs=["lat"])
     start = model.Params(K=1.0, tau=0.1, delay_lat=0.0)
@@ -76,9 +73,7 @@ def first_order() -> tuple[Model, Any, dict[str, Free]]:
 
 
 def flybarless(path: str, *, feedforward: bool) -> tuple[Model, Any, dict[str, Free]]:
-    """Return the configuration's rotor, servo, rate loop and delay; optionally with
-    feed-forward.
-    """
+    """Return the configuration's rotor, servo, rate loop, delay and optional feed-forward."""
     changes: dict[str, Any] = {f"flights.{i}.log": str(Path(path).resolve()) for i in range(3)}
     if feedforward:
         changes["onboard.rate_loop.feedforward"] = True
@@ -124,9 +119,7 @@ def stick_sd(log: Flight) -> np.ndarray:
 
 
 def agreement(model: Model, params: Any, whole: Flight) -> dict[str, float]:
-    """Return the VAF in the fitted window, of the whole record, and of the record without the
-    window.
-    """
+    """Return the VAF in the fitted window, of the whole record, and of the rest of the record."""
     measured, simulated = _flown(model, params, whole)
     fitted = _fitted(whole)
     return {
@@ -139,8 +132,7 @@ def agreement(model: Model, params: Any, whole: Flight) -> dict[str, float]:
 def where_the_stick_moves(
     model: Model, params: Any, log: Flight, doublets: float, kept: np.ndarray
 ) -> dict[float, tuple[float, float]]:
-    """Return for each share of a moving stick the duration [s] and the VAF of the kept samples
-    (N,).
+    """Return duration [s] and VAF of the kept samples (N,) for each share of a moving stick.
 
     Args:
         model: simulated over the whole log.

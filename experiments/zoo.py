@@ -121,9 +121,7 @@ class Puzzle:
     not_identifiable: tuple[str, ...] = ()
     """Free parameters that it does not determine."""
     hardly: dict[str, float] = field(default_factory=dict)
-    """Parameters with little information: not determined, or with truth and zero in
-    the interval.
-    """
+    """Parameters with little information: not determined, or truth and zero in the interval."""
     adequate: bool = True
 
 

@@ -132,9 +132,7 @@ def run_compatibility(
 
 
 def _agreement(compatibility: Compatibility) -> SensorAgreement:
-    """Return the sensor results for the top of the fit's page, whose own statements do not cover
-    sensors.
-    """
+    """Return the sensor results for the top of the fit's page."""
     head, rows = table(compatibility)
     # The fit's page already shows the fit's findings.
     doubts = tuple(d for d in compatibility.doubts if d not in compatibility.run.fit.findings)

@@ -10,7 +10,7 @@ _END = 1000
 
 
 def shortened(text: str) -> str:
-    """Return a message, cut in the middle if a long value makes it too long."""
+    """Return a message, with its middle cut out if it is too long."""
     left = len(text) - 2 * _END
     return text if left <= 0 else f"{text[:_END]} [{left} letters] {text[-_END:]}"
 
@@ -79,8 +79,7 @@ def nearest(name: str, known: Iterable[str], otherwise: str | None = None) -> st
 
 
 def require_known(names: Iterable[Any], known: Iterable[str], where: str, what: str) -> None:
-    """Refuse unknown names in a file: `fit.yaml: fit.free: model roll has no parameter 'Ixy'; did
-    you mean 'Ixx'?`.
+    """Raise if a file has unknown names, with the nearest known name in the message.
 
     Raises:
         InputError: a name is unknown.

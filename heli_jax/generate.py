@@ -151,7 +151,7 @@ def generate(experiment: Experiment) -> Simulated:
         draws = noise.sd * scale * rng.standard_normal(n)
         outputs[name] = outputs[name] + draws[: outputs[name].size]
     # Log inputs as commanded. If log and model both had the delay, a fit would find none. Wind is
-    # an input of `flown`, but no log has it.
+    # an input of `flown`, but logs do not contain it.
     logged = {k: np.asarray(commanded[k])[: run.times.size] for k in driven}
     columns = _as_logged(experiment, np.asarray(run.times), logged, outputs)
     notes = (*notes, *_held_notes(experiment, logged))
@@ -207,9 +207,7 @@ def _run(
     driven: dict[str, np.ndarray],
     where: str,
 ) -> tuple[Trajectory, dict[str, Any]]:
-    """Return the run as NumPy arrays without measurement noise, and its commanded inputs. All have
-    the same number of samples.
-    """
+    """Return the run as NumPy arrays without measurement noise, and its commanded inputs."""
     # Missing constants are NaN. Without this check the message would only be "not finite".
     with experiment.located(""):
         require_constants(experiment.model, experiment.vehicle.params)

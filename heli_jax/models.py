@@ -76,7 +76,7 @@ def by_name(
     if name in _HELICOPTERS:
         known = Corrections._fields
         require_known(corrections or {}, known, where, "the helicopter has no correction")
-        # A fixed order lets the cache return the same model for the same switches.
+        # With a fixed order the cache returns the same model for the same switches.
         switches = dict(sorted((corrections or {}).items()))
         return helicopter(_HELICOPTERS[name], wind=wind, **switches)
     model = _SHIPPED[name] if name in _SHIPPED else _imported(name, where, folder)

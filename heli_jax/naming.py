@@ -1,9 +1,9 @@
 """Names and units of record classes: a model's parameters, states, inputs and outputs.
 
 The configuration, the readers and the report use them. A record class is any class built by keyword
-with one scalar a field: a `NamedTuple`, an `eqx.Module`. JAX must know a model's classes as
-pytrees, as it does these; for a dataclass call `jax.tree_util.register_dataclass`. Units and
-meanings are optional, in the annotation: `roll: Annotated[Scalar, "rad", "roll angle"]`.
+with one scalar a field: a `NamedTuple`, an `eqx.Module`. A model's classes must be pytrees, as
+these are; for a dataclass call `jax.tree_util.register_dataclass`. Units and meanings are optional,
+in the annotation: `roll: Annotated[Scalar, "rad", "roll angle"]`.
 """
 
 import ast

@@ -1,7 +1,7 @@
 """Pickling of functions and classes that are made at run time.
 
 A model holds closures, and its records are classes that no module has by name. pickle stores names
-and refuses both; `cloudpickle` stores their content. Nothing here writes a file: it is for
+and refuses both; `cloudpickle` stores their content. This module writes no file: it is for
 `multiprocessing`, `joblib` and `copy`.
 """
 

@@ -1,6 +1,6 @@
 """Reading of user files: regular files of limited size only.
 
-A device such as /dev/zero has no end, a named pipe waits for a writer, and a sparse file of 1 TB
+A device such as /dev/zero has no end, and a named pipe waits for a writer. A sparse file of 1 TB
 takes no disk space but all memory. Kind and size are therefore checked before opening, and again on
 the open file, since the name may then refer to another file.
 """

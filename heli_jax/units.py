@@ -86,7 +86,7 @@ _PER = re.compile(r"(?<=[A-Za-z°%])(?:_| )+per(?:_| )+|(?<=[a-z])p(?=s$|s\^?2$)
 # UDUNITS spelling (Unidata): the exponent follows the name, and a point is a product.
 _EXPONENT = re.compile(r"(?<=[A-Za-zµ°])(-?[1-9])(?![0-9.])")
 _POINT = re.compile(r"(?<=[A-Za-z0-9])\.(?=[A-Za-z])")
-# Names cannot contain a slash: deg_s. No log has a product of these units and a second.
+# Names cannot contain a slash: deg_s. Logs do not have products of these units and a second.
 _UNDERLINED = re.compile(
     r"(deg|degree|degrees|rad|radian|radians|mrad|cdeg|m|meter|meters|metre|metres|cm|mm|ft|km)"
     r"_(s|sec|secs|second|seconds|h|min)(\^?2)?"
@@ -143,7 +143,7 @@ def _unknown_names(expression: str) -> list[str]:
 def _is_known(name: str) -> bool:
     registry = _registry()
     meanings = registry.parse_unit_name(name, case_sensitive=True)
-    # pint reads a final s as a plural. That is right for whole words (degrees), but `rads` may mean
+    # pint reads a final s as a plural. This is right for whole words (degrees), but `rads` may mean
     # rad/s.
     if name.endswith("s") and len(name) > 1:
         singular = registry.parse_unit_name(name[:-1], case_sensitive=True)

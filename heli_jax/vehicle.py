@@ -135,8 +135,7 @@ def of_helicopter(record: type) -> bool:
 
 
 def _reasons(params: Mapping[str, Any]) -> Iterator[tuple[Any, str, tuple[Any, ...]]]:
-    """Yield the rules for a helicopter's constants: whether each is broken, and the end of its
-    message.
+    """Yield the rules for a helicopter's constants: True if broken, and the end of the message.
 
     Values are numbers or arrays (k,) by name. Missing names are not checked, and values that are
     not numbers pass.

@@ -206,8 +206,8 @@ def _fit_run(
 
 
 def _keep(run: FitRun, out: Path, progress: Say) -> Path | None:
-    """Write a fit before further intervals are computed, so that an interrupt does not lose it.
-    Return its directory.
+    """Write a fit before slow intervals, so that an interrupt does not lose it; return its
+    directory.
     """
     words = (
         "The run was interrupted: the requested profile, bootstrap or NUTS intervals are missing."
@@ -324,8 +324,8 @@ def _supplementary(
 def compare_models(
     config: Experiment | str | Path, problem: Problem | None = None, *, progress: Say = _silent
 ) -> Choice:
-    """Fit the models of `fit.compare` and the configuration's own, and compare them by likelihood
-    ratio, AIC and BIC.
+    """Fit the models of `fit.compare` and the configuration's, and compare them by AIC, BIC and
+    likelihood.
 
     Args:
         config: result of `load_config`, or the path of a configuration.
@@ -352,7 +352,6 @@ def write_report(run: FitRun, out: str | Path) -> FitRun:
 
     Args:
         run: result of `run_fit`.
-        out: the directory.
 
     Raises:
         InputError: `out` cannot be written to, or the extra `bayes` is missing.

@@ -31,7 +31,7 @@ class _Loader(_Base):
     """SafeLoader without YAML 1.1's traps: `1e-4` is a number; `on`, `yes` and dates are text."""
 
 
-# YAML 1.1, which PyYAML follows, reads 1e-4 as text (it wants 1.0e-4), `on` and `no` as booleans
+# YAML 1.1, which PyYAML follows, reads 1e-4 as text (1.0e-4 is a number), `on` and `no` as booleans
 # and 1:30 as ninety. Only its rules for null and << stay; the core schema of YAML 1.2 replaces the
 # others.
 _Loader.yaml_implicit_resolvers = {
@@ -60,8 +60,8 @@ def read_mapping(path: str | Path) -> dict[str, Any]:
     """Return the mapping in a YAML file.
 
     Raises:
-        InputError: the file does not exist, is no regular file of at most 1 MB, no text, no YAML or
-            no mapping, has a key twice, or is too large or too deeply nested (aliases expanded).
+        InputError: the file is missing, above 1 MB, not a YAML mapping, has a duplicate key, or is
+            too large or too deeply nested (aliases expanded).
     """
     data = read_regular(path, "a YAML file (a configuration or a vehicle)", _LIMIT_BYTES)
     try:

@@ -1,4 +1,4 @@
-"""float64, strict dtypes and ranks, checked shapes, and examples that are the same every time."""
+"""Test settings: float64, strict dtypes and ranks, checked shapes, and reproducible examples."""
 
 import atexit
 import gc
@@ -8,15 +8,15 @@ import tempfile
 import time
 from pathlib import Path
 
-# Before JAX: what one test process has compiled serves the others of the same run.
+# Set before JAX is imported: the test processes of a run share compiled programs.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     _compiled = tempfile.mkdtemp(prefix="heli_jax-tests-")
     atexit.register(shutil.rmtree, _compiled, ignore_errors=True)
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _compiled
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
 
-# A test spends most of its time in XLA's compiler, and calls what it makes once or twice: in CI it
-# compiles without optimisation, in 70 % of the time.
+# Tests spend most of their time in XLA's compiler. CI compiles without optimisation, in 70 % of the
+# time.
 if os.environ.get("CI") == "true":
     os.environ.setdefault(
         "XLA_FLAGS",
@@ -32,12 +32,10 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# Before the package's first import: the hook checks the shapes that its annotations state.
-# Left out are modules that are called with other types than their annotations say:
-# flights (beartype cannot check its Table, a Protocol that is not runtime_checkable), the equations
-# (any record with the names of a Helicopter passes for one, such as with_disturbance's),
-# identification.problem (takes a list of flights for a tuple), equation_error.rls and analysis.lti
-# (their own errors for wrong arguments are tested).
+# Install the hook before the package's first import: it checks annotated shapes. Some modules are
+# left out. beartype cannot check the Table of flights, a Protocol that is not runtime_checkable.
+# The equations accept any record with the names of a Helicopter. identification.problem takes a
+# list of flights for a tuple. Tests of equation_error.rls and analysis.lti pass wrong arguments.
 _CHECKED = (
     "vehicle naming dynamics.model dynamics.jacobians dynamics.disturbance simulation "
     "numerics.hoist numerics.matrix_exponential "
@@ -53,11 +51,10 @@ hypothesis.settings.load_profile("same")
 
 
 _MAPPED = 42_000
-"""Regions of memory above which compiled programs are let go: Linux grants a process 65530, every
-kernel takes some, and past them the process dies."""
+"""Memory regions above which compiled programs are released; Linux kills a process above 65530."""
 
 
-# What is imported lives as long as the process; tracing makes millions of objects beside it.
+# Imported objects live as long as the process; frozen, they are not scanned beside traced objects.
 gc.freeze()
 gc.set_threshold(50_000, 20, 50)
 
@@ -87,7 +84,7 @@ def bench30(vehicles_folder):
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """CI leaves the slowest tests out: what each shows is shown there by a smaller one too."""
+    """Skip the slowest tests in CI, where smaller tests show the same."""
     if os.environ.get("CI") != "true":
         return
     for item in items:

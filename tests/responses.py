@@ -1,4 +1,4 @@
-"""Frequency responses of a linearised model, frequency by frequency."""
+"""Frequency responses of a linearised model, one frequency at a time."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,7 +12,7 @@ from heli_jax.analysis.operating_point import EVERYWHERE, OperatingPoint
 def continuous(
     model: Any, params: Any, output: str, input: str, at: OperatingPoint = EVERYWHERE
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """H(i omega) from an input to an output, with the input's delay."""
+    """Return H(i omega) from an input to an output, with the input's delay."""
     A, B, C, D = (np.asarray(M) for M in linearize(model, params, at.state, at.inputs).matrices)
     i, j = naming.names(model.Outputs).index(output), naming.names(model.Inputs).index(input)
     delay = dict(model.delays).get(input)
@@ -26,7 +26,7 @@ def continuous(
 
 
 def polynomials(model: Any, params: Any) -> tuple[np.ndarray, np.ndarray]:
-    """num and den of the first output by the only input of a linear model: Leverrier."""
+    """Return num and den from the only input to the first output of a linear model (Leverrier)."""
     A, B, C, _ = (np.asarray(M) for M in linearize(model, params).matrices)
     den, v, num = np.poly(A), B[:, 0], []
     for k in range(len(A)):

@@ -1,4 +1,4 @@
-"""docs/architecture.md and CONTRIBUTING.md name files; each exists."""
+"""Test that the files named in docs/architecture.md and CONTRIBUTING.md exist."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The command line as a user meets it: exit codes, sentences, files."""
+"""Command line: exit codes, sentences and files."""
 
 import errno
 import json
@@ -23,7 +23,7 @@ TREX = ROOT.parent / "shared" / "data" / "trex550" / "Pitchtest.csv"
 
 @pytest.fixture(scope="module")
 def bench_log(tmp_path_factory):
-    """A short log of the demo's bench, as its text."""
+    """Text of a short log of the demo's bench."""
     path = tmp_path_factory.mktemp("bench") / "bench.csv"
     how = ["--set", "simulate.duration=12", "--out", str(path)]
     assert main(["simulate", str(ROOT / "configs" / "bench-gusts.yaml"), *how]) == 0
@@ -32,7 +32,7 @@ def bench_log(tmp_path_factory):
 
 @pytest.fixture
 def bench(tmp_path, bench_log):
-    """The demo's configuration on a short log in a folder of its own; returns the config's path."""
+    """Return the path of the demo's configuration with a short log, in its own folder."""
     content = yaml.safe_load((ROOT / "configs" / "bench-gusts.yaml").read_text())
     content["vehicle"] = str(ROOT / "configs" / "vehicles" / "bench-30.yaml")
     content["flights"][0]["log"] = "bench.csv"
@@ -52,7 +52,7 @@ def edited(path, change):
 
 
 def refused(capsys, arguments, *words):
-    """The command ends with exit code 2, one sentence on standard error, nothing on output."""
+    """Assert exit code 2, one sentence on standard error, and no output."""
     capsys.readouterr()
     try:
         code = main([str(a) for a in arguments])
@@ -91,7 +91,7 @@ def test_fit_writes_a_whole_run_directory(bench, capsys):
     assert {"jax", "heli_jax", "python"} <= set(result["versions"])
     assert {p.suffix for p in (out / "figures").iterdir()} == {".svg"}
     assert not list(bench.parent.glob(".run*"))
-    # The resolved configuration runs again from elsewhere.
+    # The resolved configuration also runs from another folder.
     again = bench.parent / "elsewhere"
     again.mkdir()
     (again / "again.yaml").write_text((out / "config.yaml").read_text())
@@ -117,7 +117,7 @@ def test_too_few_steps_end_with_exit_code_4(bench, capsys):
     assert main(arguments) == 4
     written = json.loads((out / "fit.json").read_text())
     assert written["status"] == "not-converged"
-    # Where it stopped is told, and no interval about that.
+    # The fit states where it stopped, without an interval.
     assert all(
         e["value"] is not None and e["sd"] is None and e["lower95"] is None
         for e in written["parameters"].values()
@@ -228,7 +228,7 @@ def test_broken_and_hostile_yaml(tmp_path, capsys, text):
 
 
 def test_an_input_that_never_moves(bench):
-    """What moves freely may be fitted; what the input alone would tell is not determined."""
+    """Test that a free decay can be fitted, but not parameters that only the input determines."""
     log = bench.parent / "bench.csv"
     rows = [line.split(",") for line in log.read_text().splitlines()]
     log.write_text("\n".join(",".join([r[0], r[1] if i == 0 else "1.0", r[2]])
@@ -239,7 +239,7 @@ def test_an_input_that_never_moves(bench):
 
 
 def test_missing_samples(bench, capsys):
-    """Some are skipped and told; what leaves next to nothing is refused."""
+    """Test that a few missing samples are skipped with a note; too few left are an error."""
     log = bench.parent / "bench.csv"
     head, *rows = log.read_text().splitlines()
     at = head.replace('"', "").split(",").index("phi")
@@ -307,7 +307,7 @@ def test_an_interrupt_is_one_whatever_a_library_makes_of_it(monkeypatch, capsys)
     assert capsys.readouterr().err == "heli-jax: interrupted\n"
 
 
-# Each interrupts itself at a moment at which an exception would be lost, printed or late.
+# Each interrupts itself at a moment when an exception would be lost, printed or late.
 MOMENTS = {
     "a finaliser": """
         class Finalised:
@@ -347,7 +347,7 @@ MOMENTS = {
 
 
 def as_program(script, arguments, folder):
-    """A process that runs `main` as the command does, with interrupts as a shell leaves them."""
+    """Start a process that runs `main` like the command, with the shell's signal handling."""
     head = (
         "import hashlib, pathlib, signal, sys, threading, time\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
@@ -378,13 +378,13 @@ def test_an_interrupt_ends_a_command_at_any_moment(tmp_path, moment):
 
 
 def test_an_interrupt_while_the_command_is_imported(tmp_path):
-    """heli_jax/__main__.py listens before it imports anything."""
+    """Test that heli_jax/__main__.py handles interrupts before it imports anything."""
     (tmp_path / "argparse.py").write_text("import signal; signal.raise_signal(signal.SIGINT)\n")
     program = (
         "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
         "from heli_jax.__main__ import main; sys.exit(main())"
     )
-    # The folder is the first place that modules are looked for in.
+    # Python looks for modules in this folder first.
     ended = subprocess.run(
         [sys.executable, "-c", program, "--help"], cwd=tmp_path, capture_output=True, text=True
     )
@@ -393,7 +393,7 @@ def test_an_interrupt_while_the_command_is_imported(tmp_path):
 
 
 def test_interrupts_after_the_end_are_nothing(tmp_path):
-    """Python takes a second to take itself down, in which an interrupt would show a traceback."""
+    """Test an interrupt while Python shuts down, which takes a second."""
     script = "import atexit; atexit.register(signal.raise_signal, signal.SIGINT)\n"
     process = as_program(
         f"{script}commands._info = lambda options: 0", ["info", "log.csv"], tmp_path
@@ -406,7 +406,7 @@ def test_who_stops_reading_is_no_failure_and_a_full_disk_is(tmp_path):
     log = tmp_path / "log.csv"
     log.write_text("t,p\n" + "".join(f"{0.01 * k},{k % 7}\n" for k in range(100)))
     command = [sys.executable, "-m", "heli_jax", "info", str(log)]
-    # Written at the end and at once: Python's own buffer is larger than what info prints.
+    # Python's buffer is larger than the output of info, so all is written at the end.
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
     reading, writing = os.pipe()
     os.close(reading)
@@ -461,7 +461,7 @@ def test_two_fits_of_one_directory_are_both_kept(tmp_path):
     assert kept == {"run": "0", "run-2": "1", "run-3": "2"}
     with pytest.raises(InputError), run_directory.whole(out) as folder:
         (folder / "fit.json").write_text("lost")
-    # Below a regular file nothing can be made.
+    # A regular file cannot contain a folder.
     below = out / "fit.json" / "a" / "b.csv"
     with pytest.raises(InputError), run_directory.whole_file(below, "--out"):
         pass
@@ -573,7 +573,7 @@ def test_a_real_record(tmp_path, capsys, flybar_free):
     code = main(["fit", str(path), "--out", str(tmp_path / "run")])
     result = json.loads((tmp_path / "run" / "fit.json").read_text())
     assert result["metrics"]["roll_rate"]["vaf"] >= 0.97
-    # With the flybar's inertia free, which a moderate record hardly tells from a delay, no number.
+    # The flybar's inertia is hard to separate from a delay, so it gets no estimate.
     shift = result["nuisance"]["time_shift"]
     assert (shift["value"] is None) == (shift["sd"] is None)
     assert flybar_free or -0.25 < shift["value"] < -0.05

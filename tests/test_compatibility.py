@@ -1,4 +1,4 @@
-"""heli-jax compatibility: errors found, written, and taken off the signals again."""
+"""heli-jax compatibility: sensor errors estimated, written, and removed from the signals."""
 
 import runpy
 from pathlib import Path
@@ -18,12 +18,12 @@ from heli_jax.identification.validation.adequacy import OutputAdequacy
 
 RATE, DURATION = 25.0, 16.0
 BIAS, SCALE, LATE = 1.5, 0.08, 0.04
-"""of the roll gyro [deg/s], of its scale, and of the angles [s]"""
+"""Errors: bias of the roll gyro [deg/s], its scale, and delay of the angles [s]."""
 
 
 @pytest.fixture(scope="module")
 def true():
-    """Time, rates [rad/s] and angles [rad] of a motion in closed form, the angles late."""
+    """Return time [s], rates [rad/s] and delayed angles [rad] of a motion in closed form."""
     path = Path(__file__).parents[1] / "experiments" / "data_compatibility.py"
     motion = runpy.run_path(str(path))["Motion"](np.random.default_rng(5))
     t = np.arange(round(DURATION * RATE)) / RATE
@@ -32,12 +32,12 @@ def true():
 
 @pytest.fixture
 def folder(tmp_path, true):
-    """A log with a wrong roll gyro, and its configuration."""
+    """Return a log with a wrong roll gyro, and its configuration."""
     t, omega, angles = true
     rng = np.random.default_rng(1)
     rates = np.degrees(omega + 0.004 * rng.standard_normal(omega.shape))
     rates[:, 0] = (1 + SCALE) * rates[:, 0] + BIAS
-    # Yaw as compasses show it, from -180 to 180 degrees.
+    # A compass shows yaw from -180 to 180 degrees.
     shown = np.degrees(angles + np.array([0, 0, 3.0]) + 0.004 * rng.standard_normal(angles.shape))
     shown[:, 2] = (shown[:, 2] + 180.0) % 360.0 - 180.0
     columns = np.column_stack([t, rates, shown])
@@ -69,7 +69,7 @@ def configured(folder, name="sensors.yaml", **more):
 
 
 def notes_of(flight):
-    """By code the signals and errors that the notes are about."""
+    """Return by code the signals and errors that the notes name."""
     assert flight.source is not None
     return [(n.code, n.subjects) for n in flight.source.notes]
 
@@ -83,7 +83,7 @@ def test_errors_are_taken_off(folder, true):
     [flight] = config.read_flights(config.load(applied))
     t, omega, angles = true
     np.testing.assert_allclose(flight.inputs["p"], omega[:, 0], atol=0.02)
-    # Angles at their own times again; the last has none.
+    # The angles are at their own times again; the last sample is missing.
     n = round(LATE * RATE)
     error = flight.outputs["phi"][:-2] - angles[n : n + t.size - 2, 0]
     assert np.std(error) < 0.008
@@ -98,7 +98,7 @@ def test_a_model_of_the_machine_is_refused(folder, capsys):
 
 
 def fitted(folder, estimates, shares, status="converged", noise=0.005) -> Any:
-    """What a fit would have said, by error (value, reach of its interval), by output R2."""
+    """Return a fit with given errors (value, half of the interval) and R2 of outputs."""
     experiment = config.load(configured(folder))
     y = np.sin(np.arange(100.0))
     left = {n: y - np.sqrt(1 - r) * (y - y.mean()) for n, r in shares.items()}
@@ -118,7 +118,7 @@ def fitted(folder, estimates, shares, status="converged", noise=0.005) -> Any:
         ),
         method="filter-error",
     )
-    # Third differences show half the noise that was found, unless told otherwise.
+    # Third differences show half of the estimated noise, unless `noise` differs.
     free = {"noise_gyro": SimpleNamespace(start=noise)}
     free["b_r"] = SimpleNamespace(prior=Prior(0.0, 0.05))
     problem = SimpleNamespace(
@@ -140,11 +140,11 @@ def test_what_a_fit_says_of_the_sensors(folder):
     assert [d.code for d in sound.doubts[1:]] == ["of.fit"]
     assert sound.corrections["signals"]["roll"]["delay"] == 0.04
     assert sound.corrections["not_determined"] == ["b_r"]
-    assert compatibility._agreement(sound).doubts == sound.doubts[:1]  # the page has the fit's
+    assert compatibility._agreement(sound).doubts == sound.doubts[:1]  # also on the fit's page
     bad = judged({"phi": 0.99, "psi": 0.2})
     assert not bad.compatible
     assert not bad.corrections["signals"]
-    # As the gyros' own noise lets an angle drift that hardly moves.
+    # The integrated gyro noise lets an angle drift, although the vehicle hardly moves.
     drifts = judged({"phi": 0.99, "psi": 0.8}, noise=0.009)
     assert drifts.compatible
     assert drifts.corrections["signals"]

@@ -1,4 +1,4 @@
-"""Configurations of the whole helicopter: its variants, its corrections, and what is refused."""
+"""Configurations of the whole helicopter: variants, corrections and refusals."""
 
 import re
 from pathlib import Path
@@ -18,7 +18,7 @@ XCELL = str(ROOT / "configs" / "vehicles" / "x-cell-60.yaml")
 
 @pytest.fixture
 def load(tmp_path):
-    """load(key=value, ...) -> the experiment of an X-Cell configuration with these keys."""
+    """Return load(key=value, ...), the experiment of an X-Cell configuration with these keys."""
 
     def load(*overrides, **content):
         path = tmp_path / "xcell.yaml"
@@ -44,7 +44,7 @@ def test_the_helicopter_by_name(load, name, model):
 
 
 def test_a_slow_log_gets_more_steps_a_sample(load, tmp_path):
-    """Steps of 5 ms at most, as `simulate` takes them."""
+    """Test steps of at most 5 ms, as in `simulate`."""
     rng = np.random.default_rng(0)
     log = {"t": 0.05 * np.arange(60), "u": rng.standard_normal(60), "y": rng.standard_normal(60)}
     text = "\n".join(",".join(f"{v:.6f}" for v in row) for row in zip(*log.values(), strict=True))
@@ -72,7 +72,7 @@ def test_corrections_switch_on_and_off(load):
 
 
 def test_a_baseline_that_is_switched_off_stays_off(load):
-    # An absent key would switch it on again.
+    # Without the key it would be on again.
     assert configuration.resolved(load(rls=None))["rls"] is None
     assert "rls" in configuration.resolved(load())
 
@@ -117,7 +117,7 @@ def test_shipped_configurations(path):
     for name, free in config.fit.free.items() if config.fit else ():
         low, high = free.lower or 0.0, free.upper or float("inf")
         assert low < free.start < high
-        # A fit that begins at the truth could not fail.
+        # A fit that starts at the truth could not fail.
         assert free.start != float(getattr(experiment.vehicle.params, name))
 
 
@@ -137,7 +137,7 @@ def test_sections_have_the_fields_of_their_records(section, record):
 
 @pytest.mark.parametrize("key", ["fit.starts", "fit.free.Ixx.start", "flights.0.rate"])
 def test_true_is_no_number(key):
-    # YAML writes it without quotes, and Python counts with it as with 1.
+    # YAML writes it without quotes, and Python computes with it as with 1.
     with pytest.raises(InputError, match=r"expected a number, got true$"):
         configuration.load(ROOT / "configs" / "bench-roll.yaml", {key: True})
 
@@ -152,6 +152,6 @@ def test_true_is_no_number(key):
     ],
 )
 def test_text_is_no_number(key, value, got):
-    # The JSON schema refuses it too, so that an editor and a fit say the same.
+    # The JSON schema refuses it too, so an editor shows the same error as a fit.
     with pytest.raises(InputError, match=rf"a number without quotes, got the text {got}$"):
         configuration.load(ROOT / "configs" / "bench-roll.yaml", {key: value})

@@ -1,6 +1,6 @@
-"""The documentation site: every link and anchor holds, and nothing comes from the network.
+"""Documentation site: links and anchors are valid, and nothing is loaded from the network.
 
-`make docs` runs the commands of the pages too, and ends where one fails.
+`make docs` also runs the commands of the pages and stops at the first failure.
 """
 
 import ast
@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """The site without what its pages run: what is wrong in a link or an anchor ends it."""
+    """Build the site without running its commands; a broken link or anchor is an error."""
     folder = tmp_path_factory.mktemp("site")
     done = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)],
@@ -36,7 +36,7 @@ def site(tmp_path_factory):
 
 
 class _Loaded(HTMLParser):
-    """What a browser loads for a page, and where its links lead."""
+    """Return the addresses that a browser loads for a page, and its links."""
 
     def __init__(self):
         super().__init__()
@@ -72,7 +72,7 @@ def test_a_browser_loads_nothing_from_the_network(site, pages):
 
 
 def test_every_link_leads_somewhere(site, pages):
-    # mkdocs asks this of Markdown; here of the HTML too that code made.
+    # mkdocs checks Markdown only; this also checks the generated HTML.
     for name, page in pages.items():
         if name == "404.html":
             continue
@@ -97,8 +97,8 @@ def test_the_reference_has_what_the_code_has(site, pages):
     assert [k.path for k in keys() if not k.meaning] == []
     anchors = pages["reference/api.html"].anchors
     described = {a.rsplit(".", 1)[-1] for a in anchors}
-    assert set(heli_jax.__all__) - described == {"models"}  # a module, told in words
-    # Nothing that the build made shows where it was made.
+    assert set(heli_jax.__all__) - described == {"models"}  # a module, described in words
+    # Built pages do not contain the path of the build.
     assert str(ROOT) not in "".join(p.read_text() for p in site.rglob("*.html"))
 
 
@@ -106,7 +106,7 @@ PAGES = sorted((ROOT / "docs").rglob("*.md"))
 
 
 def test_the_commands_of_the_pages_are_commands():
-    """Their names and options; what they do is shown by the tests of each command."""
+    """Test names and options of commands in the pages."""
     from heli_jax import cli
 
     parser, count = cli._parser(), 0
@@ -115,7 +115,7 @@ def test_the_commands_of_the_pages_are_commands():
         lines = re.findall(r"^ *(?:\$ )?heli-jax ([^:\n]*)$|`heli-jax ([^`]*)`", text, re.MULTILINE)
         for line in map("".join, lines):
             words = shlex.split(line.partition(" | ")[0].partition(" > ")[0], comments=True)
-            # A command alone is a name in a sentence.
+            # A command without options is a name in a sentence.
             if len(words) > 1 and not {"--help", "--version"} & {*words}:
                 parser.parse_args(words)
                 count += 1

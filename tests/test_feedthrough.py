@@ -1,4 +1,4 @@
-"""Which outputs follow an input within a sample of a rate."""
+"""Outputs that follow an input within a sample."""
 
 from heli_jax import config as configuration
 from heli_jax.config.feedthrough import follows
@@ -46,11 +46,11 @@ def found(folder, rate, start, more="", hold="auto"):
 
 def test_an_acceleration_jumps_with_the_stick_and_a_speed_does_not(tmp_path):
     assert found(tmp_path, 40.0, -20) == {("col", "az"): True}
-    # Nothing is known of a coefficient that begins at zero, but that it is one.
+    # A coefficient that starts at zero is unknown, so the output counts.
     assert found(tmp_path, 40.0, 0) == {("col", "az"): True}
-    # Behind the autopilot's filter it follows within a sample of 20 Hz, and no more of 200 Hz.
+    # Behind the autopilot's filter it follows within a sample at 20 Hz, but not at 200 Hz.
     filtered = ", filter: {kind: pt1, hz: 30}"
     assert found(tmp_path, 20.0, -20, filtered) == {("col", "az"): False}
     assert found(tmp_path, 400.0, -20, filtered) == {}
-    # Nobody asks where nothing is resampled, or no input is held.
+    # The pairs are not needed without resampling or without a held input.
     assert found(tmp_path, None, -20) == found(tmp_path, 40.0, -20, hold="linear") == {}

@@ -1,4 +1,4 @@
-"""Runs of the whole helicopter by configuration: trimmed start, wind, pilot, ground, limits."""
+"""Simulated flights of the whole helicopter: trimmed start, wind, pilot, ground, limits."""
 
 import dataclasses
 from pathlib import Path
@@ -18,7 +18,7 @@ XCELL = str(ROOT / "configs" / "vehicles" / "x-cell-60.yaml")
 
 @pytest.fixture
 def made(tmp_path):
-    """made(key=value, ...) -> the table of a run of two seconds with these keys in `simulate`."""
+    """Return made(key=value, ...), the table of two seconds with these keys in `simulate`."""
 
     def made(model="helicopter-consistent", disturbance=None, **simulate):
         path = tmp_path / "xcell.yaml"
@@ -44,7 +44,7 @@ def test_start_wind_pilot_and_ground(made):
         ground=-1.0,
         noise={"roll": {"sd": 2, "unit": "mrad"}},
     )
-    # A trimmed descent at 1 m/s is at -1 m after one second; the row at that moment may be there.
+    # A trimmed descent at 1 m/s is at -1 m after one second, where a row may exist.
     (ended,) = found.notes
     assert (ended.code, ended.value) == ("simulation.ends-on-ground", pytest.approx(1.0, abs=1e-3))
     c = found.columns
@@ -81,7 +81,7 @@ def test_what_leaves_the_range_is_told(made):
         {"start": {"climb": 50}},
         {"inputs": {"x_rol": {"amplitude": 1}}},
         {"noise": {"rol": {"sd": 1}}},
-        # Of the whole helicopter alone:
+        # Only of the whole helicopter:
         {"model": "roll", "start": {}},
         {"model": "roll", "wind": [0, 0, 0]},
         {"model": "roll", "hold_attitude": True},
@@ -110,7 +110,7 @@ def test_a_vehicle_without_what_the_model_needs(tmp_path):
         "simulate": {"duration": 1, "rate": 50},
     }
     path.write_text(yaml.safe_dump(content))
-    # Named by its own file: the configuration is right.
+    # The error names the vehicle file, since the configuration is right.
     with pytest.raises(InputError, match=r"^\S*/bench-30.yaml: m, .* missing, "):
         generate.generate(configuration.load(path))
 
@@ -125,14 +125,14 @@ def test_a_shipped_manoeuvre_from_the_command_line(tmp_path):
     assert names[:7] == ["t", *sticks, "phi"]
     numbers = np.array([[float(v) for v in row.split(",")] for row in rows])
     table = dict(zip(names, numbers.T, strict=True))
-    # About the stick that holds the rotor against the tail's pull.
+    # The stick moves about the value that holds the rotor against the tail's pull.
     added = table["stick_roll"] - table["stick_roll"][0]
     assert set(np.round(added, 9)) == {-0.5, 0.0, 0.5}
     assert table["stick_roll"][0] < 0
-    # The governor is asked for the whole speed; the collective is that of hover.
+    # The governor keeps the full speed; the collective is that of hover.
     np.testing.assert_allclose(table["throttle"], 100.0, atol=1e-4)
     np.testing.assert_allclose(table["collective"], 49.9596, atol=1e-3)
-    # The rate is the angle's slope, both with their noise.
+    # The rate is the angle's derivative; both have their noise.
     slope = np.gradient(table["phi"], table["t"])
     assert np.corrcoef(slope, table["p"])[0, 1] > 0.9
     assert 5 < np.ptp(table["phi"]) < 60

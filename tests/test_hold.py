@@ -1,4 +1,4 @@
-"""What the command line says of the time between samples: simulate, check, fit, a sweep."""
+"""Holds of inputs on the command line: simulate, check, fit and a sweep."""
 
 from pathlib import Path
 
@@ -18,14 +18,14 @@ KEY = "flights.0.signals.inputs.x_roll.hold"
 
 @pytest.fixture(scope="module")
 def chirped(tmp_path_factory):
-    """The demo's bench with a chirp, and its log."""
+    """Return the demo's bench with a chirp, and its log."""
     folder = tmp_path_factory.mktemp("chirp")
     content = yaml.safe_load((ROOT / "configs" / "bench-gusts.yaml").read_text())
     content["vehicle"] = str(ROOT / "configs" / "vehicles" / "bench-30.yaml")
     content["flights"][0]["log"] = "bench.csv"
     del content["disturbance"]
     content["rls"] = None
-    content["simulate"]["duration"] = 20  # 1000 samples, as elsewhere
+    content["simulate"]["duration"] = 20  # 1000 samples, as in other tests
     content["simulate"]["inputs"]["x_roll"] |= {"kind": "chirp", "amplitude": 10.0}
     free = {"Ixx": {"start": 0.03}, "If": {"start": 2e-4}}
     content["fit"] = {"method": "output-error", "free": free}
@@ -42,7 +42,7 @@ def test_no_such_hold(chirped, capsys):
 
 @pytest.mark.slow
 def test_a_sweep_follows_the_holds_of_its_flights():
-    """Reduced while it goes on, kept whole, and delayed: each as simulate has it."""
+    """Test holds in a reduced sweep, stored trajectories and with a delay against simulate."""
     vehicle = load_vehicle(ROOT / "configs" / "vehicles" / "bench-30.yaml")
     model, stick = models.roll_on_stand, 3e-6 * np.sin(2.0 * np.arange(60) ** 1.2)
     stick[20:40] = np.repeat([1e-6, -2e-6], 10)

@@ -1,4 +1,4 @@
-"""Who may import whom: read from the source, so that nothing has to run."""
+"""Allowed imports between the parts of the package, read from the source."""
 
 import ast
 import functools
@@ -20,7 +20,7 @@ BASE = {
     "errors", "pickled", "import_path", "regular_file", "units", "naming", "numerics", "yaml_file",
     "vehicle", "versions", "numbers", "summaries", "exports", "stages", "finding", "messages",
 }  # fmt: skip
-# What each part may import of heli_jax, beside itself.
+# Parts of heli_jax that each part may import, beside itself.
 ALLOWED = {
     "errors": set(),
     "finding": {"messages"},
@@ -55,7 +55,7 @@ ALLOWED = {
         *BASE,
     },
 }  # fmt: skip
-# Entry points may import everything below them, never the command line.
+# Entry points may import everything below them, but never the command line.
 ENTRY = {
     "config", "generate", "new_model", "run_directory", "workflow", "cli",
     "compatibility", "new_config", "studies", "sweep_workflow",
@@ -70,7 +70,7 @@ def part(path):
 
 @functools.cache
 def imported(path):
-    """(module, line) of every import in a file, those inside functions too."""
+    """Yield (module, line) of every import in a file, including those in functions."""
     return tuple(_imported(path))
 
 
@@ -87,7 +87,7 @@ def _imported(path):
 
 
 def inner(path):
-    """Parts of heli_jax that a file imports."""
+    """Return the parts of heli_jax that a file imports."""
     for module, line in imported(path):
         names = module.split(".")
         if names[0] == "heli_jax" and len(names) > 1:
@@ -120,7 +120,7 @@ def test_imports_point_one_way(name):
     assert not wrong
 
 
-# Within identification, from what a problem is to its result: each room imports those before it.
+# Order within identification: each part may import the parts before it.
 ROOMS = (
     "methods", "defaults", "problem", "unknowns",
     "estimation", "identifiability", "design", "validation", "equation_error", "result",
@@ -163,7 +163,8 @@ def test_no_modules_import_each_other_in_a_circle():
 @pytest.mark.parametrize(
     ("library", "homes"),
     [
-        # simulated_flights.py names diffrax.ForwardMode: Levenberg-Marquardt needs that derivative.
+        # simulated_flights.py uses diffrax.ForwardMode, since Levenberg-Marquardt needs that
+        # derivative.
         ("diffrax", {"simulation", "identification/estimation/simulated_flights.py"}),
         ("optimistix", {"identification/estimation", "analysis/trim.py"}),
         ("lineax", {"identification/estimation"}),
@@ -204,7 +205,7 @@ def test_no_modules_import_each_other_in_a_circle():
         ("pickle", set()),
         ("marshal", set()),
         ("shelve", set()),
-        # Of objects that a script passes between processes; no file is written with it.
+        # For objects that a script passes between processes; files are never pickled.
         ("cloudpickle", {"pickled.py"}),
         ("dill", set()),
     ],

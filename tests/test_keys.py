@@ -1,4 +1,4 @@
-"""The reference of a configuration against the classes that check it, and JSON's own checker."""
+"""The configuration reference against the classes that check it and a JSON schema checker."""
 
 import copy
 import json
@@ -42,7 +42,7 @@ def test_the_schema_takes_what_is_shipped(path: Path) -> None:
         ("onboard", {"servos": {"on": ["lat"]}}, True),
         ("onboard", {"servos": [{"on": ["lat"]}], "gyro": {"on": {"ped": "r"}}}, True),
         ("onboard", {"servos": {"on": "lat"}}, False),
-        # What an editor writes for a key that may be left out.
+        # An editor writes null for an optional key.
         ("onboard", {"gyro": {"on": None}, "rate_loop": {"on": None}}, True),
         ("onboard", {"delays": {"inputs": None}}, False),
         ("disturbance", {"axis": "roll", "on": None, "sigma_w": None, "tau_w": None}, True),

@@ -1,4 +1,4 @@
-"""What `heli-jax frf` says of inputs between samples."""
+"""Holds of inputs in `heli-jax frf`."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""`heli-jax frf`: from a log to responses, by a known linear system that SciPy simulated."""
+"""`heli-jax frf`: responses of a known linear system, simulated by SciPy."""
 
 import csv
 import dataclasses
@@ -43,7 +43,7 @@ frequency:
 
 
 def record(seed: int, n: int = 6000, feedback: float = 0.0) -> dict[str, np.ndarray]:
-    """Twelve over s + 3 from a stick that is held, with gusts, and a stick that may follow."""
+    """Write a log of 12 / (s + 3) with a held stick, gusts and optional feedback."""
     rng = np.random.default_rng(seed)
     b, a = ROLL[0].ravel()[1], ROLL[1][1]
     slow = scipy.signal.butter(1, 2.0, fs=1 / DT)
@@ -83,7 +83,7 @@ def test_a_log_becomes_responses_files_and_a_transfer_function(config, tmp_path)
     pole = fitted["denominator"][1]
     assert pole["lower95"] < 3.0 < pole["upper95"]
     assert pole["sd"] < 1.0
-    # The hold of the stick is half a sample late, which is not the machine's.
+    # The hold delays the stick by half a sample, which is not part of the vehicle.
     assert fitted["delay_s"]["lower95"] < 0.0 < fitted["delay_s"]["upper95"]
     data = xr.open_dataset(out / "responses.nc", engine="scipy")
     assert data["unit"].sel(input="lat", output="p") == "rad/s"
@@ -97,11 +97,12 @@ def test_a_log_becomes_responses_files_and_a_transfer_function(config, tmp_path)
     rows = list(csv.DictReader((out / "responses.csv").read_text().splitlines()))
     assert len(rows) == 120
     assert float(rows[7]["gain"]) == pytest.approx(abs(H[7]), rel=1e-12)
-    # The angle is not logged: that of the rate's response. The loop has no delay but the hold.
+    # The angle is not logged, so the response is that of the rate over s. The loop has only the
+    # hold's delay.
     (handling,) = json.loads((out / "handling_qualities.json").read_text())
     assert handling["integrated"]
     bandwidth = handling["data"]["numbers"]["phase_bandwidth"]
-    # -90 - atan(w / 3) deg passes -135 deg at the pole.
+    # The phase -90 - atan(w / 3) deg passes -135 deg at the pole.
     assert bandwidth["value"] == pytest.approx(3.0, abs=3.0 * bandwidth["sd"])
     assert bandwidth["sd"] < 0.8
     assert handling["data"]["numbers"]["phase_delay"] is None
@@ -161,7 +162,7 @@ def test_an_axis_without_a_stick_is_said_and_a_speed_has_no_handling_qualities()
 
 
 def test_half_a_sample_of_delay_hangs_on_a_guess(config, tmp_path):
-    """A stick that moves at every sample was held all the same: the delay is 10 ms too long."""
+    """Test a held stick taken for a linear one: its delay is 10 ms too long."""
     known = config.read_text()
     config.write_text(known.replace(", hold: zero-order", ""))
     out = tmp_path / "guessed"
@@ -187,7 +188,7 @@ def test_degrees_that_are_read_as_radians_are_said(config, tmp_path):
 
 def test_what_chance_makes_of_few_averages_sets_no_axes():
     omega = np.geomspace(1.0, 100.0, 120)
-    coherence = np.where(omega < 20.0, 0.9, 0.15)  # chance makes an eighth of eight averages
+    coherence = np.where(omega < 20.0, 0.9, 0.15)  # 1/8 by chance
     pair = Pair(1.0 / (1j * omega), np.full(120, 1e-3), coherence)
     few, many = (seen_of(omega, pair, averages) for averages in (8.0, 100.0))
     assert few[omega < 15.0].all()
@@ -250,7 +251,7 @@ def test_a_transfer_function_that_cannot_be_fitted_keeps_nothing_else_back(confi
         file.write("    - {input: lat, output: p, zeros: 7, poles: 8, band: [0.5, 1.2]}\n")
         file.write("    - {input: lat, output: phi, poles: 1, delay: false}\n")
     out = tmp_path / "out"
-    # As of a fit that is not identifiable: a script must not take numbers that are not there.
+    # As for a fit that is not identifiable, scripts must not get meaningless numbers.
     assert main(["frf", str(config), "--out", str(out)]) == 3
     one, many, other = json.loads((out / "transfer_functions.json").read_text())
     assert one["status"] == "converged"

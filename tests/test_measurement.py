@@ -1,4 +1,4 @@
-"""What a configuration says of filters, delays and vibration between motion and log."""
+"""Filters, delays and vibration between motion and log in a configuration."""
 
 import re
 from dataclasses import replace
@@ -28,7 +28,7 @@ def stick(times):
 
 
 def write_log(path, p, parameters=(("INS_GYRO_FILTER", 20.0),)):
-    """A DataFlash log in text with a gyro, and sticks as they were sent."""
+    """Write a DataFlash log in text, with a gyro and sticks as sent."""
     text = ["FMT, 130, 27, IMU, Qdd, TimeUS,GyrX,C1"]
     text += ["FMT, 140, 31, PARM, QNf, TimeUS,Name,Value"]
     text += [f"PARM, 0, {n}, {v}" for n, v in parameters]
@@ -45,7 +45,7 @@ def flight(log="flight.log", **p):
 
 @pytest.fixture
 def load(tmp_path):
-    """load(flight, ...) -> the experiment with these flights."""
+    """Return load(flight, ...), the experiment with these flights."""
 
     def load(*flights, **content):
         path = tmp_path / "config.yaml"
@@ -67,7 +67,7 @@ def test_a_filter_is_stated_or_read_from_the_log(load, tmp_path):
     cascade = load(flight(filter=notches))
     expected = [Filter("notch", 40.0, 5.0), Filter("pt2", 90.0)]
     assert cascade.model is with_filters(bare, {"p": expected})
-    # The resolved configuration describes the same.
+    # The resolved configuration describes the same experiment.
     again = tmp_path / "again.yaml"
     again.write_text(yaml.safe_dump(configuration.resolved(cascade)))
     assert configuration.load(again).model is cascade.model
@@ -100,7 +100,7 @@ def test_flights_share_the_model(load):
 
 def test_a_filter_that_is_not_modelled_is_a_caution(load, tmp_path):
     (source,) = [f.source for f in read_flights(load(flight()))]
-    # A Butterworth filter of second order delays by sqrt(2)/omega: 11.25 ms.
+    # A Butterworth filter of second order has a delay of sqrt(2)/omega: 11.25 ms.
     (caution,) = source.cautions
     assert (caution.code, caution.subjects) == ("filters.not-modelled", ("p",))
     assert caution.value == pytest.approx(0.01125, abs=1e-5)
@@ -117,10 +117,16 @@ def test_a_filter_that_is_not_modelled_is_a_caution(load, tmp_path):
     ("method", "hz", "behind", "fixed", "said"),
     [
         ("filter-error", 20, False, ["sigma_y"], True),
-        ("filter-error", 20, False, [], False),  # it is estimated
-        ("filter-error", 20, True, ["sigma_y"], False),  # noise that the logger added is white
+        ("filter-error", 20, False, [], False),  # the delay is estimated
+        ("filter-error", 20, True, ["sigma_y"], False),  # noise added by the logger is white
         ("filter-error", 90, False, ["sigma_y"], False),
-        ("output-error", 20, False, ["sigma_y"], False),  # its intervals allow for it
+        (
+            "output-error",
+            20,
+            False,
+            ["sigma_y"],
+            False,
+        ),  # its intervals allow for it
     ],
 )
 def test_given_noise_that_a_low_pass_coloured_is_a_caution(
@@ -160,14 +166,14 @@ def test_settings_of_firmwares():
     betaflight = {"gyro_lowpass_type": "0", "gyro_lowpass_hz": "90"}
     betaflight |= {"gyro_notch_hz": "200,0", "gyro_notch_cutoff": "150,100", "dyn_notch_count": "3"}
     logged = logged_filters("Betaflight 4.2", betaflight, "gyroADC[2]")
-    # Q of a notch from its lower edge: f f1 / (f^2 - f1^2).
+    # Q of a notch follows from its lower edge: f f1 / (f^2 - f1^2).
     assert logged.filters == (Filter("pt1", 90.0), Filter("notch", 200.0, 30000 / 17500))
     assert logged.unknown == ("dyn_notch_count = 3",)
     moving = {**ROTORFLIGHT, "gyro_lpf1_dyn_hz": "25,200"}
     logged = logged_filters("Rotorflight 4.3.0", moving, "gyroADC[0]")
     assert logged.unknown == ("gyro_lpf1_dyn_hz = 25,200",)
     assert Filter("pt1", 150.0) not in logged.filters
-    # Its newer versions number the types from 6 on otherwise.
+    # Newer versions number the types from 6 on differently.
     newer = {**ROTORFLIGHT, "gyro_lpf1_type": "7", "gyro_lpf2_type": "0"}
     logged = logged_filters("Rotorflight 4.6.0", newer, "gyroADC[0]")
     assert logged.unknown == ("gyro_lpf1_static_hz = 150 of type 7",)
@@ -182,7 +188,7 @@ def test_lines_are_found_named_and_unfolded():
     np.testing.assert_allclose([first.hz, second.hz], [24.2, 55.0], atol=0.13)
     np.testing.assert_allclose(first.share, 0.045 / np.var(shaken), rtol=0.2)
     assert (first.harmonic, second.harmonic) == (1, 0)
-    # 80 Hz logged at 100 Hz appears at 20 Hz: two turns at 40 Hz.
+    # 80 Hz logged at 100 Hz appears at 20 Hz, which is two per rev at 40 Hz.
     assert folded(80.0, 100.0) == 20.0
     times = 0.01 * np.arange(1500)
     (line,) = lines(np.sin(2 * np.pi * 80 * times) + 0.1 * rng.standard_normal(1500), 0.01, 40.0)
@@ -202,11 +208,11 @@ def test_notches_on_both_sides_bias_nothing(load, tmp_path):
     assert noisy.source.cautions[-1].code == "vibration.lines"
     (clean,) = read_flights(load(shaken | {"notch": [24.2]}))
     assert "vibration.lines" not in {c.code for c in clean.source.cautions}
-    # The notched stick drives the same machine to the notched motion, behind the notch's transient.
+    # The notched stick drives the same vehicle to the notched motion, after the notch's transient.
     again = scipy.signal.lfilter([0, 1 - decay], [1, -decay], clean.inputs["lat"])
     settled = TIMES > 2.0
     np.testing.assert_allclose(clean.outputs["p"][settled], again[settled], atol=2e-4)
-    # On one side alone it would not.
+    # With a notch on one side alone it would not.
     assert np.max(np.abs(notched(p, DT, [24.2], 10.0) - p)[settled]) > 3e-3
     with pytest.raises(InputError, match="notch: expected less than half the rate of 200 Hz"):
         read_flights(load(shaken | {"notch": [150.0]}))
@@ -225,7 +231,7 @@ def test_a_notch_begins_anew_behind_missing_samples():
     clean = with_notches(gap, [24.2], "notch")
     np.testing.assert_array_equal(clean.inputs["lat"], whole)
     got = clean.outputs["p"]
-    # Its free motion is down to a twentieth after three time constants, Q/(pi f).
+    # The notch's free motion decays to a twentieth after three time constants, Q/(pi f).
     settled = 30.0 / (np.pi * 24.2) < TIMES - 4.2
     assert np.array_equal(np.isfinite(got), (TIMES <= 4.0) | settled)
     np.testing.assert_array_equal(got[TIMES <= 4.0], whole[TIMES <= 4.0])
@@ -248,7 +254,7 @@ def test_a_notch_leaves_a_slow_sensor_what_it_cannot_have():
     clean = with_notches(flight, [24.2, 48.4], "notch")
     np.testing.assert_array_equal(clean.outputs["h"], slow)
     np.testing.assert_array_equal(clean.outputs["p"], clean.inputs["lat"])
-    # By its own samples, and at the line alone that they have.
+    # The slow output is notched at its own samples, and only at the line that they contain.
     own = clean.outputs["v"][1::3]
     np.testing.assert_array_equal(own, notched(x[1::3], 3 * DT, [24.2], 10.0))
     assert np.isnan(np.delete(clean.outputs["v"], np.s_[1::3])).all()

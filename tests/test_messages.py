@@ -1,4 +1,4 @@
-"""Every finding has words, and all words are of a finding."""
+"""Messages: every finding has a text, and every text has a finding."""
 
 import ast
 import re
@@ -16,7 +16,7 @@ CODE = re.compile(r"[a-z][a-z-]+\.[a-z][a-z0-9-]+")
 
 
 def strings():
-    """All text constants of the package that may be a code."""
+    """Return all text constants of the package that may be a code."""
     for path in ROOT.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             text = node.value if isinstance(node, ast.Constant) else None
@@ -25,7 +25,7 @@ def strings():
 
 
 def codes_found():
-    """The codes that `found(...)` and `sentence(...)` are called with."""
+    """Return the codes passed to `found(...)` and `sentence(...)`."""
     for path in ROOT.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             called = node.func if isinstance(node, ast.Call) else None

@@ -1,4 +1,4 @@
-"""Record classes of every kind that the package accepts."""
+"""Record classes of every accepted kind."""
 
 import dataclasses
 from typing import Annotated, NamedTuple

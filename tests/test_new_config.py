@@ -1,4 +1,4 @@
-"""`heli-jax new`: guesses of logs whose channels are known, and files that others then read."""
+"""`heli-jax new`: guesses for logs with known channels, and the resulting files."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -56,7 +56,7 @@ def test_a_stick_in_pulse_widths_beside_a_rate_becomes_a_configuration_that_read
 ) -> None:
     log, out = write(tmp_path / "run.csv", table()), tmp_path / "run.yaml"
     assert cli.main(["new", str(log), "--out", str(out)]) == 0
-    # A stand or a flybar moves the same signals: the other models are named.
+    # A stand or a flybar has the same signals, so the other models are listed.
     assert "#   roll-on-stand: " in out.read_text()
     made = Config.model_validate(yaml_file.read_mapping(out))
     signals = made.flights[0].signals
@@ -68,7 +68,7 @@ def test_a_stick_in_pulse_widths_beside_a_rate_becomes_a_configuration_that_read
     assert {n: (o.signal, o.unit) for n, o in signals.outputs.items()} == {
         "p": ("roll_rate_dps", "deg/s")
     }
-    # What stands there is not replaced.
+    # An existing file is not replaced.
     before = out.read_text()
     assert cli.main(["new", str(log), "--out", str(out)]) == 2
     assert out.read_text() == before
@@ -88,7 +88,7 @@ def test_what_only_the_user_knows_is_refused_until_it_is_given(tmp_path: Path) -
     vehicle = yaml_file.read_mapping(tmp_path / "mine-vehicle.yaml")
     assert vehicle["Omega"]["value"] == pytest.approx(1450 * np.pi / 30, rel=1e-4)
     assert vehicle["L3"] == {"value": "EDIT", "unit": "m"}
-    # The inertias are asked for once, in the vehicle file, where the search begins too.
+    # The inertias are requested once, in the vehicle file, which also gives the start values.
     assert yaml_file.read_mapping(out)["fit"]["free"] == {"Ixx": {}, "If": {}}
     assert cli.main(["check", str(out)]) == 2
     bench = Path("configs/vehicles/bench-30.yaml").read_text()
@@ -99,7 +99,7 @@ def test_what_only_the_user_knows_is_refused_until_it_is_given(tmp_path: Path) -
 
 
 def test_a_stick_and_an_axis_that_were_not_logged(tmp_path: Path) -> None:
-    """A hover of which roll and pitch were logged: the pedal stays, and no gust of yaw shows."""
+    """Test a hover with only roll and pitch logged: the pedal stays, and no yaw gust is added."""
     columns = table("roll_rate_dps", "lat_cmd")
     columns |= {"lon_cmd": columns["lat_cmd"][::-1], "pitch_rate_dps": columns["roll_rate_dps"]}
     log, out = write(tmp_path / "hover.csv", columns), tmp_path / "hover.yaml"
@@ -109,7 +109,7 @@ def test_a_stick_and_an_axis_that_were_not_logged(tmp_path: Path) -> None:
     assert cli.main(["check", str(out)]) == 2
     out.write_text(out.read_text().replace("{signal: EDIT}", "{constant: 0}"))
     assert problem(load_config(out)).free
-    # The file's numbers are another machine's: they have to be written down to be begun from.
+    # The file has another vehicle's numbers: they are stated as start values.
     with pytest.raises(InputError, match=r"Lb\.start: "):
         problem(load_config(out, {"fit.free": {"Lb": {}}}))
 
@@ -145,7 +145,7 @@ def test_topics_with_clocks_of_their_own_get_a_rate() -> None:
     series = {"gyro": Series(fast, fast), "stick": Series(slow, slow), "gps": Series(gps, gps)}
     assert common_rate(series, ["gyro"]) == 100.0
     assert common_rate(series, ["gyro", "stick"]) == 25.0
-    # A slow sensor keeps its own samples; alone it sets the rate.
+    # A slow sensor keeps its own samples; alone it determines the rate.
     assert common_rate(series, ["gyro", "stick", "gps"]) == 25.0
     assert common_rate(series, ["gps"]) == 5.0
     assert common_rate(series, []) is None
@@ -208,7 +208,7 @@ def test_a_whole_name_goes_before_one_that_holds_it_and_commands_are_no_measurem
     assert by_name(["phi", "roll"], names) == ["roll", "log.roll"]
 
 
-# A name a field; blanks within a name stand in quotes elsewhere.
+# One name per field; in other formats a name with blanks is quoted.
 CALLED = {
     ("outputs", "roll_rate"): "RollRate gyroX wx omega_x p_meas phi_dot gyroADC[0] p_radps imu_gx "
     "AngVelX /orientation/roll-rate-degps gx_dps RollRate_degPerSec roll_rate_deg_sec_filt wx.raw "
@@ -341,13 +341,14 @@ def test_sticks_that_count_to_their_stops() -> None:
         found = scaled(name, Series(np.arange(50.0), values), "1", full)
         return found.unit, found.scale
 
-    # Betaflight's commands in steps of pulse widths; a radio's sticks as the stop of one tells.
+    # Betaflight's commands are in steps of pulse widths; a radio's stick shows its range at one
+    # stop.
     assert stick("rcCommand[0]") == ("1", 1 / 500)
     assert stick("Ail") == ("1", 0.001)
     thr = Series(np.arange(50.0), np.where(np.arange(50) < 9, -1024.0, values))
     assert stick("Ail", full_travel({"Ail": thr, "Thr": thr})) == ("1", 1 / 1024)
     assert full_travel({"x": Series(np.arange(50.0), values)}) is None
-    # Whole numbers are no rad/s, however small.
+    # Whole numbers are not rad/s, however small.
     rate = Series(np.arange(50.0), np.round(np.linspace(-5, 6, 50)))
     assert scaled("gyroADC[0]", rate, "rad/s").unit == "deg/s"
 
@@ -356,7 +357,7 @@ def test_sticks_that_count_to_their_stops() -> None:
 def test_pulse_widths_by_the_unit_of_the_file_get_scale_and_offset(
     tmp_path: Path, unit: str
 ) -> None:
-    """A stick in microseconds is a receiver's, and no time."""
+    """Test that a stick in microseconds is a receiver's, not a time."""
     columns = {"t": T, "aileron": 1500.0 + 400.0 * STICK, "p": RATE}
     lines = write(tmp_path / "run.csv", columns).read_text().splitlines()
     log, out = tmp_path / "run.csv", tmp_path / "run.yaml"
@@ -376,7 +377,7 @@ def test_pulses_rest_where_the_record_begins_unless_a_manoeuvre_goes_on_there() 
 
     assert offset(1754.0, 30) == 1500.0
     assert offset(1532.0, 30) == 1532.0
-    # Of a collective, say.
+    # A collective, for example.
     assert offset(1754.0, 300) == 1754.0
 
 
@@ -471,7 +472,7 @@ def test_a_logged_sweep_is_offered_as_an_instrument_and_dead_channels_are_no_sig
     "rate", ["rate_deg_s", "rate_deg_per_s", "rate_degrees_per_second", "rate [deg s-1]", "rate"]
 )
 def test_a_rate_is_never_taken_for_the_stick(tmp_path: Path, rate: str) -> None:
-    """A rate follows itself more closely than it follows any stick."""
+    """Test that a rate is not taken for its own stick."""
     columns = table(f"roll_{rate}", "output 1")
     columns["roll_deg"] = np.degrees(np.cumsum(RATE) * 0.02)
     log, out = write(tmp_path / "run.csv", columns), tmp_path / "run.yaml"
@@ -480,7 +481,7 @@ def test_a_rate_is_never_taken_for_the_stick(tmp_path: Path, rate: str) -> None:
     signals = Config.model_validate(yaml_file.read_mapping(out)).flights[0].signals
     assert signals.inputs["lat"].signal == "output 1"
     assert signals.outputs["p"].signal == f"roll_{rate}"
-    # Without the stick's column nothing is left that may be one: the user is asked.
+    # Without the stick's column no candidate is left, so the user must name it.
     del columns["output 1"], columns["battery"]
     write(log, columns | {"yaw_rate_deg_s": columns[f"roll_{rate}"] + 1.0})
     assert cli.main([*asked, str(tmp_path / "none.yaml")]) == 0
@@ -491,7 +492,7 @@ def test_a_rate_is_never_taken_for_the_stick(tmp_path: Path, rate: str) -> None:
 
 def test_what_a_controller_puts_out_is_a_stick_and_its_rate_is_none() -> None:
     assert no_stick("RATE.R", "", "1") == "an angular rate"
-    # ArduPilot's name of the controller's output, which its preset takes for the stick.
+    # ArduPilot's controller output, which its preset takes for the stick.
     assert no_stick("RATE.ROut", "", "1") == ""
     assert words_in("RATE.RDes") == ("rate", "r", "des")
     assert words_in("rollRate") == words_in("Roll Rate") == ("roll", "rate")
@@ -509,7 +510,7 @@ def test_numbered_channels_are_guesses_and_what_follows_one_goes_before(tmp_path
     lines = [line for line in out.read_text().splitlines() if "_raw" in line]
     assert len(lines) == 2
     assert all("GUESS: by its number" in line for line in lines)
-    # A receiver in another order: the rate tells.
+    # A receiver with another channel order: the rate identifies the stick.
     swapped = {"chan2_raw": columns["chan1_raw"], "chan1_raw": columns["chan2_raw"]}
     log, out = write(tmp_path / "one.csv", columns | swapped), tmp_path / "one.yaml"
     assert cli.main(["new", str(log), "--out", str(out), "--model", "linear:roll-flybarless"]) == 0
@@ -523,7 +524,7 @@ def test_counts_of_a_converter_are_no_degrees() -> None:
     for si in ("rad", "rad/s"):
         found = scales.scaled("gyro_x_raw", counts, si)
         assert (found.unit, found.scale, found.offset) == (si, "EDIT", pytest.approx(2048, abs=150))
-    # Neither a heading in whole degrees nor the speed of a rotor is one.
+    # A heading in whole degrees or a rotor speed is not a stick.
     heading = Series(T, np.rint(200 + 90 * np.sin(3 * T)))
     assert scales.scaled("heading", heading, "rad").unit == "deg"
     assert scales.scaled("headspeed", counts, "rad/s").scale == 1.0
@@ -540,10 +541,10 @@ def test_columns_that_cannot_be_read_are_named_where_they_would_be_a_signal(
     log.write_text("\n".join(["time,aileron,p,P,roll,mode", *rows]) + "\n")
     written = write_config(log, tmp_path / "c.yaml", model="linear:roll-flybarless")
     assert [n.subjects for n in written.notes if n.code == "channels.left-out"] == [("roll",)]
-    # P beside p: the one that is called as in the model.
+    # With P and p, the one with the model's name is chosen.
     text = (tmp_path / "c.yaml").read_text()
     assert "p: {signal: p, unit: rad/s}" in text
-    # What no line makes free is another machine's.
+    # Fixed parameters have another vehicle's values.
     assert "    # tau_f: {start: 0.04631}" in text
     log.write_text("\n".join(["time,aileron,p,p,roll,mode", *rows]) + "\n")
     written = write_config(log, tmp_path / "d.yaml", model="linear:roll-flybarless")
@@ -576,6 +577,6 @@ def test_counts_of_a_serial_bus_are_no_pulse_widths() -> None:
     assert found.scale == pytest.approx(1.0 / 819.5)
     assert "S.BUS" in found.remarks[0]
     assert scaled("sbus_ch1", Series(T, np.rint(992.0 + 800.0 * np.sin(T))), "1").offset == 992.0
-    # Of pulse widths the middle is 1500, also where a throttle stays below.
+    # The centre of pulse widths is 1500, also if a throttle stays below.
     assert "pulse" in scaled("ch1", Series(T, np.rint(1500.0 + 300.0 * np.sin(T))), "1").remarks[0]
     assert "pulse" in scaled("thr", Series(T, np.rint(1250.0 + 90.0 * np.sin(T))), "1").remarks[0]

@@ -1,4 +1,4 @@
-"""The skeleton of a model of one's own runs as it is written, and the page about it is true."""
+"""`heli-jax new-model`: the skeleton runs unchanged, and its page is correct."""
 
 import os
 import re
@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def run(folder, *arguments):
-    # The skeleton's module is found beside it; nothing is compiled into the folder.
+    # Python finds the skeleton's module beside it, without writing compiled files there.
     done = subprocess.run(
         [sys.executable, "-W", "error", *arguments], capture_output=True, text=True, cwd=folder,
         check=False, env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},

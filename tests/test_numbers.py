@@ -12,7 +12,7 @@ VALUES = st.floats(1e-12, 1e12) | st.floats(-1e12, -1e-12) | st.just(0.0)
 
 
 def value_of(text):
-    """What a number of a page is, without any of the code under test."""
+    """Return the number shown on a page, computed without the code under test."""
     digits, _, power = text.replace("−", "-").partition("·10")
     raised = "".join("-0123456789"["⁻⁰¹²³⁴⁵⁶⁷⁸⁹".index(c)] for c in power) or "0"
     return float(f"{digits}e{raised}")
@@ -65,7 +65,7 @@ def test_powers_stand_as_python_writes_them(value, page, terminal):
         ("1.2e+02 % (-7.5e-06)", "120 % (−7.5·10⁻⁶)", "120 % (-7.5e-06)"),
         ("factor 1.5e+04, +2e+00", "factor 15000, +2", "factor 15000, +2"),
         ("at 2.50e+07.", "at 2.50·10⁷.", "at 2.50e+07."),
-        # What a user wrote, and what is no number.
+        # Numbers written by a user, and texts that are not numbers.
         ("got '1e3' in runs/1e-03/fit.json", "got '1e3' in runs/1e-03/fit.json", None),
         ("1e-03.csv has a 0x1e3 and a-1e3", "1e-03.csv has a 0x1e3 and a-1e3", None),
     ],

@@ -48,7 +48,7 @@ ROLL = {
 
 @pytest.fixture
 def written(tmp_path):
-    """written(key=value, ...) -> the path of the configuration with these keys."""
+    """Return written(key=value, ...), the path of the configuration with these keys."""
 
     def written(**content):
         path = tmp_path / "roll.yaml"
@@ -67,7 +67,7 @@ def test_devices_stand_around_a_linear_model(written, tmp_path):
     np.testing.assert_allclose(found.vehicle.params.omega_servo, 2 * np.pi * 8)
     np.testing.assert_allclose(found.vehicle.params.Lb, 166.1)
     assert found.vehicle.constants["Lb"].source == "CMU-RI-TR-00-03"
-    # The resolved configuration describes the same.
+    # The resolved configuration describes the same experiment.
     again = tmp_path / "config.yaml"
     again.write_text(yaml.safe_dump(configuration.resolved(found)))
     same = configuration.load(again)
@@ -116,6 +116,6 @@ def test_a_value_that_nobody_gave_is_named(written, tmp_path):
     t = np.arange(100) * 0.04
     rows = np.column_stack([t, np.sign(np.sin(3 * t)), np.cos(3 * t)])
     np.savetxt(tmp_path / "roll.csv", rows, delimiter=",", header="t,stick,p", comments="")
-    # delay_lat has a start value in the fit, which is enough.
+    # A start value in the fit is enough for delay_lat.
     with pytest.raises(InputError, match="zeta_servo missing"):
         run_check(written(vehicle=rest))

@@ -1,6 +1,6 @@
-"""Plain words: docstrings, messages and pages keep to the field's terms and short sentences.
+"""Plain words: docstrings, messages and pages use the field's terms and short sentences.
 
-The rules are few and mechanical; reading aloud finds the rest.
+The rules are few and mechanical; they do not replace reading.
 """
 
 import ast
@@ -36,7 +36,7 @@ def docstrings() -> Iterator[tuple[str, str]]:
 
 
 def prose(page: Path) -> Iterator[str]:
-    """Paragraphs, items and cells of a page, with `code` for a row of code and without headings."""
+    """Yield paragraphs, items and cells of a page, without headings and with code replaced."""
     text = page.read_text("utf-8")
     text = re.sub(r"^ *```.*?^ *```|<!--.*?-->", "", text, flags=re.DOTALL | re.MULTILINE)
     text = re.sub(r"^(?:    |#).*$", "", text, flags=re.MULTILINE)

@@ -1,4 +1,4 @@
-"""What a script meets: pickling, the version, and errors that say what to pass."""
+"""Use from scripts: pickling, the version, and errors that state what to pass."""
 
 import pickle
 import subprocess
@@ -22,7 +22,7 @@ FLIGHT = Flight(
 )
 FREE = {"Lb": Free(100.0)}
 WRONG: Any = Free
-"""for what its types forbid"""
+"""Arguments that the types forbid."""
 
 
 @pytest.mark.parametrize(
@@ -132,10 +132,11 @@ def _banked(phi: np.ndarray) -> Problem:
 
 def test_angles_that_turn_faster_than_a_helicopter_are_warned_of() -> None:
     t = 0.02 * np.arange(200)
-    # 15 degrees to either side at 0.8 Hz; as radians that is 75 rad/s.
+    # 15 degrees to either side at 0.8 Hz; taken as radians it would be 75 rad/s.
     with pytest.warns(UserWarning, match="faster than helicopters turn.*np.radians"):
         _banked(15.0 * np.sin(5.0 * t))
-    # A roll in half a second, its angle going on and jumping back; and a linear model's drift.
+    # A full roll in half a second, with a continuous and a wrapped angle; and the drift of a linear
+    # model.
     rolled = np.interp(t, [1.0, 1.5], [0.0, 2.0 * np.pi])
     for phi in (rolled, (rolled + np.pi) % (2.0 * np.pi) - np.pi, 4.0 * t):
         with warnings.catch_warnings():
@@ -164,7 +165,7 @@ def _sweep(design: Any, reduce: Any) -> None:
 
 
 def test_a_fit_in_single_precision_is_refused() -> None:
-    """A filter's fit to a sound record in a loop ended with exit code 4 there."""
+    """Test filter error on a sound record in a loop, which once ended with exit code 4."""
     code = (
         "import numpy as np\n"
         "from heli_jax import Flight, Free, Problem, check, fit, linear_model\n"

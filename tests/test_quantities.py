@@ -1,4 +1,4 @@
-"""Numbers of a configuration with units of their own, and names that differ in case alone."""
+"""Numbers with units in a configuration, and names that differ only in case."""
 
 import math
 

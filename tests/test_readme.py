@@ -1,4 +1,4 @@
-"""The Python of the README and of docs/python.md runs as it stands."""
+"""Test that the Python code of the README and of docs/python.md runs unchanged."""
 
 import re
 import shutil
@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A folder with the configurations and the log of `make demo`."""
+    """Return a folder with the configurations and the log of `make demo`."""
     folder = tmp_path_factory.mktemp("readme")
     shutil.copytree(ROOT / "configs", folder / "configs")
     config = folder / "configs/bench-roll.yaml"
@@ -57,7 +57,7 @@ def test_the_readme_is_one_screen():
 
 def test_from_a_log_to_estimates_intervals_a_figure_and_a_data_frame(folder):
     program = parts("docs/python.md")[0]
-    # What the README shows is a part of it, so that one run tells of both.
+    # The README's code is a part of it, so one run tests both.
     [shown] = parts("README.md")
     assert [line for line in shown.splitlines()[4:8] if line not in program.splitlines()] == []
     assert len(program.strip().splitlines()) <= 16

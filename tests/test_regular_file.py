@@ -1,7 +1,6 @@
-"""What is no file of a sensible size ends in a sentence: soon, and without memory.
+"""Files that are not regular or far too large end in one sentence, fast and without memory.
 
-Every command runs in a process of its own whose memory and time are bounded, so that a fault here
-costs a test and not the machine.
+Every command runs in a process with limited memory and time, so that a fault costs one test only.
 """
 
 import json
@@ -26,7 +25,7 @@ from heli_jax.regular_file import read_regular, require_regular
 ROOT = Path(__file__).parents[1]
 TB = 10**12
 
-# Runs commands one after the other, each for at most so many seconds, within so much memory.
+# Run commands one after the other, each with a limit of time and memory.
 DRIVER = """
 import contextlib, io, json, resource, signal, sys
 from heli_jax.cli import main
@@ -52,7 +51,7 @@ print(json.dumps(found))
 
 
 def commands(folder, arguments, seconds=10, **how):
-    """(exit code, standard error) of each command, run in one bounded process."""
+    """Return (exit code, standard error) of each command, from one process with limits."""
     (folder / "driver.py").write_text(DRIVER)
     (folder / "arguments.json").write_text(json.dumps(arguments))
     line = [sys.executable, str(folder / "driver.py"), str(folder / "arguments.json"), str(seconds)]
@@ -76,12 +75,12 @@ def link(path, target):
 
 
 def special_files(folder, ending):
-    """What may stand where a file is wanted, by what is said of it."""
+    """Objects in place of a file, by the message about them."""
     folder.mkdir()
     pipe, folder_itself = folder / f"pipe{ending}", folder / f"folder{ending}"
     os.mkfifo(pipe)
     folder_itself.mkdir()
-    with socket.socket(socket.AF_UNIX) as server:  # the name stays when it is closed
+    with socket.socket(socket.AF_UNIX) as server:  # the name remains when it is closed
         server.bind(os.path.relpath(folder / f"socket{ending}"))
     return [
         (link(folder / f"zero{ending}", "/dev/zero"), "got a device"),
@@ -100,7 +99,7 @@ def special_files(folder, ending):
 
 @pytest.fixture
 def configuration(tmp_path):
-    """Writes the demo's configuration with some of it changed; returns its path."""
+    """Return a function that writes the demo's configuration with changes and returns its path."""
     content = yaml.safe_load((ROOT / "configs" / "bench-gusts.yaml").read_text())
     content["vehicle"] = str(ROOT / "configs" / "vehicles" / "bench-30.yaml")
     count = iter(range(1000))
@@ -133,7 +132,7 @@ def test_special_files_in_every_place_end_in_a_sentence(tmp_path, monkeypatch, c
     os.mkfifo(tmp_path / "waits.py")
     cases.append((["check", configuration(model="large:model")[0]], "got 1 TB"))
     cases.append((["check", configuration(model="waits:model")[0]], "waits"))
-    # What is written does not go into a pipe or over it.
+    # Output is not written into a pipe, nor over it.
     pipe = str(tmp_path / "c" / "pipe.csv")
     cases.append((["simulate", configuration()[0], "--out", pipe], "is a pipe"))
     cases.append((["fit", configuration()[0], "--out", pipe], "exists already"))
@@ -193,7 +192,7 @@ def test_a_sweep_goes_on_only_in_a_directory_of_files(tmp_path, configuration):
 
 
 def test_a_file_that_grows_while_it_is_read_is_no_larger_than_stated():
-    # A file of /proc is a regular one of no size, and this one of 256 TB.
+    # A file of /proc is a regular file of size zero, and this one has 256 TB.
     assert os.stat("/proc/self/pagemap").st_size == 0
     with pytest.raises(InputError, match="expected a configuration of at most 1 MB, got more"):
         read_regular("/proc/self/pagemap", "a configuration", 10**6)
@@ -261,7 +260,7 @@ def test_text_that_costs_more_than_its_size(tmp_path):
 
 
 def test_a_small_parquet_file_that_claims_much(tmp_path):
-    # Equal values take no room in a file, and their full size in memory.
+    # Equal values need no space in a file, but their full size in memory.
     zeros = pa.array(np.zeros(10**6))
     many = pa.chunked_array([zeros] * 101)
     path = parquet_of(tmp_path / "rows.parquet", {"t": many})
@@ -283,7 +282,7 @@ def test_a_parquet_file_without_an_end_is_not_hashed(tmp_path):
         file.truncate(15 * 10**9)
     with pytest.raises(InputError, match="no whole Parquet file"):
         describe_log(path)
-    with path.open("r+b") as file:  # an end that says that the file is its header
+    with path.open("r+b") as file:  # an end that declares the whole file a header
         file.seek(-8, 2)
         file.write((2**31).to_bytes(4, "little") + b"PAR1")
     with pytest.raises(InputError, match=r"footer of at most 64 MB, got 2\.15 GB"):

@@ -1,4 +1,4 @@
-"""What long work says of itself while it lasts, and what is kept of how long it took."""
+"""Progress messages of long work, and its stored times."""
 
 import re
 import threading

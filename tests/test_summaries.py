@@ -1,4 +1,4 @@
-"""How objects show themselves, and what other libraries get of them."""
+"""Representations of objects, and their conversion for other libraries."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Tables on the terminal: no digit is cut at any width."""
+"""Tables on the terminal: digits are never cut, at any width."""
 
 import re
 import sys
@@ -56,7 +56,7 @@ def test_sentences_begin_new_lines_between_words(
     lines = capsys.readouterr().out.splitlines()
     assert " ".join(" ".join(lines).split()) == " ".join(sentences)
     if width is None:
-        # A program that reads them finds each in a line of its own.
+        # A program that reads them gets one line each.
         assert lines == list(sentences)
     else:
         assert all(len(line) <= width or " " not in line.strip() for line in lines)

@@ -1,4 +1,4 @@
-"""A stated low-pass that a log never went through shows by the noise that it would have taken."""
+"""Detection of a stated low-pass that the log did not go through, by its noise."""
 
 import numpy as np
 import pytest
@@ -51,5 +51,6 @@ def test_noise_above_a_stated_low_pass_is_told(tmp_path, kind, hz, step):
 
 
 def test_a_low_pass_that_leaves_the_noise_is_not_doubted(tmp_path):
-    # Logged at 100 Hz, noise behind 30 Hz folds, and is nearly white with the filter and without.
+    # Logged at 100 Hz, noise behind a 30 Hz filter folds and is nearly white, with the filter and
+    # without.
     assert not cautions(tmp_path, "biquad", 30, passed=False, step=0.0)

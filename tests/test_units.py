@@ -1,4 +1,4 @@
-"""Units against the definitions of SI, not against the package's own table."""
+"""Units against the definitions of SI, not against the package's table."""
 
 import math
 import re
@@ -27,7 +27,7 @@ FACTORS = [
     ("g cm^2", "kg m^2", 1e-7),
     ("g·cm^2", "kg m^2", 1e-7),
     ("kg mm^2", "kg m^2", 1e-6),
-    # As logs and NetCDF's attributes spell them.
+    # Spellings of logs and NetCDF attributes.
     *((u, "rad/s", math.pi / 180.0) for u in ("deg s-1", "degrees_per_second", "deg_s", "dps")),
     *((u, "rad/s", math.pi / 180.0) for u in ("deg_per_s", "degree/second", "Grad/s", "°·s⁻¹")),
     *((u, "m/s^2", 1.0) for u in ("m s-2", "m.s-2", "m/s²", "m/s2", "m_s2")),
@@ -47,7 +47,7 @@ FACTORS = [
     ("kilometers", "m", 1e3),
     ("", "1", 1.0),
     ("-", "1", 1.0),
-    # A plain number passes for radians, as SI has it.
+    # A plain number counts as radians, as in SI.
     ("1/s", "rad/s", 1.0),
     ("1", "rad", 1.0),
     ("1", "1/rad", 1.0),
@@ -69,14 +69,14 @@ def test_factors(unit, si, wanted):
         ("kg", "kg m^2"),
         ("deg", "rad/s"),
         ("%", "m"),
-        # The other way round is SI's habit; this way a Hz could pass for 1/s.
+        # SI allows the reverse; here a Hz could pass for 1/s.
         ("Hz", "1/s"),
-        # Benches write turns so, and of radians in a minute they are 6.28 times as many.
+        # Benches write turns like this; radians per minute are 6.28 times as many.
         ("1/min", "rad/s"),
         ("min-1", "rad/s"),
         ("1/h", "rad/s"),
         ("N m/quux", "N m/A"),
-        # Of another zero than K.
+        # Their zero differs from that of K.
         ("degC", "K"),
     ],
 )
@@ -164,7 +164,7 @@ compound = st.builds(
 def test_factor_is_positive_and_inverts(unit):
     try:
         si = units.si_of(unit)
-    except ValueError:  # of a kind without a listed SI unit: against itself then
+    except ValueError:  # a kind without a listed SI unit is compared with itself
         si = unit
     assert units.factor(unit, si) * units.factor(si, unit) == pytest.approx(1.0, rel=1e-12)
 

@@ -1,4 +1,4 @@
-"""Vehicle files: the shipped numbers, and what a wrong file says."""
+"""Vehicle files: shipped numbers, and errors for wrong files."""
 
 import math
 
@@ -14,12 +14,12 @@ from heli_jax.errors import InputError
 from heli_jax.vehicle import read_vehicle, vehicle_from_mapping
 from tests.dynamics import paper, whole_helicopter
 
-# Copied by hand from the paper and its reading, once for all tests.
+# Copied by hand from the paper and its reading.
 BENCH_30 = {n: v for n, v in paper.BENCH.items() if n not in ("kappa", "zeta")}
 STAND = {"kappa": 4.0, "zeta": 0.2}
 # The paper's tip loss and the 1/2 of eqs 14-15.
 SAME = {"B": 0.97, "cyclic_moment": 0.5, "Ixx_added": 0.0, "Iyy_added": 0.0, "K_mu": 1.0}
-# Gavrilets' X-Cell .60: his rotor's inertia, tail height and governor.
+# Gavrilets' X-Cell .60: rotor inertia, tail height and governor.
 ROTOR = {"k_beta": 54.0, "I_beta": 0.038, "h_T": 0.08, "K_P": 0.01, "K_I": 0.02, "Omega": 157.1}
 
 
@@ -48,14 +48,14 @@ def test_every_shipped_number_says_where_it_is_from(file, vehicles_folder):
 
 
 def test_hover_of_the_x_cell_balances(vehicles_folder):
-    # reading.md: "Hover (X-Cell numbers): C_T 0.004125, ..., vi 4.89 m/s", from which K_theta0 and
-    # its like were solved. Momentum theory: T = 2 rho A vi^2.
+    # reading.md: "Hover (X-Cell numbers): C_T 0.004125, ..., vi 4.89 m/s". K_theta0 and similar
+    # constants follow from it. Momentum theory: T = 2 rho A vi^2.
     v = load_vehicle(vehicles_folder / "x-cell-60.yaml")
     thrust, area = float(v.m * v.g), math.pi * float(v.R) ** 2
     pressure = float(v.rho) * area
     assert math.sqrt(thrust / (2.0 * pressure)) == pytest.approx(4.89, abs=0.01)
     assert thrust / (pressure * float(v.R * v.Omega) ** 2) == pytest.approx(0.004125, rel=1e-3)
-    # The motor's torque turns the rotor: K_Tm = Ir K_throttle, or the two disagree.
+    # The motor's torque turns the rotor, so K_Tm = Ir K_throttle.
     assert float(v.K_Tm) == pytest.approx(float(v.Ir * v.K_throttle), rel=1e-3)
 
 
@@ -66,7 +66,7 @@ def test_every_field_has_a_unit_and_a_meaning():
 
 
 def read(**changes):
-    """The bench machine with some entries changed; None takes one away."""
+    """Return the bench vehicle with some entries changed; None removes one."""
     content = {**BENCH_30, **changes}
     return vehicle_from_mapping({k: v for k, v in content.items() if v is not None}, "file.yaml")
 

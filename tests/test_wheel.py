@@ -1,4 +1,4 @@
-"""The wheel holds every file of the package, and a fit runs from it without the tree."""
+"""The wheel has every file of the package, and a fit runs from it without the source tree."""
 
 import importlib.util
 import os

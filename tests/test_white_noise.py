@@ -1,4 +1,4 @@
-"""Whether a signal's noise is white: by records whose noise is known."""
+"""White-noise test of signals, on records with known noise."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ ANGLE = np.cumsum(RATE) * 0.01
 
 
 def angles(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A rate from a gyro, an angle from a sensor of its own, and the integral of that gyro."""
+    """Return a gyro rate, an angle from a separate sensor, and the integral of the gyro."""
     rng = np.random.default_rng(seed)
     # The gyro is read ten times as often as it is logged.
     fast = 0.03 * rng.standard_normal((T.size, 10))
@@ -35,12 +35,12 @@ def test_an_integrated_rate_wanders_and_white_noise_does_not(seed: int) -> None:
     assert wanders(integrated)
     assert not wanders(gyro)
     assert not wanders(sensor)
-    # Lost samples and a rounding of a thousandth of a degree change nothing.
+    # Lost samples and a rounding to 0.001 degrees change nothing.
     lost = np.random.default_rng(seed).random(T.size) < 0.02
     assert wanders(np.where(lost, np.nan, np.radians(np.round(np.degrees(integrated), 3))))
     # A sensor half as fast repeats its values.
     assert not wanders(np.repeat(sensor[::2], 2))
-    # Few samples tell nothing.
+    # A few samples give no result.
     assert not wanders(integrated[:300])
 
 

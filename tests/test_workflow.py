@@ -1,4 +1,4 @@
-"""The whole analysis from Python: the same as the command line, and read back."""
+"""The whole analysis from Python: equal to the command line, and readable from files."""
 
 import dataclasses
 import json
@@ -153,7 +153,7 @@ def test_a_unit_that_nobody_stated_is_told(config, run, tmp_path):
 
 
 def test_what_check_refuses_is_not_fitted(config, tmp_path):
-    """Of a roll that swings at a third of a hertz nothing is left at half a hertz."""
+    """Test that a log at half a hertz is refused for a roll that swings at a third of a hertz."""
     rows = (config.parent / "bench.csv").read_text().splitlines()
     (tmp_path / "bench.csv").write_text("\n".join([rows[0], *rows[1::100]]) + "\n")
     path = tmp_path / "slow.yaml"
@@ -192,7 +192,7 @@ def test_of_a_start_at_zero_no_part_is_expected(config, capsys):
 
 
 def test_the_time_of_a_run_is_told_part_by_part(config):
-    """What takes long is known by its name, and nothing is left out."""
+    """Test that all long stages are named."""
     asked = {"fit.intervals": {"profile": ["Ixx"]}}
     out = config.parent / "told"
     heli_jax.run_fit(heli_jax.load_config(config, asked), out)

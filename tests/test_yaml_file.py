@@ -1,4 +1,4 @@
-"""YAML files: what plain data become, and that nothing but InputError comes of anything else."""
+"""YAML files: conversion of plain data, and InputError for everything else."""
 
 import math
 import time
@@ -144,7 +144,7 @@ def test_no_file_and_folder(tmp_path):
 
 
 def mapping_or_error(read):
-    """What was read, or else the sentence that refused it."""
+    """Return the content read, or the message of the refusal."""
     try:
         return read(), ""
     except InputError as e:

@@ -2,12 +2,13 @@
 
     .venv/bin/python experiments/benchmarks/frequency_fit.py [RUNS]
 
-The bench of experiments/frequency_error.py (one record of 6000 samples, three parameters) and the
-R-50 of experiments/closed_loop_frequency.py (four records of 4500 samples, six outputs, 22
-parameters), directly and with instruments. On one thread, the best of RUNS (5); no record is fitted
-twice in a row. Search: from the flights to converged estimates, with the noise's spectrum and their
-covariance. Whole: with all results of `fit`. Times are processor time and elapsed time, to which
-other load adds. The targets: 30 ms for the bench, 0.5 s for the R-50.
+One problem is the bench of experiments/frequency_error.py: a record of 6000 samples, three
+parameters. The other is the R-50 of experiments/closed_loop_frequency.py, directly and with
+instruments: four records of 4500 samples, six outputs, 22 parameters. On one thread, the best of
+RUNS (5); no record is fitted twice in a row. Search: from the flights to converged estimates, with
+the noise's spectrum and their covariance. Whole: with all results of `fit`. Times are processor
+time and elapsed time, to which other load adds. The targets: 30 ms for the bench, 0.5 s for the
+R-50.
 """
 
 import os

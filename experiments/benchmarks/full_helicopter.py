@@ -1,7 +1,7 @@
 """Speed of the variant `full` compared with the same equations in C, as in `helicopter.py`.
 
 Flapping, tail force and power, and governor: from hover, 10 s at 50 Hz, RK4 with 4 steps a sample,
-small steps of all sticks, 1024 vehicles that differ in Ixx, on one core.
+small steps of all sticks, with 1024 values of Ixx, on one core.
 """
 
 import sys

@@ -152,9 +152,7 @@ def fused(run: Run, model: Model = MODEL) -> Callable[[], np.ndarray]:
 def in_c(
     run: Run, source: str = "helicopter.c", constants: tuple[str, ...] = IN_C
 ) -> Callable[[], np.ndarray]:
-    """Return the same batch in C, with the fastest build; `constants` follow the order of the
-    source.
-    """
+    """Return the same batch by the fastest build in C; `constants` are in the source's order."""
     builds = [
         built_in_c(run, source, constants, (f"-DLANES={lanes}", *width))
         for lanes in LANES
@@ -321,9 +319,7 @@ def by_samples(run: Run, numbers: Numbers) -> float:
 
 
 def by_one_call(run: Run, numbers: Numbers) -> float:
-    """Return the sum of roll^2 from one call with steps of at most a sample; sticks are looked up
-    by time.
-    """
+    """Return the sum of roll^2 from one call, with steps of at most a sample."""
     rates, x = right_hand_side(first_vehicle(), numbers), np.array([float(v) for v in run.start])
     sticks = np.stack([np.asarray(u) for u in run.inputs], axis=1).tolist()
     times = DT * np.arange(N)

@@ -90,9 +90,7 @@ def ratios(ours: Callable[[], Any], theirs: Callable[[], Any], times: int = 1) -
 
 
 def fit_against_scipy(flight: Flight) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return the optimum from the same start, and the whole of `fit`, compared with SciPy's
-    optimum.
-    """
+    """Compare the optimum from the same start, and the whole of `fit`, with SciPy's optimum."""
     free = {"Ixx": Free(0.05), "If": Free(5e-4), "a": Free(5.0, prior=Prior(5.5, 0.5))}
     problem = Problem(models.roll_on_stand, VEHICLE, [flight], free, Nuisance(False, False))
     base = {n: float(getattr(VEHICLE, n)) for n in VEHICLE.__dataclass_fields__}

@@ -6,9 +6,9 @@ reader has a process of its own, in turn with the other library's:
 
     python experiments/benchmarks/logs.py --minutes 10 --megabytes 50
 
-prints the best elapsed and processor times, their ratios to the other library's, and the largest
-memory beyond the imports in multiples of the file size. On a busy computer use the processor time.
-Use --minutes 120 for two hours.
+prints the best elapsed and processor times, and their ratios to the other library's. It also prints
+the largest memory beyond the imports, in multiples of the file size. On a busy computer use the
+processor time. Use --minutes 120 for two hours.
 """
 
 import argparse
@@ -75,9 +75,7 @@ def write_dataflash(path: Path, megabytes: float) -> None:
 
 
 def write_blackbox(path: Path, megabytes: float, single: bool) -> None:
-    """Write flights of 2 MB, one made frame by frame and then repeated, as on a card; or a `single`
-    one.
-    """
+    """Write a flight of 2 MB, repeated as on a card; or a `single` flight."""
     sys.path.insert(0, str(Path(__file__).parents[2]))
     from tests.flights.log_writers import blackbox
 

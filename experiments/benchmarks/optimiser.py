@@ -2,8 +2,8 @@
 
     .venv/bin/python experiments/benchmarks/optimiser.py [WORDS]
 
-Both repeat the optimiser's first run in each fit of the zoo and of the rigs in corpus_cases.py
-(those with WORDS in their names), compiled and from the same point. A case is listed if one of them
+Both repeat the optimiser's first run in fits of the zoo and of the rigs in corpus_cases.py,
+compiled and from the same point. WORDS select cases by their names. A case is listed if one of them
 fails, ends at another cost, or takes twice the other's steps.
 """
 

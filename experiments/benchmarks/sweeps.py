@@ -117,9 +117,7 @@ def in_threads(work: Callable[[int], None], threads: int) -> None:
 
 
 def arrays(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the C kernel's arguments for n vehicles: discrete coefficients, and those of the
-    equations.
-    """
+    """Return the C kernel's arguments for n vehicles: discrete and continuous coefficients."""
     values = design(n).values(0, n)
 
     def scalars(Ixx: Any, If: Any) -> Any:
@@ -145,9 +143,7 @@ def in_c(
     coefficients: tuple[np.ndarray, np.ndarray],
     threads: int,
 ) -> Callable[[], np.ndarray]:
-    """Return a call of the C kernel on all vehicles with some threads, which returns
-    mean squares.
-    """
+    """Return a function that runs the C kernel on all vehicles and returns mean squares."""
     matrix = coefficients[0] if solver == "exact" else coefficients[1]
     parts = [np.ascontiguousarray(p) for p in np.array_split(matrix, threads, axis=1)]
     costs = [np.zeros(p.shape[1]) for p in parts]
@@ -312,9 +308,7 @@ def by_length(N: int) -> float:
 
 
 def on_workers(flight: Flight, n: int, workers: int) -> float:
-    """Return microseconds per vehicle on a local dask cluster, between a quarter and all of the
-    vehicles; the best of three sweeps.
-    """
+    """Return microseconds per vehicle on a local dask cluster: slope, best of three sweeps."""
     from heli_jax.sweeps.cluster import connected
 
     best = np.inf

@@ -1,8 +1,7 @@
-"""Output error with autocorrelated residuals: AR(1) noise with missing samples, and the disturbed
-bench.
+"""Output error with autocorrelated residuals: AR(1) noise with missing samples, or gusts.
 
-The bench's residuals are as large as its response. The records come from scipy and the closed form
-of eq. 23, not from our own simulation.
+The response to gusts is as large as the driven one (the disturbed bench). The records come from
+scipy and the closed form of eq. 23, not from our own simulation.
 """
 
 import dataclasses

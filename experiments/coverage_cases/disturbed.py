@@ -1,6 +1,4 @@
-"""The disturbed bench, simulated from the paper's equations with SciPy alone; it has no case
-itself.
-"""
+"""The disturbed bench, simulated from the paper's equations with SciPy alone; it has no case."""
 
 import numpy as np
 import scipy.linalg

@@ -60,9 +60,7 @@ AIRCRAFT = Model(
 
 
 def smooth(rng: np.random.Generator, duration: float, pace: float) -> Callable[[float], float]:
-    """Return a pilot's command of unit size over time [s]: a cubic spline through random points,
-    `pace` [s] apart.
-    """
+    """Return a pilot's command of unit size: a cubic spline of random points `pace` [s] apart."""
     knots = np.arange(-2.0 * pace, duration + 3.0 * pace, pace)
     spline = scipy.interpolate.CubicSpline(knots, rng.uniform(-1.0, 1.0, knots.size))
     return lambda t: float(spline(t))

@@ -46,9 +46,7 @@ class HandlingPair(NamedTuple):
 
 
 class Handling(NamedTuple):
-    """Handling qualities of one pair by model and data; text gives the reason for a missing one,
-    None means not requested.
-    """
+    """Handling qualities of one pair by model and data; text: reason; None: not requested."""
 
     pair: HandlingPair
     model: HandlingQualities | str | None

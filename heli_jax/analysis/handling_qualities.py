@@ -8,18 +8,16 @@ Definitions for the response of an attitude to a stick, from ADS-33E-PRF (2000),
   that at w180;
 - bandwidth: the lesser of both for rate responses, the phase bandwidth for attitude command;
 - phase delay: (lag at 2 w180 - 180) / (57.3 * 2 w180), angles in degrees. If the phase is not
-  straight between w180 and 2 w180, the lag is that of a least-squares line.
+  straight between w180 and 2 w180, a least-squares line gives the lag.
 
-Intervals come from the delta method, with finite differences by all that the response depends on:
-the parameters of a fit, or the random errors of a measured response. The interval of a frequency is
-where the response's own interval contains the defining level.
+Intervals come from the delta method, with finite differences by a fit's parameters or by a measured
+response's random errors. The interval of a frequency is where the response's interval contains the
+defining level.
 
-Checked against publications about the standard, not against its text. Ham, Gardner and Tischler
+These were checked against publications, not against the standard's text. Ham, Gardner and Tischler
 (1993), Flight testing and frequency domain analysis for rotorcraft handling qualities
-characteristics: the attitude's response to the stick, or a rate's over s; the phase delay by two
-points or by least squares from the neutral stability frequency to its double (CIFER weights that
-line by coherence; here it is not weighted). Frost and others (2002), AIAA 2002-4869: 45 deg of
-phase margin for attitude command, the lesser of that and 6 dB of gain margin for rate responses.
+characteristics, give the response and the phase delay. CIFER also weights the line by coherence.
+Frost and others (2002), AIAA 2002-4869, give both bandwidths.
 """
 
 from typing import Literal, NamedTuple
@@ -96,8 +94,7 @@ class HandlingQualities(NamedTuple):
 
 
 def handling_qualities(curve: Curve, kind: Kind = "rate") -> HandlingQualities:
-    """Return bandwidth and phase delay of an attitude's response, or crossover and margins of a
-    loop.
+    """Return bandwidth and phase delay of an attitude, or crossover and margins of a loop.
 
     Args:
         curve: the response of an attitude to a stick, or of an open loop for negative unity
@@ -132,7 +129,7 @@ def _branch(x: np.ndarray, points: Point) -> tuple[int, np.ndarray]:
     phase = np.unwrap(points.phase)
     # Bode's relation: a gain that falls with the n-th power of frequency has n right angles of lag,
     # for any sign of the stick. It fails near a growing mode, and delays add lag at high
-    # frequencies. So the majority in the lower half of the band decides.
+    # frequencies. The majority in the lower half of the band therefore decides.
     low = slice(0, x.size // 2)
     turns = np.round((phase - 0.5 * np.pi * np.gradient(points.log_gain, x))[low] / np.pi)
     values, counts = np.unique(turns, return_counts=True)
@@ -243,8 +240,7 @@ def _derivatives(kind: Kind, response: _Response) -> dict[str, np.ndarray]:
 def _ends(
     response: _Response, name: str, values: dict[str, float], by: dict[str, np.ndarray]
 ) -> tuple[float, float]:
-    """Return the ends of a frequency's interval [rad/s], where the curve's band (Fieller) leaves
-    the level.
+    """Return a frequency's interval [rad/s], where the curve's band contains the level (Fieller).
 
     An end outside the band is infinite; unknown errors give NaN. The error over the slope is not
     used, since for a noisy curve the slope is less certain than the value.
@@ -352,9 +348,7 @@ def _put_bandwidth(kind: Kind, numbers: dict[str, Number], sentences: list[str])
 
 
 def _explain_loop(response: _Response, values: dict[str, float], sentences: list[str]) -> None:
-    """State why numbers of a loop are missing, and the gain reduction limit around an unstable
-    vehicle.
-    """
+    """State why numbers of a loop are missing, and the gain limit of an unstable vehicle."""
     if "crossover" not in values:
         sentences.append(_missing("crossover", "the gain does not fall through 0 dB in the band"))
     else:

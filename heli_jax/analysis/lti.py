@@ -39,16 +39,15 @@ def d2c(
 
     "zoh" inverts the zero-order hold and raises if no inverse of the same order exists. "real-log"
     takes the real part of the matrix logarithm of [[Ad, Bd], [0, 1]], which gives Kim & Tilbury's
-    eq. 35 from eq. 34. Where "zoh" raises, its result differs from Hd.
+    eq. 35 from eq. 34. If "zoh" raises, its result differs from Hd.
 
     Args:
-        num: numerator of Hd(z), highest power first.
-        den: denominator of Hd(z), highest power first.
+        num, den: coefficients of Hd(z), highest power first.
         dt: time between samples [s].
 
     Raises:
-        ValueError: unknown method, not a proper transfer function, a pole at z = 0 (no logarithm
-            exists), or, with "zoh", a pole on the negative real axis, which the message names.
+        ValueError: unknown method, not a proper transfer function, a pole at z = 0, or, with "zoh",
+            a pole on the negative real axis.
     """
     if method not in ("zoh", "real-log"):
         raise ValueError(f"method: expected 'zoh' or 'real-log', got {method!r}")
@@ -104,15 +103,13 @@ def _state_space(num: ArrayLike, den: ArrayLike, dt: float) -> tuple[np.ndarray,
 
 def _polynomials(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> Polynomials:
     den = np.real(np.poly(A))
-    # Not det(s - A + bc) - det(s - A), which has small coefficients as differences of large ones.
+    # det(s - A + bc) - det(s - A) would have small coefficients as differences of large ones.
     num = D[0, 0] * den + _numerator(A, B[:, 0], C[0])
     return num, den
 
 
 def _numerator(A: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Return num of c (s - A)^-1 b by Leverrier's recursion, linear in b and c, without
-    cancellation.
-    """
+    """Return num of c (s - A)^-1 b by Leverrier's recursion, without cancellation."""
     n = A.shape[0]
     den = np.real(np.poly(A))
     num = np.zeros(n + 1)

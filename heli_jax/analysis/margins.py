@@ -59,20 +59,15 @@ class _Loop(NamedTuple):
 def margins(
     A: ArrayLike, B: ArrayLike, C: ArrayLike, D: ArrayLike, gain: ArrayLike = 1.0
 ) -> Margins:
-    """Return the margins of the loops L(s) = gain (C (s - A)^-1 B + D) with negative unity
-    feedback.
+    """Return the margins of loops L(s) = gain (C (s - A)^-1 B + D) with negative feedback.
 
     An element that is not finite, or has 1 + gain D = 0, gives NaN, NaN and False. Elements do not
     affect each other.
 
-    A loop is stable if all eigenvalues of A - gain B C / (1 + gain D) have negative real parts,
-    apart from those that the loop does not move. An unobserved position or heading has an
-    eigenvalue of zero at any gain, which does not concern the loop. So an eigenvalue that is not
-    negative is ignored if A has it at least as often, to 1e-9 of the fastest (or of 1/s), and it
-    grows no faster than that. Rounding spreads zeros that form a chain, as a speed and its position
-    do. Those count as zeros within 1e-6 if their mean is zero to 1e-9. An unobserved chain of three
-    or more, in coordinates that mix its states with others, is not recognised, and such a loop
-    counts as unstable. An unobserved growing mode makes a loop unstable.
+    A loop is stable if all eigenvalues of A - gain B C / (1 + gain D) have negative real parts.
+    Eigenvalues of A that the loop does not move are ignored unless they grow, such as the zero of
+    an unobserved position or heading. An unobserved chain of three or more zeros in mixed
+    coordinates is not recognised, and the loop then counts as unstable.
 
     Args:
         A: (batch, n, n) [1/s].
@@ -151,9 +146,7 @@ def _eigenvalues(A: np.ndarray) -> _Complex:
 
 
 def _of_size_one(loop: _Loop) -> _Complex:
-    """Return the eigenvalues (m, 2 n) of the Hamiltonian matrix, on the imaginary axis where |L| =
-    1.
-    """
+    """Return the Hamiltonian's eigenvalues (m, 2 n), on the imaginary axis where |L| = 1."""
     A, B, C, D = loop
     R = (1.0 - D**2)[:, None, None]
     # If |L| = 1 at infinite frequency, finite crossings still exist.
@@ -184,11 +177,12 @@ def _stable(before: _Complex, after: _Complex, size: np.ndarray) -> np.ndarray:
     """True if the eigenvalues `after` (m, n) are stable, apart from those also in `before`."""
     n = after.shape[1]
     limit = _SAME * size[:, None]
-    # At least as many before as after, and growing no faster than the limit.
+    # An unmoved eigenvalue is in A at least as often, and grows no faster than 1e-9 of the fastest.
     there = np.abs(after[:, :, None] - before[:, None, :]) <= limit[:, :, None]
     here = np.abs(after[:, :, None] - after[:, None, :]) <= limit[:, :, None]
     unmoved = (there.sum(2) >= here.sum(2)) & (after.real <= limit)
-    # Chains of zeros: the longest run of slowest eigenvalues with a mean of zero.
+    # Rounding spreads the zeros of a chain, such as a speed and its position. The longest run of
+    # slowest eigenvalues counts as zero if all are below 1e-6 and their mean below 1e-9.
     zero = _STILL * size[:, None]
     order = np.argsort(np.abs(after), axis=1, kind="stable")
     slowest = np.take_along_axis(after, order, 1)
@@ -205,9 +199,7 @@ def _stable(before: _Complex, after: _Complex, size: np.ndarray) -> np.ndarray:
 
 
 def _response(loop: _Loop, omega: np.ndarray) -> tuple[_Complex, _Complex, np.ndarray]:
-    """Return L (m,) at one frequency each [rad/s], its derivative by log frequency, and the
-    rounding error.
-    """
+    """Return L (m,) at a frequency each [rad/s], derivative by log frequency, rounding error."""
     s = 1j * omega
     M = s[:, None, None] * np.eye(loop.B.shape[1]) - loop.A
     x = _solve(M, loop.B)
@@ -258,8 +250,7 @@ def _crossings(
     size: np.ndarray,
     step: Callable[[_Complex, _Complex], np.ndarray],
 ) -> tuple[np.ndarray, _Complex, np.ndarray]:
-    """Return loops (c,) that may cross near the imaginary eigenvalues (m, 2 n), with L and its
-    rounding error (c,).
+    """Return loops (c,) that may cross near imaginary eigenvalues (m, 2 n), L, rounding error.
 
     Args:
         step: Newton step from L and its derivative.

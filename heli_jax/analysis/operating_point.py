@@ -25,9 +25,7 @@ from heli_jax.vehicle import of_helicopter
 
 
 class OperatingPoint(NamedTuple):
-    """State and inputs at which a model is linearised; None for a linear model, with the same
-    matrices everywhere.
-    """
+    """State and inputs at which a model is linearised; None for a linear model."""
 
     state: Any
     inputs: Any
@@ -75,8 +73,7 @@ def operating_point(
 def modes_of_flight(
     model: Model, params: Any, flight: Flight, substeps: int
 ) -> tuple[np.ndarray, str] | None:
-    """Return the eigenvalues (n,) [1/s] of the model linearised for a flight, and the operating
-    point in words.
+    """Return the eigenvalues (n,) [1/s] of a model linearised for a flight, and the point in words.
 
     Returns None if the matrices are not finite.
 
@@ -115,7 +112,7 @@ def _mean(
     dtype = jnp.result_type(float)
     mean = model.Inputs(**{n: jnp.asarray(u.mean(), dtype) for n, u in acting.items()})
     driven = model.Inputs(**{n: jnp.asarray(u, dtype) for n, u in acting.items()})
-    # Not the equilibrium of the mean inputs, which a user's model may lack.
+    # A user's model may lack an equilibrium of the mean inputs.
     state = _mean_state(model, params, driven, jnp.asarray(dt, dtype), substeps)
     if all(bool(np.isfinite(v)) for v in jax.tree.leaves(state)):
         return OperatingPoint(state, mean, "the record's mean")

@@ -51,8 +51,7 @@ class Pilot(NamedTuple):
 
 
 def attitude_hold(model: Model, params: Any, trimmed: Trim, pace: float = PACE) -> Pilot:
-    """Return the pilot that holds the attitude of `trimmed`, including heading. Parameters must be
-    concrete.
+    """Return the pilot that holds attitude and heading of `trimmed`, for concrete parameters.
 
     Args:
         pace: least decay rate of every attitude mode [1/s].

@@ -116,8 +116,8 @@ def measured_curve(
     Gain and phase are fitted over half an octave to either side, or up to an octave if errors are
     large. Each bin is weighted by its random error. Errors of close bins are correlated;
     independent bins are 1.95 lines of the window apart. The band is the widest one with a mean
-    coherence of 0.6 over an octave in which no bin deviates by more than a right angle from its
-    neighbours. Larger jumps are noise, and beyond them the number of whole turns is unknown.
+    coherence of 0.6 over an octave and no phase jump above a right angle. Beyond a larger jump the
+    number of whole turns is unknown.
 
     Args:
         omega: frequencies (k,) [rad/s], rising.
@@ -198,7 +198,7 @@ def _widest(x: np.ndarray, known: np.ndarray) -> np.ndarray:
 def _root(omega: np.ndarray, relative: np.ndarray, window: float) -> np.ndarray:
     """Return R (k, k), with R R' the covariance of the relative errors of the bins."""
     lines = (omega[:, None] - omega[None, :]) * window / (2.0 * np.pi)
-    # Transform of the squared Hann window. Two bins share the square of it.
+    # Transform of the squared Hann window. Two bins share its square.
     shares = ((0.0, 3.0 / 8.0), (1.0, 0.25), (-1.0, 0.25), (2.0, 1.0 / 16.0), (-2.0, 1.0 / 16.0))
     shared = sum(c * np.sinc(lines - m) for m, c in shares) / (3.0 / 8.0)
     covariance = relative[:, None] * relative[None, :] * shared**2
@@ -353,18 +353,16 @@ def unnoticeable(omega: Float[np.ndarray, " k"]) -> Envelope:
     """Return the envelopes of maximum unnoticeable added dynamics.
 
     Pilots of full-size fixed-wing aircraft did not notice added dynamics within them. They are
-    narrowest at about 1 to 5 rad/s, and wide at low and high frequencies. They serve for comparison
-    and are no gate.
+    narrowest at about 1 to 5 rad/s. They are for comparison only.
 
     Args:
         omega: frequencies (k,) [rad/s].
 
     Source: Wood and Hodgkinson (1980), Definition of acceptable levels of mismatch for equivalent
     systems of augmented CTOL aircraft, MDC A6792, as in MIL-STD-1797A and Tischler and Remple
-    (2012). The coefficients are those of the function LoesBound of C. Regan (2006, 'based on
-    Stoliker's routines'), number by number. That function asks for a check of its numbers, and they
-    were not compared with the reports. Some sources add a lead and a lag of a few milliseconds to
-    the phase envelopes. These are left out here, so these envelopes are the narrower ones.
+    (2012). The coefficients are those of LoesBound by C. Regan (2006), which were not compared with
+    the reports. Some sources add a lead and a lag of a few milliseconds to the phase envelopes.
+    They are left out here, which gives narrower envelopes.
     """
     s = 1j * omega
     gain = [20.0 * np.log10(np.abs(np.polyval(n, s) / np.polyval(d, s))) for n, d in _GAIN]

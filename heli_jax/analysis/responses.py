@@ -66,12 +66,12 @@ def responses(
 ) -> Responses:
     """Return the responses of each output to each input, with the other inputs accounted for.
 
-    A response is NaN if inputs move as one, if an input does not move, or if an instrument is too
-    weak compared with other causes of its input (`sd_of_ratio`).
+    A response is NaN if inputs move as one or not at all, or if an instrument explains too little
+    of its input (`sd_of_ratio`).
 
     Args:
-        instruments: one excitation for each input, outside all feedback; without them, inputs are
-            assumed not to depend on the outputs.
+        instruments: an excitation of each input, outside all feedback. Without it, inputs must not
+            depend on the outputs.
 
     Raises:
         TooFewAveragesError: there are too few averages for the number of inputs.
@@ -138,18 +138,13 @@ def _left(S: np.ndarray, u: list[int], y: list[int], H: np.ndarray) -> np.ndarra
     return np.maximum(power - 2.0 * crossed + explained, _ROUNDING * power)
 
 
-# Intervals of responses by instrument.
-#
-# These are ratios of two uncertain numbers. With w_j the combination of the instruments for input j
-# alone, H_j = S_wy / S_wu. A response H' agrees with the record in the disc
-#
-#     |H' - H|^2 <= c (S_ee - 2 Re(conj(H' - H) S_ue) + |H' - H|^2 S_vv),  c = t^2 S_ww / (2 n),
-#
-# with Student's t, and v the part of the input that no instrument explains. If the excitation is
-# weak beside v, the disc is larger than the first-order error and off centre. If c S_vv reaches 1,
-# it is unbounded: the response is unknown.
-#
-# Sources: Fieller (1954); Anderson and Rubin (1949) for instruments.
+# Intervals of responses by instrument. These are ratios of two uncertain numbers. With w_j the
+# combination of the instruments for input j alone, H_j = S_wy / S_wu. A response H' agrees with the
+# record in a disc: |H' - H|^2 <= c (S_ee - 2 Re(conj(H' - H) S_ue) + |H' - H|^2 S_vv), c = t^2 S_ww
+# / (2 n). Here t is Student's t, and v the part of the input that no instrument explains. If the
+# excitation is weak beside v, the disc is larger than the first-order error and off centre. If c
+# S_vv reaches 1, it is unbounded: the response is unknown. Sources: Fieller (1954); Anderson and
+# Rubin (1949) for instruments.
 
 
 def sd_of_ratio(
@@ -180,7 +175,7 @@ def sd_of_ratio(
         # Cross-density of y - H u with each input.
         crossed = S[:, u][:, :, y] - np.einsum("kja,kla->kjl", S[:, u][:, :, u], H)
         c = 0.5 * half95**2 * spread
-        # An input that is its own instrument has no part of its own, apart from rounding.
+        # Apart from rounding, such an input equals its instrument.
         direct = np.array([a == b for a, b in zip(u, z, strict=True)])
         room = np.where(direct, 1.0, 1.0 - c * own)[:, None, :]
         aside = np.where(direct, 0.0, np.abs(np.swapaxes(crossed, 1, 2)) * c[:, None, :]) / room
@@ -257,24 +252,16 @@ def student95(freedom: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     return scipy.special.stdtrit(np.maximum(freedom, 1.0), 0.975)
 
 
-# Errors that windows add to a response at the ends of a record.
-#
-# For a response y = h * u, a window w gives, by Taylor's series of w(t + tau),
-#
-#     Y_w = H U_w + i H' U_w' + ...,
-#
-# where U_w' is the input with the window's derivative and H' the derivative of H by frequency. In
-# windows that overlap by two thirds the second terms cancel, with two exceptions. One is the ends
-# of a record and of each part between missing samples. The other is input power that a window's
-# width brings from another frequency (the flanks of a sine, frequencies beyond a sweep). Only H' is
-# unknown.
-#
-# Let e be the part of U_w' that counts as the input. To first order, a measured response is that at
-# omega + i e. H' is the slope of a straight line through responses at such points. For a single
-# sine the points coincide and H' is unknown: it may be anything that windows of that length
-# resolve.
-#
-# Source: Pintelon and Schoukens (2012), chapter 6.
+# Errors that windows add to a response at the ends of a record. For y = h * u, Taylor's series of
+# the window w(t + tau) gives Y_w = H U_w + i H' U_w' + ... . U_w' is the input with the window's
+# derivative, H' the derivative of H by frequency. In windows that overlap by two thirds the second
+# terms cancel, with two exceptions. One is the ends of a record and of each part between missing
+# samples. The other is input power that a window's width brings from another frequency (the flanks
+# of a sine, frequencies beyond a sweep). Only H' is unknown. Let e be the part of U_w' that counts
+# as the input. To first order, a measured response is that at omega + i e. H' is the slope of a
+# straight line through responses at such points. For a single sine the points coincide and H' is
+# unknown: it may be anything that windows of that length resolve. Source: Pintelon and Schoukens
+# (2012), chapter 6.
 
 
 _LINES = 2.5
@@ -302,8 +289,8 @@ def without_ends(
     ends: Complex[np.ndarray, "k m m"],
     seconds: float,
 ) -> tuple[Complex[np.ndarray, "k l m"], Float[np.ndarray, "k l m"]]:
-    """Return, to first order, the errors that windows add at the ends of records and on the flanks
-    of held inputs, and the responses' standard deviation.
+    """Return the errors from windows at the ends of records and on the flanks of held inputs, to
+    first order, and the responses' sd.
 
     Args:
         omega: frequencies [rad/s], rising.

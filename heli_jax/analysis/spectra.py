@@ -74,8 +74,7 @@ class Spectra(NamedTuple):
 
 
 def segment_transforms(signals: Float[np.ndarray, "c N"], dt: float, length: int) -> Spectra:
-    """Transform half-overlapping, detrended segments in a Hann window (Welch 1967) to k = length //
-    2 + 1 frequencies from zero.
+    """Transform half-overlapping, detrended Hann segments (Welch 1967) to length // 2 + 1 lines.
 
     Args:
         dt: time between samples [s].
@@ -150,7 +149,7 @@ def cross_spectra(
     """Transform all records in Hann windows, each segment without its mean, to any frequencies.
 
     Args:
-        records: the same c signals in each, (c, N) with any N; no sample missing.
+        records: the same c signals in each, (c, N) with any N, without missing samples.
         dt: time between samples [s].
         omega: (k,) [rad/s], above zero and below the Nyquist frequency.
         seconds: length of a segment [s]; shorter records are left out.

@@ -381,8 +381,8 @@ def _deviations(J: np.ndarray) -> np.ndarray:
 
 
 def mismatch(measured: Measured, model: Complex[np.ndarray, " k"]) -> float:
-    """Return Tischler's cost J: 20 times the mean of squared errors in dB and in degrees, weighted
-    by coherence.
+    """Return Tischler's cost J: 20 times the mean squared error in dB and degrees, weighted by
+    coherence.
 
     It is NaN where nothing is measured. Source: Tischler and Remple (2012), section 11.2.
     """

@@ -74,19 +74,18 @@ def trim(
 ) -> Trim:
     """Return the trim of a helicopter model: hover, climb, forward and sideward flight.
 
-    It solves for all sticks, the attitude, the tip-path plane, the flybar and the rotor speed
-    together. With a collective stick in addition to the throttle, the rotor turns at the vehicle's
-    Omega. Parameters must be concrete; `equilibrium` can be differentiated and batched.
+    The unknowns are sticks, attitude, tip-path plane, flybar and rotor speed. With a collective
+    stick in addition to the throttle, the rotor turns at the vehicle's Omega. Parameters must be
+    concrete (`equilibrium` is differentiable).
 
     Args:
         wind: velocity of the air along x, y and z [m/s], for a model with wind.
         sticks: limits of the sticks by name; default: `STICKS`.
-        power_off: True for autorotation: the throttle is zero, and the (negative) climb is unknown
-            instead. Only for a model with a collective stick.
+        power_off: True for autorotation: throttle zero, climb unknown; needs a collective stick.
 
     Raises:
-        ValueError: no such flight exists (the message gives the residual), a stick would exceed its
-            limits, or the flight is outside the model's range.
+        ValueError: no such flight exists, a stick would exceed its limits, or the flight is outside
+            the model's range.
     """
     steady = _require(model, power_off)
     if sticks is None:

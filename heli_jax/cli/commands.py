@@ -243,7 +243,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if seen.seen:
                 terminal.say("interrupted")
                 return INTERRUPTED
-            # Any other error is a bug, and a report of it needs the traceback.
+            # Any other error is a bug, and its report needs the traceback.
             if not isinstance(e, InputError | OSError):
                 raise
             if isinstance(e, OSError):
@@ -284,7 +284,7 @@ def _prepare_jax(cpu_devices: int | None = None) -> None:
     Args:
         cpu_devices: number of processors that are devices; default: JAX decides.
     """
-    # Commands import JAX and its users themselves. That takes seconds, which a wrong option, --help
+    # Commands import JAX and its users themselves. It takes seconds, which a wrong option, --help
     # and `info` do not need.
     import jax
 
@@ -317,9 +317,7 @@ def _prepare_jax(cpu_devices: int | None = None) -> None:
 
 
 def _private_cache() -> str | None:
-    """Return the cache folder, or None if it does not belong to this user alone. Cached programs
-    are executable code.
-    """
+    """Return the cache folder if it is this user's own, since it contains executable code."""
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "heli_jax"
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)

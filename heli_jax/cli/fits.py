@@ -31,8 +31,8 @@ from heli_jax.workflow import FitRun
 
 
 def print_fit(run: FitRun, *, verbose: bool = False) -> None:
-    """Print the first screen of the report: three statements, estimates, the most severe findings;
-    `verbose` adds the rest.
+    """Print the report's first screen: statements, estimates, worst findings; `verbose` adds the
+    rest.
     """
     fit = run.fit
     for line in lines(fit):

@@ -75,9 +75,7 @@ class Interrupts:
 
 @contextlib.contextmanager
 def as_program() -> Iterator[Interrupts]:
-    """End the process on an interrupt while the command runs; ignore interrupts while Python shuts
-    down.
-    """
+    """End the process on an interrupt; ignore interrupts while Python shuts down."""
     # Other systems cannot report a signal through a pipe.
     if os.name != "posix":
         with as_function() as interrupts:

@@ -133,9 +133,7 @@ def between_samples(flights: Sequence[Flight], inputs: Collection[str]) -> list[
 
 
 def _read_in_degrees(experiment: Experiment, flights: Sequence[Flight]) -> tuple[Finding, ...]:
-    """Return doubts about outputs that look like degrees read as radians. Gains are then off by 35
-    dB, which nothing else shows.
-    """
+    """Return doubts about outputs that look like degrees read as radians (gains off by 35 dB)."""
     # Late import, since it loads the diagnostics of fits.
     from heli_jax.flights.flight import labels
     from heli_jax.identification.diagnostics.units import in_degrees
@@ -159,8 +157,8 @@ def _require_samples(flights: Sequence[Flight], path: str | Path) -> None:
 def run_responses(
     experiment: Experiment, out: Path, log: str | None, say: Callable[[str], None]
 ) -> list[str]:
-    """Write the responses into a new directory, print them, and return the statuses of the transfer
-    functions.
+    """Write responses into a new directory, print them, and return the transfer functions'
+    statuses.
     """
     from heli_jax.report.responses import transfer_status, write_responses
     from heli_jax.report.tables import handling as handling_table

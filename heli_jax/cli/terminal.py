@@ -37,9 +37,7 @@ def plain_text(text: str) -> str:
 
 
 def tell(text: str, file: TextIO | None = None) -> None:
-    """Print sentences on `file` (default: standard output), wrapped between words on a terminal.
-    Line breaks in the text are kept.
-    """
+    """Print sentences on `file` (default: standard output), wrapped on a terminal."""
     text = plain_text(terminal_sentence(text))
     stream = sys.stdout if file is None else file
     if stream.isatty():
@@ -62,9 +60,7 @@ def _folded(line: str, width: int) -> str:
 
 
 def print_table(head: _Row, rows: Sequence[_Row], *, keys: int = 1) -> None:
-    """Print a table on standard output with columns of their natural width; print a list if it is
-    wider than the terminal. A pipe has no limit.
-    """
+    """Print a table on standard output; print a list if it is wider than the terminal."""
     # rich takes a tenth of a second to import, too long for `heli-jax --help`.
     from rich.box import SIMPLE_HEAD
     from rich.cells import cell_len

@@ -214,7 +214,7 @@ def _child(at: Any, name: str, where: str) -> Any:
 
 
 def _index(at: list[Any], name: str, where: str) -> int:
-    # No negative index and none beyond the end: a list is changed, never extended.
+    # Indices are not negative and not beyond the end: a list is changed, never extended.
     if not name.isdigit() or int(name) >= len(at):
         raise InputError(f"{where}: got {name!r}, expected a number from 0 to {len(at) - 1}")
     return int(name)
@@ -226,10 +226,10 @@ def _validated(content: dict[str, Any], where: str) -> Config:
     except pydantic.ValidationError as e:
         # For a key with several allowed kinds pydantic reports errors of each; those of the actual
         # kind are useful. An unknown key comes first, because it is the likeliest cause of the
-        # others. Only one error is shown: nobody reads a list of twenty.
+        # others. Only one error is shown: a list of twenty is too long to read.
         errors = sorted(e.errors(), key=_of_least_use)
         raise InputError(f"{where}: {_sentence(errors[0])}") from None
-    # Where a text is allowed, it would be taken as a channel's name or a unit.
+    # If a text is allowed, it would be taken as a channel's name or a unit.
     if places := list(_still_to_edit(content)):
         others = ", ".join(map(_place, places[1:]))
         more = f"; {EDIT} stands also at {others}" if others else ""

@@ -30,7 +30,6 @@ def follows(
     parameters at their starts.
 
     Args:
-        experiment: the configuration.
         rate: rate to which a log is resampled [Hz]; None without resampling, which needs no pairs.
         inputs: inputs of the log.
     """

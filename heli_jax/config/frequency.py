@@ -60,9 +60,7 @@ def check_pairs(
     """Refuse pairs of input and output that the model lacks.
 
     Args:
-        experiment: the configuration.
         section: their section of `frequency`.
-        pairs: the pairs.
 
     Raises:
         InputError: one of them is unknown.

@@ -87,12 +87,12 @@ def completed(content: dict[str, Any], where: str) -> dict[str, Any]:
         # A stated value means that the error is known, so it is not free.
         if f.prior is not None and n not in given
     }
-    # A bias of the outputs or an offset of the inputs would duplicate an error. One delay among so
-    # many errors needs no search over its local minima.
+    # A bias of the outputs or an offset of the inputs would duplicate an error. A delay among many
+    # errors needs no search over its local minima.
     nuisance = {"bias": False, "input_offset": False, **fit.get("nuisance", {})}
     # Gyros are inputs, and their noise is integrated; a filter models that, a simulation does not.
     fit = {"method": "filter-error", "free": free, "starts": 1, **fit, "nuisance": nuisance}
-    # No baseline, because recursive least squares takes one output of one stick.
+    # There is no baseline, because recursive least squares takes one output of one stick.
     return {"vehicle": {}, "rls": None, **content, "model": model.name, "fit": fit}
 
 
@@ -145,7 +145,6 @@ def prepared(model: Model, flight: Flight, where: str) -> Flight:
 
     Args:
         model: any model; only a kinematic one changes the flight.
-        flight: the flight.
         where: place in the configuration, for messages.
 
     Raises:
@@ -157,7 +156,7 @@ def prepared(model: Model, flight: Flight, where: str) -> Flight:
     theta = flight.outputs.get("theta")
     reached = 0.0 if theta is None else np.nanmax(np.abs(theta), initial=0.0)
     if reached > STEEPEST:
-        # No pitch angle is beyond 90 degrees.
+        # Pitch angles do not exceed 90 degrees.
         remedy = "choose another window" if reached < _STRAIGHT_UP else "is its unit another?"
         raise InputError(
             f"{where}: theta reaches {np.degrees(reached):.0f} deg, expected at most "
@@ -211,7 +210,6 @@ def noise_of(model: Model, flights: Sequence[Flight]) -> dict[str, float]:
 
     Args:
         model: from `heli_jax.dynamics.kinematics`.
-        flights: the flights.
     """
     known, noise = naming.names(model.Params), {}
     for parameter, names in NOISES.items():
@@ -239,8 +237,6 @@ def free_noise(model: Model, params: Record, flights: Sequence[Flight]) -> dict[
 
     Args:
         model: any model; empty unless it is kinematic.
-        params: its parameters.
-        flights: the flights.
     """
     if not is_kinematic(model):
         return {}
@@ -252,14 +248,13 @@ def free_noise(model: Model, params: Record, flights: Sequence[Flight]) -> dict[
 def sharpened(model: Model, flight: Flight) -> Flight:
     r"""Correct rates and forces so that lines between samples have the integral of the motion.
 
-    Lines cut corners. Of a motion at omega they keep 1 - (omega dt)^2 / 12 of the integral, which a
-    fit would attribute to the sensor's scale. Each sample minus a twelfth of its second difference
-    restores it up to (omega dt)^4 / 240. With white noise in the samples, only the first and the
-    last sample change the drift (Euler and Maclaurin's correction of the trapezoidal rule).
+    Lines cut corners. They keep 1 - (omega dt)^2 / 12 of the integral of a motion at omega. A fit
+    would attribute the rest to the sensor's scale. Each sample minus a twelfth of its second
+    difference restores it up to (omega dt)^4 / 240. With white noise in the samples, only the first
+    and the last sample change the drift (Euler and Maclaurin's correction of the trapezoidal rule).
 
     Args:
         model: any model; only a kinematic one changes the flight.
-        flight: the flight.
     """
     if not is_kinematic(model):
         return flight
@@ -281,11 +276,10 @@ order."""
 
 
 def substeps_of(model: Model, flights: Sequence[Flight]) -> int:
-    """Return the steps per sample for a kinematic model, which has no fast dynamics of its own.
+    """Return the steps per sample for a kinematic model, which has no fast dynamics.
 
     Args:
         model: from `heli_jax.dynamics.kinematics`, bare or with devices around it.
-        flights: the flights.
     """
     step = _EXPLICIT if model.explicit else _STEP
     return max(1, *(math.ceil(f.dt / step - 1e-9) for f in flights))

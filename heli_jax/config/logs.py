@@ -71,7 +71,6 @@ def read_flights(experiment: Experiment, *, gain: bool = False) -> tuple[Flight,
     """Read the flights of a configuration, in SI.
 
     Args:
-        experiment: the configuration.
         gain: True if an input with a unit may be a plain number: an estimated gain then carries the
             unit.
 
@@ -227,7 +226,6 @@ def as_configured(experiment: Experiment, selection: Selection) -> Selection:
     """Return the selection of a log, completed by a configuration's first flight.
 
     Args:
-        experiment: the configuration.
         selection: overrides the configuration's rate, flight and clock. Without signals of its own,
             the columns are the model's inputs and outputs, in SI.
 
@@ -374,9 +372,8 @@ def signals(
     """Return the columns of the model's inputs or outputs, with units checked.
 
     Args:
-        model: the model.
         role: `inputs` or `outputs`.
-        stated: their sections by name.
+        stated: sections of the signals, by name.
         where: place of the section, for messages.
         gain: True if an input with a unit may be a plain number.
 
@@ -497,7 +494,6 @@ def _with_instruments(flight: Flight, instruments: Mapping[str, Signal]) -> Flig
     """Separate the instruments of a flight from its inputs.
 
     Args:
-        flight: the flight.
         instruments: names from `_instrument_signals`.
     """
     if not instruments:

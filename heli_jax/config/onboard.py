@@ -184,7 +184,6 @@ def with_onboard(model: Model, config: OnboardConfig | None, path: Path) -> Mode
     """Return the model with the devices of a configuration.
 
     Args:
-        model: the model.
         config: the section, or None.
         path: the configuration file.
 

@@ -54,7 +54,6 @@ def resolve(
     """Return the signals of a configuration, completed by its preset.
 
     Args:
-        model: the model.
         stated: the section `signals`.
         where: place of the section, for messages.
         onboard: the section `onboard`, if any.

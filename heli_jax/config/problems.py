@@ -65,7 +65,7 @@ def problem(experiment: Experiment) -> Problem:
     with experiment.located("fit"):
         whole = Problem(
             **of_method,
-            # Not before the noise of the inputs is known, because sharpening increases it.
+            # Sharpening increases the noise of the inputs, so it waits until that is known.
             flights=tuple(sharpened(model, f) for f in flights),
             nuisance=nuisance,
             substeps=substeps_of(model, flights) if is_kinematic(model) else substeps,
@@ -124,7 +124,7 @@ def _of_method(
     """Return the parts of a problem that depend on its method."""
     config = experiment.config
     assert config.fit is not None
-    # Output error gets the bare model, whatever `disturbance` states. That section then serves only
+    # Output error gets the bare model, whatever `disturbance` states. The section then serves only
     # simulation and the candidate models.
     model, params, fixed = experiment.model, experiment.vehicle.params, ()
     if objective_of(method).noise_model == "disturbance":
@@ -284,8 +284,6 @@ def _first_guesses(
     """Return the free parameters with their starts, and the equation-error result or None.
 
     Args:
-        experiment: the configuration.
-        flights: its flights.
         free: free parameters of the configuration; NaN where a start is left out.
     """
     config, path = experiment.config.fit, experiment.path
@@ -345,7 +343,6 @@ def _instrument_for(config: FitConfig, method: str) -> tuple[str, ...] | None:
 
     Args:
         config: section whose `instrument` may apply to the start, or to a method of `also`.
-        method: the method.
     """
     others = [m for m in (config.start, *config.also) if m in METHODS]
     if objective_of(method).noise_model == "spectrum" or not any(

@@ -23,7 +23,7 @@ class Section(BaseModel):
         for written, number in _numbers(value, made):
             if isinstance(written, bool) and number is not written:
                 raise ValueError(f"expected a number, got {str(written).lower()}")
-            # Nor is 1 accepted as true.
+            # 1 is not accepted as true either.
             if isinstance(number, bool) and not isinstance(written, bool | str):
                 raise ValueError(f"expected true or false, got {written}")
             if isinstance(written, str):

@@ -53,7 +53,6 @@ def sweep_job(
     """Return the sweep of a configuration, checked, with its logs and tables read.
 
     Args:
-        experiment: the configuration.
         made: flight made by `simulate`; by default the logs are read.
         trimmed: steady flight in which each run of `made` begins.
         pilot: attitude feedback of the simulated pilot, if any.
@@ -160,8 +159,8 @@ def _of_designs(section: DesignConfig, model: Model, path: Path, seed: int) -> D
     parts = []
     for i, part in enumerate(section.of):
         try:
-            # No two parts, at any depth, draw the same values. Not seed + i: the second part of one
-            # seed would equal the first of the next.
+            # Parts draw different values at any depth. Not seed + i: the second part of one seed
+            # would equal the first of the next.
             own = np.random.SeedSequence(seed, spawn_key=(i,)).generate_state(1)[0]
             parts.append(_design(part, model, path, int(own)))
         except InputError:

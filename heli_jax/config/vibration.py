@@ -38,19 +38,17 @@ _FASTEST_ROTOR = 500.0
 def with_notches(flight: Flight, frequencies: Sequence[float], where: str) -> Flight:
     """Return the flight with notches at some frequencies in its inputs and outputs alike.
 
-    A linear vehicle responds to notched sticks with notched motion, so the estimates are not
-    biased. With notches on one side only, their lag would be attributed to the vehicle. An output
-    sampled too slowly for a frequency is not notched there; the lag that is missing is at most 3 %
-    of its step.
+    A linear vehicle responds to notched sticks with notched motion, so this does not bias
+    estimates. An output sampled too slowly for a frequency is not notched there; the lag that is
+    missing is at most 3 % of its step.
 
     Args:
-        flight: the flight.
-        frequencies: [Hz]; none leaves the flight unchanged.
+        frequencies: [Hz].
         where: place in the configuration, for messages.
 
     Raises:
-        InputError: a frequency above the Nyquist frequency, or an output with so many gaps that the
-            notches hardly ever settle.
+        InputError: a frequency above the Nyquist frequency, or an output with too many gaps for the
+            notches to settle.
     """
     if not frequencies:
         return flight
@@ -158,7 +156,6 @@ def _rotor_doubt(vibration: VibrationConfig, speed: float) -> tuple[Finding, ...
     """Return a finding if a rotor's stated speed is implausible, or its unit is not stated.
 
     Args:
-        vibration: the section.
         speed: stated speed [rad/s].
     """
     if speed > _FASTEST_ROTOR:

@@ -1,23 +1,23 @@
 r"""Forces and moments of the rotors: eqs 10 and 13 to 20.
 
-Airspeeds are in m/s instead of the paper's ratios to R Omega ($\mu$, $\nu$, $\lambda$). So nothing
-is divided by the rotor speed, and a rotor at rest is no singular point.
+Airspeeds are in m/s instead of the paper's ratios to R Omega ($\mu$, $\nu$, $\lambda$). No equation
+divides by the rotor speed, so a rotor at rest is not singular.
 
 The induced velocity covers all axial flow: climb, hover, vortex ring, windmill. Momentum theory
-gives $2 v_i s = T/(\rho\pi R^2)$ with the flow $s = \sqrt{V^2 + (W + v_i)^2}$ through the rotor.
-In a descent between half and twice the induced velocity it has three roots or the wrong one: the
-wake is a ring or turbulent, and measured rotors have more flow. Here a separate term adds that
+gives $2 v_i s = T/(\rho\pi R^2)$ with the flow $s = \sqrt{V^2 + (W + v_i)^2}$ through the rotor. In
+a descent between half and twice the induced velocity it has three roots or the wrong one. The wake
+is then a ring or turbulent, and measured rotors have more flow. Here a separate term adds that
 flow,
 
 $$s^2 = V^2 + (W + v_i)^2 + k\,\frac{q^2}{v_i^2 + k_V V^2},\qquad
   q = \max\left(0, (-W - \tfrac12 v_i)(\tfrac{11}{5} v_i + W)\right),$$
 
-It is zero outside the range and has a continuous first derivative at its ends. So one curve with
-one root joins hover and the windmill brake. k = 0.37 and k_V = 5.8 are fitted to the measured
-curve of W. Johnson (NASA TP-2005-213477, and the theory of NDARC, NASA TP-2009-215402): in units
-of the induced velocity of hover, $W + v_i = W(0.373 W^2 + 0.598 V^2 - 0.991)$ where $1.5 V^2 + (2W
-+ 3)^2 < 1$. The fit is within 8 %, and within 4 % where no air flows through the rotor (W = -1.63,
-autorotation).
+It is zero outside the range and has a continuous first derivative at its ends. One curve with one
+root therefore joins hover and the windmill brake. k = 0.37 and k_V = 5.8 are fitted to the measured
+curve of W. Johnson (NASA TP-2005-213477, and the theory of NDARC, NASA TP-2009-215402): in units of
+the induced velocity of hover, $W + v_i = W(0.373 W^2 + 0.598 V^2 - 0.991)$ where
+$1.5 V^2 + (2W + 3)^2 < 1$. The fit is within 8 %, and within 4 % where no air flows through the
+rotor (W = -1.63, autorotation).
 """
 
 import math
@@ -73,8 +73,8 @@ def cyclic_moment(p: Helicopter, Omega: Scalar, theta_cyc: Scalar) -> Scalar:
         Omega: main rotor speed [rad/s].
         theta_cyc: cyclic pitch of the blades [rad], eq. 11.
     """
-    # The default is the paper's 1/2, not 1/8: only with it are its Ixx and a comparable. No rate
-    # enters here, although a rotor damps the body by -omega/Omega: see `hub_moment`.
+    # The default is the paper's 1/2, not 1/8: only with it are its Ixx and a comparable. Rates do
+    # not enter here, although a rotor damps the body by -omega/Omega: see `hub_moment`.
     return (p.cyclic_moment * p.rho * p.a * p.c * p.R**4) * Omega**2 * theta_cyc
 
 
@@ -119,8 +119,8 @@ def thrust(
     # The tests' quadrature agrees with eq. 13 except for that term.
     half = 0.5 * p.a * solidity(p.R, p.c)
     b = (half * 0.5 * p.B**2 * p.R) * Omega
-    # T over rho pi R^2 is linear in vi: T0 - b vi. So momentum theory, which the paper omits,
-    # couples thrust and inflow in one scalar equation.
+    # T over rho pi R^2 is linear in vi: T0 - b vi. Momentum theory, which the paper omits,
+    # therefore couples thrust and inflow in one scalar equation.
     lifting = (half * p.B**3 / 3.0 * p.R**2) * Omega**2 * theta0 + b * flow.edgewise
     T0 = lifting - b * flow.W
     if vi is None:
@@ -313,9 +313,7 @@ def _climbing(c: Scalar, t: Scalar, b: Scalar) -> Scalar:
 
 
 def _windmill(c: Scalar, t: Scalar, b: Scalar) -> Scalar:
-    """Return the smaller root v [m/s] of 2 v (-c - v) = t - b v, a fast vertical descent; infinite
-    if there is none.
-    """
+    """Return the smaller root v [m/s] of 2 v (-c - v) = t - b v (fast descent), or infinity."""
     q = b - 2.0 * c
     inside = q * q - 8.0 * t
     there = (q > 0) & (inside > 0)

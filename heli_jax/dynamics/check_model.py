@@ -52,20 +52,17 @@ def check_params(params: type, vehicle: Any) -> None:
 
 
 def check_model(model: Any, *, traceable: bool = True) -> None:
-    """Refuse objects that are no Model, and Models with functions that cannot be traced or return
-    unexpected types.
+    """Raise if an object is not a Model, or its functions fail or return unexpected types.
 
-    A model is checked once; later calls only look it up.
+    A model is checked once; later calls look it up.
 
     Args:
         traceable: True if parameters, states and inputs are all traced, as in a fit or a sweep.
-            Otherwise only return values are checked, since code may branch on parameters that stay
-            plain numbers.
+            Otherwise only return values are checked, since code may branch on plain parameters.
 
     Raises:
-        TypeError: it is no Model.
-        ValueError: a function fails; the message names it, what was expected, what it did, and the
-            remedy.
+        TypeError: it is not a Model.
+        ValueError: a function fails; the message gives its name, what was expected, and the remedy.
     """
     if isinstance(model, str):
         raise TypeError(
@@ -136,8 +133,8 @@ def explained[**P, R](function: Callable[P, R]) -> Callable[P, R]:
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
         model = args[0] if args else kwargs.get("model")
         check_model(model, traceable=False)
-        # It is not known in advance whether all arguments are traced. So the full check runs only
-        # after a failure. If it finds nothing, the model did not cause the failure.
+        # It is not known in advance whether all arguments are traced. The full check therefore runs
+        # only after a failure. If it finds nothing, the model did not cause the failure.
         try:
             return function(*args, **kwargs)
         except Exception:

@@ -54,16 +54,15 @@ def with_disturbance(model: Model, on: str | Sequence[str], poles: int = 1) -> M
     r"""Return the model with Ornstein-Uhlenbeck (Gauss-Markov) disturbances on some derivatives.
 
     $\dot w = -w/\tau_w + \sigma_w\sqrt{2/\tau_w}\,n$ with white noise n of unit intensity. w adds
-    to the derivative of a state. It has the standard deviation sigma_w (in that state's unit per
-    second) and the correlation time tau_w [s]. With two poles w follows a second lag of the same
-    time constant, scaled to the same standard deviation. w is stationary from the first sample:
-    all its states have the standard deviation sigma_w, and with two poles their correlation is
-    1/sqrt(2). An output that equals that derivative or its negative, as an accelerometer's,
-    includes the disturbance too.
+    to the derivative of a state. It has standard deviation sigma_w (in that state's unit per
+    second) and correlation time tau_w [s]. Two poles are two equal lags, scaled to the same
+    sigma_w. w is stationary from the first sample, and with two poles the correlation of its states
+    is 1/sqrt(2). Outputs equal to that derivative, such as an accelerometer's, include the
+    disturbance.
 
-    A single disturbance adds the parameters `sigma_w` (default 0) and `tau_w` (default 1 s). With
-    several, each has its own, named after the disturbed axis or state: `sigma_w_p`, `tau_w_p`. A
-    model's own process noise stays unchanged.
+    A single disturbance adds the parameters `sigma_w` (default 0) and `tau_w` (default 1 s).
+    Several are named after the disturbed axis or state: `sigma_w_p`, `tau_w_p`. A model's own
+    process noise stays unchanged.
 
     Args:
         on: names of disturbed axes (`disturbable`; w is an acceleration) or states
@@ -204,8 +203,7 @@ def _pushed_unit(model: Model, state: str) -> str:
 
 
 def _felt(model: Model, added: tuple[Disturbance, ...]) -> tuple[tuple[str, str, float], ...]:
-    """Return the outputs that equal the derivative of a disturbed state, or its negative: name,
-    disturbing lag, sign.
+    """Return outputs that are plus or minus a disturbed derivative: name, disturbing lag, sign.
 
     They are found by two evaluations, as kinematics in `disturbable_states`. Units are compared
     too, since an output that is a state may have the same value.
@@ -292,9 +290,7 @@ class _Disturbed(NamedTuple):
         return self.State(**rates)
 
     def output(self, p: Record, s: Record, u: Record) -> Record:
-        """Return the model's outputs. A disturbance acts on them through the motion, and directly
-        on outputs that equal the disturbed derivative.
-        """
+        """Return the model's outputs, with the disturbance on those that equal its derivative."""
         outputs = self.model.output(p, self.undisturbed(s), u)
         # Without the disturbance in an accelerometer's output, a gust would look like
         # autocorrelated noise, and the filter would estimate a wrong size and time.

@@ -1,8 +1,8 @@
 """The Bell-Hiller flybar: mixing (eq. 11) and flapping (eq. 12), and the first-order bar.
 
 Here and in the other equations, factors of parameters alone have their own brackets. They are
-computed once, outside the loop over time, which then has no division. Nothing is divided by the
-rotor speed, so a rotor at rest is no singular point.
+computed once, outside the loop over time, which then has no division. No equation divides by the
+rotor speed, so a rotor at rest is not singular.
 """
 
 import jax.numpy as jnp

@@ -163,7 +163,7 @@ def _inputs_class(corrections: Corrections, wind: bool) -> type:
         throttle = sticks.pop("x_throttle")
         sticks |= {"x_collective": COLLECTIVE, "x_throttle": throttle}
     if corrections.measured_speed:
-        # Nothing reads a throttle that is separate from the collective pitch.
+        # A throttle separate from the collective pitch is not used.
         if corrections.collective:
             del sticks["x_throttle"]
         sticks["Omega"] = ROTOR_SPEED

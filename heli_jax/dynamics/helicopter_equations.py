@@ -80,8 +80,8 @@ class HelicopterOutputs(NamedTuple):
     rotor_speed: Annotated[Scalar, "rad/s", "rotor speed"]
 
 
-# Switches instead of subclasses, so that each correction can be tested by itself. A NamedTuple of
-# booleans is static to jit, so a switch that is off costs nothing.
+# Switches instead of subclasses make each correction testable alone. A NamedTuple of booleans is
+# static to jit, so a switch that is off costs nothing.
 class Corrections(NamedTuple):
     """Independent corrections of the paper's equations, and extensions."""
 
@@ -197,7 +197,7 @@ def motion(corrections: Corrections, s: Record, u: Record) -> Motion:
         lateral_speed * at.cphi + below * at.sphi,
         below * at.cphi - lateral_speed * at.sphi,
     )
-    # Eqs 5-7 integrate M/I into the angles, so the paper's rates are the angles' derivatives. That
+    # Eqs 5-7 integrate M/I into the angles, so the paper's rates are the angles' derivatives. This
     # holds only in level flight: in a steady turn with dpsi at bank phi, the body has a pitch rate.
     p, q, r = _turned(s, at) if corrections.rigid_body else (s.dphi, s.dtheta, s.dpsi)
     return once(Motion(at, dx, dy, dz, forward, right, down, p, q, r))
@@ -269,11 +269,11 @@ def flow(corrections: Corrections, p: Helicopter, s: Record, u: Record, m: Motio
       - (\dot z - \ell_r\dot\theta)\cos\theta$$
 
     With `edgewise` and `descent` both are those of the hub, $h_r$ above and $\ell_r$ behind the
-    centre of gravity. The effect of cyclic pitch then depends on the flight direction. Pitch
-    cyclic has its largest blade angle on the right, where the blade advances in forward flight.
-    Roll cyclic has it at the nose, where the blade advances in flight to the left.
+    centre of gravity. The effect of cyclic pitch then depends on the flight direction. Pitch cyclic
+    has its largest blade angle on the right, where the blade advances in forward flight. Roll
+    cyclic has its largest blade angle at the nose, where the blade advances in flight to the left.
     """
-    # The hub is h_r above the centre of gravity, so a rising nose moves it backwards and a sinking
+    # The hub is h_r above the centre of gravity. A rising nose moves it backwards, and a sinking
     # right side moves it to the right.
     forward_speed, lateral_speed, up = (
         m.dx - p.hr * s.dtheta,
@@ -296,7 +296,8 @@ def flow(corrections: Corrections, p: Helicopter, s: Record, u: Record, m: Motio
         forward_speed, lateral_speed = hub_speed(p, m)
         if corrections.flapping:
             # Relative to the tilted plane, less air flows through it and the blade pitch is smaller
-            # by the same angle. So the thrust stays, and the power is that of the tilted thrust.
+            # by the same angle. The thrust is therefore unchanged, and the power is that of the
+            # tilted thrust.
             W = W - forward_speed * s.a1 + lateral_speed * s.b1
             tilt = Cyclic(tilt.roll - s.b1, tilt.pitch - s.a1)
         return aero.Flow(

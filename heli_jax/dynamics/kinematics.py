@@ -6,10 +6,9 @@ Parameters are the sensors' errors. Without mass and thrust, any misfit comes fr
 
 $$z = (1 + \lambda)\,y + b + noise$$
 
-Two choices differ from the book's equations and give the same trajectories. Velocities are states
-along north, east and down. Gyro noise then enters only through the angles, which a filter must
-account for. Velocities are also those of the IMU. Its lever arm then appears in the outputs as
-$\omega \times r$, without the angular acceleration, which a log has only as a derivative of noise.
+Two choices differ from the book's equations, with the same trajectories. Velocities are along
+north, east and down, so gyro noise enters only through the angles. Velocities are those of the IMU,
+so its lever arm appears in the outputs as $\omega \times r$, without the angular acceleration.
 """
 
 from typing import Annotated, Any, NamedTuple

@@ -212,7 +212,7 @@ def tail_rotor(
         # the way from tail thrust to moments and forces in `loads`.
         T = (1.0 / p.L_T) * aero.tail_moment(p, Omega, theta0T)
         inflow = 0.0 * T
-    # Not computed if unused, since a vehicle of the paper may lack its constants.
+    # It is computed only if used, since a vehicle of the paper may lack its constants.
     Q = aero.tail_torque(p, Omega, theta0T, inflow) if corrections.tail_power else 0.0 * T
     # Yaw, roll, side force and shaft power all use these two. With the barrier, the inflow
     # iteration runs only once.

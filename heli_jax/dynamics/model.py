@@ -88,8 +88,7 @@ class Model(eqx.Module):
     `State` of derivatives per second. For batches use `jax.vmap`.
 
     `linear=True` states that `vector_field` and `output` are linear in (state, inputs) and zero at
-    zero. The exact zero-order-hold discretisation is then possible, with matrices from
-    differentiation.
+    zero. Discretisation is then exact, with matrices from differentiation.
 
     `axes`, `steady_flight` and `without_stand` are optional. By default they follow from the names
     of states and inputs: see `axes_of`.
@@ -217,9 +216,7 @@ YAW = Axis("yaw", "dpsi", "psi", "Izz", None, "x_yaw")
 
 
 def axes_of(model: Model) -> tuple[Axis, ...]:
-    """Return the axes of a model: those that it states, else those of roll, pitch and yaw with a
-    rate among its states under the name used here.
-    """
+    """Return the axes that a model states, else roll, pitch and yaw with a known rate as state."""
     if model.axes is not None:
         return model.axes
     # A user's model with the same state names needs no axes to have disturbances and the stand.
@@ -296,8 +293,7 @@ def linear_misfit(model: Model, params: Record) -> float:
 
 
 def require_linear(model: Model, params: Record) -> None:
-    """Refuse a model with `linear=True` that is nonlinear: its exact discretisation would be wrong
-    without a message.
+    """Raise if a model with `linear=True` is nonlinear, since its discretisation would be wrong.
 
     Args:
         params: the model's Params, SI, concrete.
@@ -365,8 +361,7 @@ def require_constants(model: Model, params: Record, given: Collection[str] = ())
 
 
 def reads(model: Model, params: Record, name: str) -> bool:
-    """True if rates or outputs depend on a parameter, at states and inputs of one, or if it delays
-    an input.
+    """True if rates or outputs depend on a parameter (states and inputs one), or it is a delay.
 
     Args:
         params: the model's Params; concrete numbers.
@@ -381,8 +376,8 @@ def reads(model: Model, params: Record, name: str) -> bool:
 
 
 def _at_one(model: Model, params: Record, name: str, value: float) -> np.ndarray:
-    """Return rates and outputs with a parameter at `value`, and states, inputs and missing
-    parameters at one.
+    """Return rates and outputs with a parameter at `value`; states, inputs and missing ones are
+    1.
     """
     # One instead of zero, so that a parameter that multiplies a state or another parameter shows.
     one = np.float64(1.0)

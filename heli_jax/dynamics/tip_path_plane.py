@@ -6,17 +6,17 @@ $$\tau_f\dot a_1 = -a_1 - \tau_f q + \theta_{pitch} + \frac{\partial a_1}{\parti
     - \tau_f\omega_k a_1$$
 
 with the cyclic pitch of eq. 11, $\tau_f = 16/(\gamma\Omega)$ and the Lock number
-$\gamma = \rho a c R^4/I_\beta$ (Mettler, Tischler and Kanade, CMU-RI-TR-00-03, 2000; Gavrilets,
-MIT thesis, 2003; Padfield, Helicopter Flight Dynamics). $\omega_k = k_\beta/(2 I_\beta\Omega)$ is
-the effect of a stiff hub. It raises the blade's frequency above $\Omega$, and a free tilt then
-rotates against the rotor's sense.
+$\gamma = \rho a c R^4/I_\beta$ (Mettler, Tischler and Kanade, CMU-RI-TR-00-03, 2000; Gavrilets, MIT
+thesis, 2003; Padfield, Helicopter Flight Dynamics). $\omega_k = k_\beta/(2 I_\beta\Omega)$ is the
+effect of a stiff hub. It raises the blade's frequency above $\Omega$, and a free tilt then rotates
+against the rotor's sense.
 
 Two effects are neglected: the blade's second derivative, at most $\gamma/16$ of the other terms,
-and coning. The rotor is a seesaw, whose blades do not cone. A rotor with a coning angle $a_0$
-tilts further by $-\tfrac43\frac{v}{R\Omega}a_0$ in a1, with v the speed to the right and u that
-forward, and by $-\tfrac43\frac{u}{R\Omega}a_0$ in b1. For the X-Cell 60, whose thrust would cone
-free blades by 1.3 degrees, that is -0.17 degrees of b1 at 10 m/s, in addition to the modelled
--0.15. In trim the lateral stick compensates it.
+and coning, which a seesaw rotor does not have. With a coning angle $a_0$, speed v to the right and
+u forward, a rotor tilts further by $-\tfrac43\frac{v}{R\Omega}a_0$ in a1 and
+$-\tfrac43\frac{u}{R\Omega}a_0$ in b1. The X-Cell 60's thrust would cone free blades by 1.3 degrees.
+At 10 m/s this adds -0.17 degrees of b1 to the modelled -0.15. In trim the lateral stick compensates
+it.
 """
 
 from typing import NamedTuple
@@ -133,8 +133,7 @@ class HubLoads(NamedTuple):
 
 
 def hub_loads(p: Helicopter, T: Scalar, tilt: Tilt) -> HubLoads:
-    r"""Return the in-plane forces $-T a_1$ and $T b_1$ at the hub, and the moments $(k_\beta + T
-    h_r)$ times the tilt.
+    r"""Return the hub forces $-T a_1$ and $T b_1$, and the moments $(k_\beta + T h_r)$ times tilt.
 
     Args:
         p: vehicle, SI; k_beta is the stiffness of the whole hub.

@@ -1,8 +1,8 @@
 """Clock of a table: the column that a user names, a rate of the rows, or a guess from the file.
 
 Rows, or counts in a column, may be samples at a known rate. Several runs in a table are put one
-after another with some seconds between. They are found by a time that begins anew or by a column
-that numbers them. The gaps then split them into flights.
+after another with some seconds between. A time that begins anew or a column of numbers separates
+them. The gaps then split them into flights.
 """
 
 import datetime
@@ -193,7 +193,6 @@ def table_clock(
     """Return the clock, None without one, and True if its unit is a guess.
 
     Args:
-        table: the table.
         surveys: surveys of its columns.
         time: column of time stamps, if stated.
         unit: unit of the time stamps, if stated.
@@ -309,7 +308,7 @@ def require_increasing(table: Table, name: str, stamps: np.ndarray) -> None:
 def require_likely(path: str, time: Signal, stamps: np.ndarray) -> None:
     """Refuse stamps (N,) in seconds that are plausible only in another unit.
 
-    This applies if their name states that unit, or if nobody stated seconds.
+    This applies if their name states that unit, or if seconds were not stated.
     """
     named, likely = split_unit(time.name)[1], likely_unit(stamps)
     if time.unit != "s" or likely == "s" or not (named == likely or time.assumed):
@@ -372,7 +371,6 @@ def with_runs(
     The columns are unchanged if the table has only one run.
 
     Args:
-        table: the table.
         clock: name of the clock.
         columns: columns of the table, with the clock.
         scale: unit of the stamps [s].

@@ -28,15 +28,15 @@ the result is noise."""
 class Swashplate:
     r"""Geometry of a swashplate's servos, and the scale of their channels.
 
-    Servo i, seen from above at the angle $\psi_i$ clockwise from the nose and at the radius $r_i$,
-    lifts the plate by $s_i = (\text{channel}_i - \text{offset}_i)\,\text{scale}_i$, with the
+    Seen from above, servo i is at the angle $\psi_i$ clockwise from the nose and the radius $r_i$.
+    It lifts the plate by $s_i = (\text{channel}_i - \text{offset}_i)\,\text{scale}_i$, with the
     opposite sign if inverted. Because the plate is a plane,
 
     $$ s_i = c + r_i (\theta \cos(\psi_i - \gamma) - \phi \sin(\psi_i - \gamma)), $$
 
-    with the collective c, the tilt $\phi$ (down to the right, which rolls right) and $\theta$ (up
-    at the nose, which pitches up) and the phase $\gamma$. More than three servos give a
-    least-squares solution. Source: signs and angles are those of ArduPilot's AP_MotorsHeli_Swash.
+    with collective c, phase $\gamma$, and tilts $\phi$ (right side down) and $\theta$ (nose side
+    up). More than three servos give a least-squares solution. Signs and angles follow ArduPilot's
+    AP_MotorsHeli_Swash.
 
     Attributes:
         servos: channels, at least three.

@@ -170,13 +170,11 @@ def describe_flights(
 
     Args:
         path: the log, in a format that `read_flight` reads.
-        time: column of time stamps, in seconds if only its name is given; by default a column with
-            a usual name. Its unit then comes from an ending such as `_ms`, or is guessed from the
-            steps.
+        time: column of time stamps; by default one with a usual name. Without `unit` its unit comes
+            from an ending such as `_ms`, or is guessed from the steps.
         unit: unit of the time stamps, if stated.
         number: number of the one flight to describe, from 1.
-        rate: samples a second [Hz] of a table without times: of its rows, or of a column that
-            counts them.
+        rate: sample rate [Hz] of a table without times.
 
     Raises:
         InputError: the log cannot be read, has no such column, or needs no column of times.

@@ -41,7 +41,7 @@ class Signal:
         constant: value in `unit` of an input that the log lacks.
         missing: numbers of the log that mean no value. An output is missing there; an input keeps
             its previous value.
-        assumed: True if nobody stated the unit, so that the file's unit overrides it.
+        assumed: True if the unit was not stated, so that the file's unit overrides it.
         origin: source of unit, axes and sign, in words, if a preset states them.
         contradicted: unit that the file states, if it differs from `unit`.
     """

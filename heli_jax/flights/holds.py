@@ -34,8 +34,9 @@ def decide(values: np.ndarray) -> Decision:
 
     An input commanded in steps moves in jumps, also with noise of a few counts. It may hold for two
     samples (logged faster than sampled) or two hundred. A smooth motion, with or without pauses,
-    has hardly any jumps, nor has a step over several samples. An input with both is mixed. Moves by
-    one count of the log decide nothing: they are the resolution of a slow motion or of noise.
+    has hardly any jumps. Neither has a step over several samples. An input with both is mixed.
+    Moves by one count of the log decide nothing: they are the resolution of a slow motion or of
+    noise.
     """
     largest = float(np.abs(values).max())
     if largest > 0:

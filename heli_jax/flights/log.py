@@ -115,7 +115,7 @@ def require_columns(path: str, have: Sequence[str], needed: Sequence[str]) -> No
     """Refuse a column that is missing or occurs twice."""
     for name in needed:
         count = have.count(name)
-        # Which of the two is meant is unknown, and pyarrow would return either.
+        # It is unknown which of the two is meant, and pyarrow would return either.
         if count > 1:
             raise wrong(path, f"{count} columns have this name, expected one", column(name))
         if count == 0:

@@ -346,7 +346,7 @@ def repeats_removed(
         if stated[name] == "keep" or usual is None or usual < 2:
             continue
         if stated[name] == "auto" and not moving:
-            # No other signal shows that the vehicle moved while this one was constant.
+            # The other signals do not show motion while this one was constant.
             words = (
                 f"{name} keeps each value for {usual} samples; if the sensor is that slow, state "
                 "`repeats: missing`"

@@ -432,7 +432,6 @@ def at_times(
     between samples.
 
     Args:
-        request: names of the signals, and options.
         signals: signals by key, SI, each on its own clock.
         holds: hold by input.
         times: times of the grid (M,) [s].
@@ -521,7 +520,6 @@ def _resampled_with(
     The output's samples alone would put it half a step early.
 
     Args:
-        signal: the output.
         inputs: held inputs that the output follows without delay, each with the result of
             `held_low_passed`.
         times: (M,) [s].

@@ -10,8 +10,8 @@ from heli_jax.flights.flight import Flight
 from heli_jax.flights.resample import longest_gap
 
 SHORTEST = 2.0
-"""Shortest part [s]. Each part has its own initial state and biases, which shorter ones hardly
-determine."""
+"""Shortest part [s]. Each part has its own initial state and biases, which shorter parts do not
+determine well."""
 FEWEST = 50
 """Fewest samples of the fastest clock in a part."""
 

@@ -70,7 +70,7 @@ def read_flight(
             [s], `known` [SI], `hold_out`, `name`, `number`, `also`.
 
     Raises:
-        InputError: one sentence on what is wrong with the log or with the arguments.
+        InputError: the log or an argument is wrong; the message is one sentence.
         TypeError: a keyword that is no field of ReadOptions.
     """
     options = dataclasses.replace(options, **keywords)
@@ -94,8 +94,8 @@ def read_parts(
 
     Returns:
         The unchanged run if it has no such gap, else its parts, named `NAME, part 1` and so on.
-        Parts of less than 2 s or 50 samples are left out. So are parts without a moving input, if
-        an input moves in other parts. The notes of the first part list what was left out.
+        Parts of less than 2 s or 50 samples are left out. Parts without a moving input are left out
+        if an input moves in others. The notes of the first part list what was left out.
 
     Raises:
         InputError: as in `read_flight`, or no part is left.

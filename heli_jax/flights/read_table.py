@@ -233,7 +233,6 @@ def without_joins(log: ChannelLog, joined: bool = False) -> ChannelLog:
     """Return the log with separate topics if the rows of a table hold one topic each.
 
     Args:
-        log: the log.
         joined: True if they are known to do so.
     """
     topics: list[Topic] = []

@@ -94,7 +94,7 @@ def require_rate_and_window(
 
 
 class Request:
-    """Signals, rate and window that a user wants from a log."""
+    """Signals, rate and window to read from a log."""
 
     def __init__(
         self,

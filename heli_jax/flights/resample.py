@@ -78,9 +78,8 @@ def held_until_jumps(seconds: np.ndarray, values: np.ndarray, times: np.ndarray)
 def held_mean(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Return the mean of a stepwise signal over each step of a grid, from its time to the next.
 
-    A vehicle responds to the integral of a step. The mean keeps the integral wherever the step is.
-    The value at the grid's time would be late by half a step on average, which a fit attributes to
-    lag.
+    The mean keeps the integral of the signal, to which a vehicle responds. The value at the grid's
+    time would be late by half a step on average, which a fit attributes to lag.
 
     Args:
         seconds: stamps (N,) [s], increasing; each sample holds until the next.
@@ -218,9 +217,8 @@ def at_nearest(signal: Timed, times: np.ndarray) -> np.ndarray:
 def at_own_rate(signal: Timed, times: np.ndarray) -> np.ndarray:
     """Move the nearest sample to each instant along its slope, at the grid's own rate.
 
-    For signals with the grid's rate but different or uneven stamps. Linear interpolation has the
-    same order but averages noise: white noise gets an autocorrelation of up to +0.5 at lag one,
-    which looks like a disturbance.
+    This is for signals with the grid's rate but different or uneven stamps. Linear interpolation
+    would give white noise an autocorrelation of up to +0.5, which looks like a disturbance.
 
     Args:
         signal: the signal on its own clock.

@@ -1,7 +1,7 @@
 """Facts of a signal as it was logged: clipped ends, steps, stuck parts.
 
-They are found before any resampling: a low-pass filter rounds a clipped top and fills the steps of
-a coarse log, so the faults would be hidden but remain.
+They are computed before any resampling: a low-pass filter rounds a clipped top and fills the steps
+of a coarse log, so the faults would be hidden but remain.
 """
 
 from collections.abc import Hashable, Mapping, Sequence

@@ -99,7 +99,7 @@ def write(run: Run, lanes: int) -> tuple[str, list[Argument]]:
     arguments = f"{tables}, i64 %begin, i64 %end, i64 %count"
     body = "\n".join(code.lines)
     # Without the attributes LLVM would use half the width of AVX-512, and spilled registers would
-    # cross cache lines. That costs a quarter of an exact step's time.
+    # cross cache lines. This costs a quarter of an exact step's time.
     attributes = 'alignstack(64) "prefer-vector-width"="512" "min-legal-vector-width"="512"'
     function = f"define void @run({arguments}) nounwind {attributes} {{\nentry:\n{body}\n}}"
     return "\n".join([*head, function, ""]), kinds

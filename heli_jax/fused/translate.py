@@ -143,9 +143,7 @@ def _equation(code: Code, equation: Any, inputs: list[Operand]) -> list[Operand]
 def _elementwise(
     code: Code, name: str, params: dict[str, Any], inputs: list[Operand], dtype: np.dtype
 ) -> Operand:
-    """Apply an operation to arrays of one shape, single numbers, and arrays broadcast along axes of
-    length 1.
-    """
+    """Apply an operation to arrays of one shape, numbers, and arrays with axes of length 1."""
     operation = functools.partial(OPERATIONS[name], code, **params)
     shape = np.broadcast_shapes(*(v.shape for v in inputs))
     if any(isinstance(v, Stored) for v in inputs):
@@ -170,9 +168,7 @@ def _repeated(
 
 
 def _branches(code: Code, params: dict[str, Any], inputs: list[Operand]) -> list[Operand]:
-    """Translate cond: vehicles may take different branches, so all are computed and one result is
-    selected.
-    """
+    """Translate cond: compute all branches, and select a result for each vehicle."""
     which, operands, branches = inputs[0], inputs[1:], params["branches"]
     if not isinstance(which, Stored) and which.dtype != object:
         branch = branches[int(np.clip(which, 0, len(branches) - 1))]

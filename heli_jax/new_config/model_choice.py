@@ -50,7 +50,6 @@ def chosen_model(
 
     Args:
         name: as stated; by default chosen from the signals that move.
-        log: the log.
         path: path of the log, for messages.
         folder: folder of the configuration.
     """

@@ -16,7 +16,7 @@ _MIDDLE, _TRIM = 1500.0, 150.0
 _SBUS_REST, _SBUS_STOP = 992.0, 819.5
 """Counts of a receiver's serial bus at rest, and from there to the end: 172 to 1811."""
 _LONG = 0.2
-"""Share of a record for which nobody holds a stick away from its rest position."""
+"""Share of a record above which a stick's value is its rest position."""
 _ROTORS = {"rpm", "omega", "rotor", "headspeed", "head", "nr", "speed"}
 _FULL_COMMAND = 500.0
 """Count at a stick's stop in firmware that commands in pulse widths around the middle."""
@@ -35,7 +35,6 @@ def scaled(
 
     Args:
         channel: name of the channel.
-        series: its samples.
         si: SI unit of the model's signal.
         full: count of the log's sticks at their stops, if known.
         is_input: True for a stick or a servo.

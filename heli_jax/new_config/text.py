@@ -60,8 +60,6 @@ def filtered_outputs(
 
     Args:
         name: name of the preset.
-        model: the model.
-        log: the log.
         asked: outputs to take from the preset; all if empty.
     """
     table, known = preset(name).signals, model_outputs()
@@ -121,16 +119,13 @@ def configuration(
     """Return the configuration as text.
 
     Args:
-        chosen: the model.
-        log: path of the log.
         time: clock of a table; None if topics have separate clocks.
         flight: number of the flight, if there are several.
-        preset: name of the preset, if one fits.
         signals: channels, without a preset.
         vehicle: path of the vehicle file, if any.
         free: starts by parameter; None for the vehicle's value.
         held: fixed parameters with another vehicle's values.
-        rate: grid rate [Hz] for topics with separate clocks, or for rows of several topics.
+        rate: grid rate [Hz], if topics have separate clocks or share rows.
         others: other models of the axis.
         preset_outputs: outputs to take from the preset; all if empty.
         filtered: filtered outputs of the preset.

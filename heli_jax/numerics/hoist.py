@@ -21,8 +21,8 @@ def hoisted(
 ) -> tuple[list[Any], Callable[..., Any]]:
     """Split a function of params and others into two parts.
 
-    Returns values that depend only on params, and a function of these and others. That function
-    performs the same operations as `function(params, *others)`.
+    Returns values that depend only on params, and a function of these and others. It performs the
+    same operations as `function(params, *others)`.
 
     Args:
         params: constant over the steps; leaves may be tracers.
@@ -35,7 +35,7 @@ def hoisted(
     known = dict(zip(jaxpr.invars, leaves, strict=False))
     known |= dict(zip(jaxpr.constvars, closed.consts, strict=True))
     later, repeated = [], []
-    # Equations of known values are computed now. Those with other inputs or side effects wait.
+    # Equations of known values are computed now. Operations with other inputs or side effects wait.
     for equation in jaxpr.eqns:
         inputs = [v for v in equation.invars if not isinstance(v, Literal)]
         if equation.effects or not all(v in known for v in inputs) or _along(equation):
@@ -69,9 +69,7 @@ def hoisted(
 
 
 def _along(equation: Any) -> bool:
-    """True if one number is repeated along a record; reading it is free, but storing it takes a
-    record's memory.
-    """
+    """True if a number is repeated along a record, which is free to read but not to store."""
     return _repeats(equation) and equation.outvars[0].aval.ndim == 1
 
 

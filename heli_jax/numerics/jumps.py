@@ -41,8 +41,8 @@ def weights(u: Any, xp: Any = np) -> Any:
 def jumps(u: Any, xp: Any = np) -> Any:
     """Return a mask of intervals (N-1,) in which a signal was held until it jumped.
 
-    A jump is a move whose two neighbours are below a quarter of it. Noise has such moves by chance,
-    so jumps must also make up most of the motion within eight samples on either side.
+    A jump is a move at least four times its two neighbours. Noise has such moves by chance, so
+    jumps must also make up most of the motion within eight samples on either side.
 
     Args:
         u: samples (N,), finite, in any unit.

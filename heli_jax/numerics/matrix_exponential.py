@@ -150,8 +150,8 @@ def van_loan(
     X, h = X * jnp.exp2(-s), h * jnp.exp2(-s)
     eye = jnp.eye(A.shape[0], dtype=A.dtype)
 
-    # Terms of degree k of e^{A h} and of the integrals of e^{A s} f and e^{A s} g g^T e^{A^T s},
-    # each from the previous one.
+    # Terms of degree k of e^{A h} and of the integrals of e^{A s} f and e^{A s} g g^T e^{A^T s}.
+    # Each follows from the previous one.
     def term(carry: PyTree, k: Array) -> tuple[PyTree, None]:
         (P, m, M), total = carry
         XM = product(X, M)

@@ -45,8 +45,7 @@ def noise_guess(signal: np.ndarray) -> float:
 
 
 def white_part(signal: np.ndarray) -> float:
-    """Return the sd of the white noise in a signal: the smaller of its levels at both ends of the
-    spectrum.
+    """Return a signal's white-noise sd: the smaller of the levels at both ends of its spectrum.
 
     Args:
         signal: (N,), NaN where nothing is measured.
@@ -78,8 +77,8 @@ def wanders(signal: np.ndarray) -> bool:
     white noise; smoothed signals have more. Too few samples give False.
 
     Args:
-        signal: (N,), NaN where nothing is measured. Of repeated values, as from a slower sensor,
-            only the first counts.
+        signal: (N,), NaN where nothing is measured. Only the first of repeated values counts, as
+            from a slower sensor.
     """
     known = signal[np.isfinite(signal)]
     repeated = np.diff(known) == 0.0
@@ -131,9 +130,7 @@ def _third_differences(signal: np.ndarray, every: int) -> np.ndarray:
 
 
 def _noise_sd(d: np.ndarray) -> float:
-    """Return the sd of normal numbers from the median of their sizes, 0.674 sd, which corners of
-    the motion do not affect.
-    """
+    """Return the sd of normal numbers from the median of their sizes, 0.674 sd (robust)."""
     return float(np.median(np.abs(d)) / 0.6744897501960817)
 
 

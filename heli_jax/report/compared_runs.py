@@ -38,8 +38,7 @@ class ComparedRuns(NamedTuple):
 
     @property
     def estimates(self) -> Table:
-        """Estimate and sd by run of parameters, determined combinations and shared nuisances, with
-        differences from the first run."""
+        """Estimates and sd by run, with differences from the first run."""
         first = self.labels[0]
         several = [f"{label} - {first} [sd]" for label in self.labels[1:]]
         rows, of_runs = [], self._by_run()
@@ -131,8 +130,9 @@ class ComparedRuns(NamedTuple):
         return tuple(notes)
 
     def to_dataframe(self) -> "pd.DataFrame":
-        """Return a row for each run and parameter, or determined combination; NaN if it is not
-        identifiable or the fit did not converge."""
+        """Return a row per run and parameter or combination; NaN if not identifiable or not
+        converged.
+        """
         from heli_jax.exports import runs_frame
 
         estimates = self._usable()

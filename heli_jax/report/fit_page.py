@@ -47,8 +47,6 @@ def write_report(
 
     Args:
         directory: existing output directory.
-        analysis: the fit and what belongs to it.
-        title: title of the page.
         vehicle_constants: constants of the vehicle file, by name.
         origin: command, configuration and files beside the page; default none.
         png: write figures/NAME.png too.

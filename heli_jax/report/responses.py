@@ -49,8 +49,9 @@ def write_responses(
     config: str = "",
     png: bool = False,
 ) -> None:
-    """Write responses.nc, responses.csv, transfer_functions.json, handling_qualities.json, figures/
-    and responses.html."""
+    """Write the files of responses, transfer functions and handling qualities, with figures and
+    page.
+    """
     write_table(directory / "responses.csv", table(responses))
     write_netcdf(directory / "responses.nc", responses, units)
     fits = [_content(*fit, responses.window) for fit in responses.fits]
@@ -304,8 +305,9 @@ def _measured(c: Coefficient, factor: float = 1.0) -> str:
 
 
 def useful_band(omega: np.ndarray, pair: Pair) -> tuple[str, str, str]:
-    """Return as text the mean coherence, and the widest band with coherence above 0.6 and a small
-    random error."""
+    """Return as text the mean coherence, and the widest band with coherence above 0.6 and small
+    error.
+    """
     seen = np.isfinite(pair.coherence)
     if not seen.any():
         return "not determined", "–", "–"

@@ -96,8 +96,8 @@ def accumulated(
             solver, substeps, block, adjoint and hold.
 
     Raises:
-        ValueError: as for `simulate`; a block below 1, or above 1 for a solver that is not exact;
-            an option that only `simulate` has.
+        ValueError: as for `simulate`; a block below 1, or above 1 without the exact solver; an
+            option of `simulate` only.
         TypeError: an unknown option.
     """
     options = keywords.pop("options", DEFAULT).changed(keywords)
@@ -199,7 +199,7 @@ def _prepared(
     options: SimulationOptions,
 ) -> "tuple[_Reducer, _Stepping, Record]":
     """Return the reduction at a sample, the step to the next one, and the first State."""
-    # Refused, since without a stored run nobody would see that the options have no effect.
+    # Refused, since without a stored run these options would silently have no effect.
     for name in _NOT_HERE:
         if getattr(options, name) is not getattr(DEFAULT, name):
             raise ValueError(f"accumulate: expected no {name}, which only simulate has")
@@ -279,7 +279,7 @@ class Accumulating(SolverWrapper):
     """A per-sample solver that carries a running value with the state.
 
     y = (state, value). At each sample, before the step, value = update(value, state, held inputs at
-    that sample, k). Nothing else of the trajectory is stored.
+    that sample, k). The rest of the trajectory is not stored.
     """
 
     update: Callable[..., Any] = eqx.field(static=True)

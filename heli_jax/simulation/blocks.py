@@ -29,8 +29,8 @@ from heli_jax.simulation.solvers import ZeroOrderHoldArgs, advance, dot
 def blockwise(args: ZeroOrderHoldArgs, m: int, x0: Record) -> Record:
     """Return the states (N,) of a record from x0, computed in blocks of m samples.
 
-    Between blocks X[k+1] = A^m X[k] + w[k]. Within a block, powers of A map the first state, and
-    A^j B the inputs, to all samples at once, one state variable at a time.
+    Between blocks X[k+1] = A^m X[k] + w[k]. Within a block, powers of A map the first state to all
+    samples at once, and A^j B the inputs.
     """
     assert args.discrete is not None
     if args.discrete.Bn is not None:
@@ -83,7 +83,7 @@ def columns(args: ZeroOrderHoldArgs) -> tuple[Array, Array]:
 
 
 def without_next(discrete: Discrete) -> Discrete:
-    """Return the recurrence without the next inputs, so that linear inputs cost no more than held
+    """Return the recurrence without the next inputs, so that linear inputs are as fast as held
     ones.
 
     z[k] = x[k] - Bn u[k] turns x[k+1] = Ad x[k] + Bd u[k] + Bn u[k+1] into z[k+1] = Ad z[k] + (Ad

@@ -45,9 +45,9 @@ def discretize(
 
     Args:
         dt: sample time [s].
-        delays: delays of the inputs; whole samples are handled where the arrays are read. With
-            `late` [s] the time in each interval before the delayed sample u[k] acts, under a
-            zero-order hold x[k+1] = Ad x[k] + (G(dt) - G(dt-late)) u[k-1] + G(dt-late) u[k].
+        delays: delays of the inputs; whole samples are handled where the arrays are read. `late`
+            [s] is the time in each interval before the delayed sample u[k] acts. A zero-order hold
+            then gives x[k+1] = Ad x[k] + (G(dt) - G(dt-late)) u[k-1] + G(dt-late) u[k].
     """
     A, B, _, _ = jacobians(model, params)
     dt = jnp.asarray(dt, A.dtype)

@@ -129,7 +129,7 @@ class _Interval(NamedTuple):
         return jax.tree.map(lambda a, b: a + s * (b - a), self.u0, self.u1)
 
     # Hermite's cubic from the rates at both ends is of fourth order in the sample time, as RK4 is.
-    # No solver step has to be repeated.
+    # Solver steps need not be repeated.
     def state(self, s: Array) -> Record:
         def cubic(a: Array, b: Array, da: Array, db: Array) -> Array:
             """Interpolate between two values with slopes."""

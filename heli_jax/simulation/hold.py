@@ -1,5 +1,4 @@
-"""Inputs between samples: constant (zero-order), on a straight line (linear), or mixed. A mixed
-input is held until it jumps and is linear elsewhere.
+"""Inputs between samples: held (zero-order), linear, or mixed (held until a jump, else linear).
 
 A stick that is commanded in steps is constant; one that was sampled while moving is not. Holding
 the latter delays it by half a sample on average.
@@ -79,7 +78,7 @@ def delays_of(
         floor = jnp.floor(jax.lax.stop_gradient(samples))
         whole.append(floor.astype(int))
         rest.append(samples - floor)
-    # Which inputs are delayed is static; the delays are not, so a fit changes them without
+    # The set of delayed inputs is static; the delays are not, so a fit changes them without
     # compiling.
     groups = tuple(distinct.index(k) if k in distinct else None for k in keys)
     return Delays(groups, tuple(whole), tuple(rest))

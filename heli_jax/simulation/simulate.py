@@ -82,9 +82,9 @@ def simulate(
         A Trajectory; a failed integration sets its `status` and raises nothing.
 
     Raises:
-        ValueError: "exact" for a nonlinear model, an unknown solver, wrong shapes, a key for a
-            model without noise or with adaptive steps, feedback with a delay or with a linear hold,
-            or an unknown hold.
+        ValueError: an unknown solver or hold, wrong shapes, or options that exclude each other:
+            "exact" for a nonlinear model, a key without noise or with adaptive steps, feedback with
+            a delay or a linear hold.
         TypeError: an unknown option.
     """
     # The Flight has dt unless it is given. From here on it is in `options`.
@@ -323,7 +323,7 @@ def add_process_noise(
 
 
 # Arguments of `step` are diffrax's: terms, the interval [t0, t1] in samples, its first state, and
-# args. No solver here keeps a state between steps.
+# args. Solvers here keep no state between steps.
 
 
 class StateFeedback(SolverWrapper):

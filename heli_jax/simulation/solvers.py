@@ -305,8 +305,8 @@ class PerSample(SolverWrapper):
     ) -> Any:
         """Make `substeps` steps of h [s].
 
-        Held inputs do not depend on time, and moving ones count it from the start of the step. So
-        each step starts at 0, and a constant step length makes the code faster.
+        Held inputs do not depend on time, and moving ones count it from the start of the step. Each
+        step therefore starts at 0, and a constant step length makes the code faster.
         """
         begin = jnp.zeros_like(h)
 

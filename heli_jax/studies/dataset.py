@@ -33,7 +33,6 @@ def dataset(
     """Return the Dataset of a study.
 
     Args:
-        study: the study.
         names: directories of the fits.
         fits: content of fit.json or failed.json by fit; None if it was not run.
         versions: versions of the packages.

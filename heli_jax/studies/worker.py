@@ -66,7 +66,7 @@ def main() -> None:
 def _read(tasks: "queue.SimpleQueue[bytes]") -> None:
     for line in sys.stdin.buffer:
         tasks.put(line)
-    # At once: nobody reads the result any more.
+    # At once: the result is no longer read.
     if SCRATCH in os.environ:
         shutil.rmtree(os.environ[SCRATCH], ignore_errors=True)
     os._exit(0)

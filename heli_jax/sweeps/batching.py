@@ -19,8 +19,8 @@ _CPU, _GPU = 64, 1 << 17
 _CHUNK_S = 2.0
 # [bytes] Results of a chunk; two chunks are held at once, one in computation and one being written.
 _CHUNK_BYTES = 64e6
-# Approximate number of chunks, if there are enough elements, so that progress is visible. Twice as
-# many for each of several processes, so that none waits long for the last one.
+# Approximate number of chunks, if there are enough elements, so that progress is visible. Several
+# processes need twice as many chunks each, so that none waits long for the last one.
 _CHUNKS = 4
 # [bytes] Whole runs held at once, for a user's function.
 _RUN_BYTES = {"cpu": 256e6, "gpu": 8e9}
@@ -41,7 +41,6 @@ def split_for(
     """Divide a sweep into chunks that are written at once, and these into batches of the device.
 
     Args:
-        job: the sweep.
         devices: devices of JAX; by default those of this process.
         chunk: elements written at a time; chosen by default.
         lanes: batch size; chosen by default.

@@ -127,7 +127,7 @@ def _is_trimmed(trim: Trim) -> jax.Array:
 
 
 _Run = tuple[Scalars, dict[str, jax.Array], Any, list[jax.Array]]
-"""Results, trajectories (samples kept,), the last State, and whether each limit was left."""
+"""Results, trajectories (samples kept,), the last State, and True for each exceeded limit."""
 
 OK, DIVERGED, OUT_OF_RANGE, NOT_RUN = 0, 1, 2, 255
 MEANINGS = {OK: "ok", DIVERGED: "diverged", OUT_OF_RANGE: "out_of_range", NOT_RUN: "not_run"}
@@ -146,8 +146,8 @@ _BLOCK = 4
 # each: 7.5 and 8.0 us a vehicle with 2, 7.9 with 3, 8.4 with 4.
 _FUSED_BLOCK = 2
 # Number of states and inputs above which a step is one sample. hybrid-flybarless has 15: 3000
-# samples of a vehicle took 119 us with 1 and 187 with 2, by XLA 116 and 140 (processor time, AVX2,
-# busy computer, medians of four). Values between 5 and 15 were not measured.
+# samples of a vehicle took 119 us with 1 and 187 with 2, by XLA 116 and 140. These are medians of
+# four processor times (AVX2, busy computer). Values between 5 and 15 were not measured.
 _FUSED_BLOCK_FITS = 8
 
 

@@ -1,12 +1,12 @@
 """Reducers: numbers computed from each run of a sweep during the simulation.
 
 A reducer starts with running values, updates them at every sample, and computes its result at the
-end. No part of the run is stored. A function of a whole run may replace it; the runs of one block
+end. The run itself is not stored. A function of a whole run may replace it; the runs of one block
 are then stored for it.
 """
 
 # `Any` below: the running values of a user's Streaming are any pytree, and without a signal it gets
-# the model's Outputs. Those here have scalars, ().
+# the model's Outputs. The reducers here have scalars, ().
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -150,7 +150,6 @@ def check(name: str, reduce: Reduce, outputs: tuple[str, ...], inputs: tuple[str
 
     Args:
         name: name of the result.
-        reduce: the result.
         outputs: names of the model's outputs.
         inputs: names of its inputs.
 

@@ -96,7 +96,6 @@ def sweep(
     """Run a model once for every element of a design, and keep numbers of each run.
 
     Args:
-        model: the model to simulate.
         params: the model's Params, SI; the axes of the design override them.
         flights: inputs of the runs, and outputs for results that compare with them. With several
             flights each result has a dimension `flight`.
@@ -134,9 +133,7 @@ def run_sweep(
     """Run a checked sweep.
 
     Args:
-        job: the checked sweep.
         out: a directory for the store, or None for one in memory.
-        options: options for the execution.
         files: texts by name, written beside the store when it is made.
         attributes: attributes of the store; `seed` is 0 by default.
         notes: notes to report and to store.

@@ -181,12 +181,9 @@ def job(
     """Check a sweep and prepare it.
 
     Args:
-        model: the model.
         params: the model's Params, SI; the axes of the design override them.
         flights: flights with the inputs.
-        design: the design of experiments.
         reduce: results by name.
-        options: options of the runs.
 
     Raises:
         ValueError: an axis or a result that the model or the flights cannot have; an incomplete

@@ -147,8 +147,6 @@ def create(
 
     Args:
         path: path of the store; None for one in memory.
-        job: the sweep.
-        split: its division.
         attributes: attributes of the store.
         where: place for messages.
 

@@ -1,4 +1,4 @@
-"""Intervals of responses and of transfer functions of few averages: Student's t."""
+"""Intervals of responses and transfer functions from few averages: Student's t."""
 
 import numpy as np
 import pytest
@@ -22,15 +22,15 @@ def test_a_mean_over_frequencies_is_as_certain_as_it_says(averages):
     k = 4000
     drawn = np.random.default_rng(0).gamma(averages, 1.0 / averages, k)
     mean, freedom = averaged(drawn, np.ones(k), averages)
-    # Of a variance with f degrees of freedom the relative variance is 2 / f.
+    # A variance with f degrees of freedom has a relative variance of 2 / f.
     assert 2.0 / np.var(mean) == pytest.approx(freedom, rel=0.15)
     assert np.mean(mean) == pytest.approx(1.0, abs=0.05)
-    # Of so many frequencies no more than they are.
+    # Four frequencies give at most 2 x 4 degrees of freedom.
     assert averaged(drawn[:4], np.ones(4), 1.0)[1] == pytest.approx(8.0)
 
 
 def record(seed: int) -> Flight:
-    """30 s and what came before."""
+    """Return a record of 30 s, without its transient."""
     rng = np.random.default_rng(seed)
     u = scipy.signal.lfilter(*scipy.signal.butter(1, 0.3), rng.standard_normal(800))
     b, a, _ = scipy.signal.cont2discrete(([TRUTH[0]], [1.0, *TRUTH[1:]]), DT)
@@ -40,7 +40,7 @@ def record(seed: int) -> Flight:
 
 
 def test_of_little_more_than_two_averages_intervals_hold_the_truth():
-    """With 1.96 and weights by each frequency's own error 92 % of bins and 86 % of numbers."""
+    """Test coverage; with 1.96 and each frequency's own error it was 92 % of bins."""
     wanted = Wanted("lat", "p", zeros=0, poles=2, delay=False)
     settings = Settings((0.4, 4.0), 18.0, points=30, transfer_functions=(wanted,))
     b, a, _ = scipy.signal.cont2discrete(([TRUTH[0]], [1.0, *TRUTH[1:]]), DT)

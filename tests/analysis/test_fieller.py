@@ -1,4 +1,4 @@
-"""Errors of responses by instrument, by chance: each frequency is a draw of its own."""
+"""Errors of responses by instrument, from independent draws."""
 
 import numpy as np
 import pytest
@@ -10,8 +10,10 @@ RESPONSE, WINDOWS, DRAWS = 2.0 - 1.0j, 20, 4000
 
 
 def drawn(strength, seed=0):
-    """Responses of `DRAWS` frequencies, the input `strength` times the excitation and as much of
-    feedback's as it is itself."""
+    """Return responses at `DRAWS` frequencies.
+
+    The input is `strength` times the excitation, plus as much from feedback as its own size.
+    """
     rng = np.random.default_rng(seed)
 
     def normal():
@@ -29,7 +31,7 @@ def test_intervals_hold_however_weak_the_excitation_is(strength):
     found = drawn(strength)
     H, sd = found.H[:, 0, 0], found.sd[:, 0, 0]
     given = np.isfinite(sd)
-    # Where nothing is known no response is given, and none is counted among the misses.
+    # If nothing is known, no response is given, and none is counted as a miss.
     inside = np.abs(np.real(H - RESPONSE)) < 1.96 * sd
     outside = np.mean(given & ~inside)
     assert outside < 0.06

@@ -1,4 +1,4 @@
-"""What responses of flights ask of their records."""
+"""Requirements of flight responses on their records."""
 
 import numpy as np
 import pytest
@@ -16,8 +16,10 @@ def test_a_flight_that_is_too_short_for_any_window_is_refused_by_its_own_length(
 
 
 def test_coherence_is_that_of_the_flights_in_which_a_stick_moves():
-    """Sweeps of one stick at a time: with the noise of all flights against one sweep, a coherence
-    of 0.87 was one of 0.65."""
+    """Test sweeps of one stick at a time.
+
+    With the noise of all flights against one sweep, a coherence of 0.87 became 0.65.
+    """
     rng, t = np.random.default_rng(0), 0.02 * np.arange(3000)
     sweep, rest = scipy.signal.chirp(t, 0.2, t[-1], 4.0, "linear", -90), np.zeros(t.size)
     flights = []
@@ -31,5 +33,5 @@ def test_coherence_is_that_of_the_flights_in_which_a_stick_moves():
     found = np.mean(together.pairs["lat"].coherence)
     assert found == pytest.approx(np.mean(alone.pairs["lat"].coherence), abs=0.05)
     assert 0.5 < found < 0.9
-    # The pedals move nothing, and chance makes of a coherence what it makes of that one flight.
+    # The pedals have no effect, so the coherence is that of chance in one flight.
     assert np.mean(together.pairs["ped"].coherence) < 0.2

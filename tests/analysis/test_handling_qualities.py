@@ -1,4 +1,4 @@
-"""Handling qualities against values by hand, other code, and intervals that hold the truth."""
+"""Handling qualities against values by hand and other code; coverage of their intervals."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,13 +21,14 @@ from heli_jax.analysis.response_curves import (
 from heli_jax.flights import Flight
 
 T, TAU = 0.1, np.pi / 40.0
-"""of 1 / (s (T s + 1)) exp(-TAU s): at 10 rad/s the lag is 90 + 45 + 45 deg"""
+"""Parameters of 1 / (s (T s + 1)) exp(-TAU s): at 10 rad/s the lag is 90 + 45 + 45 deg."""
 OMEGA = np.geomspace(1.0, 40.0, 120)
 BY_HAND = {
     "w180": 10.0,
-    # At 20 rad/s it is 90 + atan 2 + 90 deg.
+    # At 20 rad/s the lag is 90 + atan 2 + 90 deg.
     "phase_delay": np.arctan(2.0) / 20.0,
-    # The gain at 10 rad/s is 1 / sqrt(200): twice that (6 dB) where w^2 (1 + w^2 / 100) = 200 / 4.
+    # The gain at 10 rad/s is 1 / sqrt(200). It is twice that (6 dB) where w^2 (1 + w^2 / 100) = 200
+    # / 4.
     "gain_bandwidth": np.sqrt(50.0 * (np.sqrt(1.0 + 0.04 * 200.0 / 10.0**0.6) - 1.0)),
 }
 
@@ -50,7 +51,7 @@ def test_a_lag_with_an_integrator_and_a_delay_has_the_values_by_hand(sign):
         assert found.numbers[name].value == pytest.approx(value, rel=2e-4)
     phase = found.numbers["phase_bandwidth"].value
     assert np.arctan(T * phase) + TAU * phase == pytest.approx(0.25 * np.pi, rel=1e-4)
-    # The lesser of both; the line through the phase from 10 to 20 rad/s is a little steeper.
+    # The lesser of both; the line through the phase from 10 to 20 rad/s is slightly steeper.
     assert found.numbers["bandwidth"] == found.numbers["phase_bandwidth"]
     w = np.linspace(10.0, 20.0, 400)
     slope = np.polyfit(w, -0.5 * np.pi - np.arctan(T * w) - TAU * w, 1)[0]
@@ -58,13 +59,14 @@ def test_a_lag_with_an_integrator_and_a_delay_has_the_values_by_hand(sign):
 
 
 def test_attitude_command_takes_the_phase_bandwidth_and_warns():
-    # A second-order lag of little damping: the gain hardly falls before the phase does.
+    # A lightly damped second-order lag: the phase falls before the gain.
     s = 1j * OMEGA
     H = 36.0 / (s**2 + 2.0 * 0.3 * 6.0 * s + 36.0) * np.exp(-0.1 * s)
     curve = measured(H)
     rate, command = (handling_qualities(curve, k) for k in ("rate", "attitude-command"))
     assert command.numbers["bandwidth"] == command.numbers["phase_bandwidth"]
-    # Nowhere is the gain twice that at w180, near the resonance: no bandwidth of a rate response.
+    # Near the resonance the gain never reaches twice that at w180: a rate response has no
+    # bandwidth.
     assert "bandwidth" not in rate.numbers
     assert any("gain bandwidth is indeterminate" in s for s in command.sentences)
 
@@ -84,7 +86,7 @@ def test_what_the_band_does_not_reach_has_no_number():
 
 @pytest.mark.parametrize("turn", [2.0, np.pi, -2.0])
 def test_past_a_bin_whose_phase_leaps_nothing_is_known(turn):
-    # Unwrapped through it the phase from 20 rad/s on may be a turn off: a delay below zero.
+    # Unwrapped through the gap, the phase from 20 rad/s may be a turn off, with a negative delay.
     i = int(np.searchsorted(OMEGA, 19.0))
     H = plant(OMEGA) * np.exp(1j * np.where(np.arange(OMEGA.size) > i, -0.6 * turn, 0.0))
     H[i] *= 4.0 * np.exp(1j * turn)
@@ -131,7 +133,7 @@ def test_of_a_model_the_derivatives_are_those_of_finite_differences():
         here = naming.replace(params, **{n: jnp.asarray(v) for n, v in changes.items()})
         of = linear_responses(model, here, names)
         root = np.diag([sds[n] for n in names])
-        # By its rate and by its attitude: the same.
+        # Rate and attitude give the same.
         curve = integrated(modelled_curve(of, ("lat", "p"), root, (2.0, 60.0)))
         return handling_qualities(curve).numbers
 
@@ -141,7 +143,7 @@ def test_of_a_model_the_derivatives_are_those_of_finite_differences():
         linear_responses(model, params, names), ("lat", "phi"), root, (2.0, 60.0)
     )
     by_attitude = handling_qualities(attitude).numbers
-    # Without a delay the lag ends at 270 deg, and 2 w180 has a phase.
+    # Without a delay the lag ends at 270 deg, and the phase at 2 w180 exists.
     assert set(found) >= {"bandwidth", "gain_bandwidth", "phase_delay", "phase_delay_line"}
     for name, number in found.items():
         assert by_attitude[name].value == pytest.approx(number.value, rel=1e-9)
@@ -154,7 +156,7 @@ def test_of_a_model_the_derivatives_are_those_of_finite_differences():
 
 
 def test_intervals_of_a_measured_response_hold_the_truth():
-    """Rate of a lag with a delay of three samples, a random stick, and noise."""
+    """Return a record of a lag with a delay of three samples, with a random stick and noise."""
     dt, n = 0.02, 6000
     num, den, _ = scipy.signal.cont2discrete(([8.0], [T, 1.0]), dt)
     inside = {}
@@ -185,5 +187,5 @@ def test_intervals_of_a_measured_response_hold_the_truth():
             if name in truth:
                 inside.setdefault(name, []).append(v.lower95 < truth[name] < v.upper95)
     assert all(len(v) == 12 for v in inside.values())
-    # Of three dozen numbers, which are not independent of one another.
+    # A bound for three dozen dependent numbers.
     assert 0.86 < np.mean(list(inside.values())) <= 1.0

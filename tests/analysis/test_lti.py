@@ -1,4 +1,4 @@
-"""Between discrete and continuous: the paper's own numbers, SciPy, and round trips."""
+"""Discrete and continuous transfer functions: the paper's numbers, SciPy, and round trips."""
 
 import numpy as np
 import pytest
@@ -15,13 +15,13 @@ EQ34 = (
 )
 EQ35_NUM = ["1.25", "181.1", "11676", "780900", "19800000"]
 EQ35_DEN = ["1", "44.83", "5648", "209600", "1012000"]
-# The same, computed once by hand with another program: reading.md.
+# The same, computed once with another program: reading.md.
 NUM = [1.2553, 181.147, 11675.1, 780919, 1.98072e7]
 DEN = [1.0, 44.837, 5648.27, 209595, 1.01235e6]
 
 
 def printed_step(text):
-    """One unit of the last digit that is printed, trailing zeros of whole numbers apart."""
+    """Return one unit of the last printed digit, without trailing zeros of whole numbers."""
     if "." in text:
         return 10.0 ** -len(text.split(".")[1])
     return 10.0 ** (len(text) - len(text.rstrip("0"))) if len(text) > 1 else 1e-9
@@ -30,7 +30,7 @@ def printed_step(text):
 def test_equation_34_gives_every_published_digit_of_35():
     num, den = d2c(*EQ34, 0.02, method="real-log")
     for found, printed in (*zip(num, EQ35_NUM, strict=True), *zip(den, EQ35_DEN, strict=True)):
-        # The paper cuts some digits and rounds others: within one unit of the last.
+        # The paper truncates some digits and rounds others: within one unit of the last.
         assert abs(found - float(printed)) <= printed_step(printed), printed
     np.testing.assert_allclose(num, NUM, rtol=5e-6)
     np.testing.assert_allclose(den, DEN, rtol=1e-5)
@@ -56,7 +56,7 @@ def test_c2d_is_scipys(seed):
     wanted_num, wanted_den, _ = scipy.signal.cont2discrete((num, den), dt)
     found_num, found_den = c2d(num, den, dt)
     assert found_num.shape == found_den.shape == (n + 1,)
-    # SciPy's numerator is a difference of two denominators, and has their rounding.
+    # SciPy's numerator is a difference of two denominators, with their rounding.
     size = 1e-10 * np.abs(wanted_num).max() + 1e-14 * np.abs(wanted_den).max()
     np.testing.assert_allclose(found_num, np.ravel(wanted_num), rtol=1e-8, atol=size)
     np.testing.assert_allclose(found_den, wanted_den, rtol=1e-9, atol=1e-12)
@@ -74,13 +74,13 @@ def test_a_stable_system_below_nyquist_comes_back(real, oscillating, zeros, seed
         poles += list(np.roots([1.0, 2.0 * damping * omega, omega**2]))
     poles = np.array(poles)
     gaps = np.abs(poles[:, None] - poles[None, :])[~np.eye(len(poles), dtype=bool)]
-    # A logarithm near a multiple pole loses half the digits; that is not what is tested.
+    # A logarithm near a multiple pole loses half of the digits, which is not tested here.
     if poles.size == 0 or (gaps.size and gaps.min() < 3.0):
         return
     den = np.real(np.poly(poles))
     num = np.random.default_rng(seed).standard_normal(min(zeros, len(poles)) + 1)
     back_num, back_den = d2c(*c2d(num, den, dt), dt)
-    # Compared where both mean something: on the frequency axis, in units of the largest response.
+    # Compared on the frequency axis, in units of the largest response.
     s = 1j * np.geomspace(0.1, 150.0, 40)
     wanted = np.polyval(num, s) / np.polyval(den, s)
     found = np.polyval(back_num, s) / np.polyval(back_den, s)
@@ -136,7 +136,7 @@ def test_every_negative_pole_is_named(poles):
 @pytest.mark.parametrize("size", [1e-18, 1e-9, 1e9, 1e18])
 @pytest.mark.parametrize("go", [c2d, d2c])
 def test_the_unit_of_the_output_does_not_matter(go, size):
-    """Linear in num: a response in micrometres is a response."""
+    """Test linearity in num: a response in micrometres is a response."""
     num, den = np.array([1.0, -2.0, 3.0]), [1.0, -1.2, 0.6]
     wanted, same = go(num, den, 0.1)
     found, other = go(size * num, den, 0.1)

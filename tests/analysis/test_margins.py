@@ -1,4 +1,4 @@
-"""Gain and phase margins: python-control, formulas by hand, and loops that disturb others."""
+"""Gain and phase margins against python-control and formulas; independence of batch elements."""
 
 import warnings
 
@@ -10,7 +10,7 @@ from heli_jax.analysis.margins import Margins, margins
 
 
 def loop(num, den):
-    """A, B, C, D of a transfer function, each with a batch of one."""
+    """Return A, B, C, D of a transfer function, each with a batch of one."""
     s = control.tf2ss(control.tf(num, den))
     return np.array(s.A)[None], np.array(s.B).T, np.array(s.C), np.array(s.D)[0]
 
@@ -21,21 +21,21 @@ def of(num, den, gain=1.0):
 
 
 def controls(A, B, C, D, gain):
-    """Python-control's margins, the smallest of all crossings, and whether it is stable."""
-    # Its own use of NumPy warns, and does something else where warnings are errors.
+    """Return python-control's smallest margins over all crossings, and True if stable."""
+    # python-control's NumPy calls warn, and its result differs if warnings are errors.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         s = control.ss(A, B[:, None], C[None], [[D]]) * float(gain)
         stable = control.feedback(s, 1).poles().real.max() < 0
         gm, pm, *_ = control.stability_margins(s, returnall=True)
         gm = np.abs(20 * np.log10(gm))
-    # It does not look at infinite frequency.
+    # python-control ignores infinite frequency.
     gm = [*gm, *([abs(20 * np.log10(-gain * D))] if gain * D < 0 else [])]
     return min(gm, default=np.inf), min(np.abs(pm), default=np.inf), bool(stable)
 
 
 def random_loop(rng):
-    """A stable A of order 2 to 6 with poles from 0.1 to 30 rad/s, some of little damping."""
+    """Return a stable system of order 2 to 6, with poles from 0.1 to 30 rad/s."""
     n, i = int(rng.integers(2, 7)), 0
     A = np.zeros((n, n))
     while i < n:
@@ -52,7 +52,7 @@ def random_loop(rng):
     return T @ A @ np.linalg.inv(T), rng.standard_normal(n), rng.standard_normal(n), D
 
 
-# Of these some close a loop that is not stable.
+# Some of these loops are unstable.
 GAINS = np.array([0.02, 0.05, 0.2, 1.0, -0.1])
 
 
@@ -83,11 +83,11 @@ def test_three_lags(k):
 
 
 def test_gain_may_have_to_fall_or_to_rise():
-    # 4 (s + 1)^2 / s^3 has an angle of -180 deg at 1 rad/s, where its size is 8.
+    # 4 (s + 1)^2 / s^3 has a phase of -180 deg at 1 rad/s, where its gain is 8.
     gain, _, stable = of([4.0, 8.0, 4.0], [1.0, 0.0, 0.0, 0.0])
     assert stable
     assert gain == pytest.approx(20 * np.log10(8.0), rel=1e-9)
-    # k 20 / ((s - 1) (s + 10)) closes to s^2 + 9 s + 20 k - 10: k above a half.
+    # k 20 / ((s - 1) (s + 10)) has the closed loop s^2 + 9 s + 20 k - 10: stable for k above 0.5.
     gain, _, stable = of([20.0], [1.0, 9.0, -10.0])
     assert stable
     assert gain == pytest.approx(20 * np.log10(2.0), rel=1e-9)
@@ -101,7 +101,7 @@ def test_double_integrator_with_lead():
     assert stable
     assert gain == np.inf
     assert phase == pytest.approx(np.degrees(np.arcsin((1 - a) / (1 + a))), rel=1e-9)
-    # With a lag besides.
+    # With an additional lag.
     lag = 0.05
     gain, _, stable = of([k * T, k], np.polymul([a * T, 1.0, 0.0, 0.0], [lag, 1.0]))
     w = np.sqrt((1 - (a * T + lag) / T) / (a * T * lag))
@@ -111,7 +111,8 @@ def test_double_integrator_with_lead():
 
 
 def test_a_pole_is_no_crossing():
-    # (s + lead) / (s^2 + w^2) turns by 180 deg at its pole, through infinity and not the axis.
+    # The phase of (s + lead) / (s^2 + w^2) turns by 180 deg at its pole, through infinity, not
+    # through the axis.
     lead, square = (M.ravel() for M in np.meshgrid([0.3, 1.0, 10.0], np.linspace(1.0, 20.0, 40)))
     A = np.zeros((lead.size, 2, 2))
     A[:, 0, 1], A[:, 1, 0] = 1.0, -square
@@ -123,7 +124,7 @@ def test_a_pole_is_no_crossing():
 @pytest.mark.parametrize("damping", [1e-1, 1e-3, 1e-5])
 @pytest.mark.parametrize("peak", [-0.6, 3.0])
 def test_narrow_resonance_is_not_missed(damping, peak):
-    # A lag besides, and a circle that a resonance draws: through `peak` in its middle.
+    # An additional lag, and a resonance's circle through its middle `peak`.
     w = 7.3
     width = 2 * damping * w
     A = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, w], [0.0, -w, -width]])
@@ -132,13 +133,13 @@ def test_narrow_resonance_is_not_missed(damping, peak):
     found = margins(A[None], B[None], C[None], [0.0])
     assert stable
     assert found.stable[0]
-    # Control's roots of a polynomial lose digits where two of them are near each other.
+    # python-control's polynomial roots lose digits if two of them are close.
     np.testing.assert_allclose(found.gain[0], gain, rtol=1e-5)
     np.testing.assert_allclose(found.phase[0], phase, rtol=1e-5)
 
 
 def test_rounding_is_no_loop():
-    # The input drives one mode and the output sees others, in coordinates that hide it.
+    # The input drives one mode and the output shows others, in mixed coordinates.
     T = np.linalg.qr(np.random.default_rng(2).standard_normal((20, 4, 4)))[0]
     A = T @ np.diag([-1.0, -2.0, -5.0, -9.0]) @ T.mT
     found = margins(A, T[:, :, 0], T[:, :, 1] + T[:, :, 2], np.zeros(20))
@@ -171,7 +172,7 @@ def test_constant_loop(D, gain, n):
 
 
 def crowd(batch=300):
-    """Loops of four states, more than are worked on together, with another gain each."""
+    """Return loops of four states with different gains, more than one block."""
     rng = np.random.default_rng(7)
     A = rng.standard_normal((batch, 4, 4)) - 2.5 * np.eye(4)
     B, C = rng.standard_normal((2, batch, 4))
@@ -203,7 +204,7 @@ def test_elements_that_mean_nothing_leave_the_others_alone():
     ):
         broken[which][10 * where] = value
     broken[3][100], broken[4][100] = -0.5, 2.0
-    # And one whose matrix is singular at a point of the grid.
+    # One has a matrix that is singular at a point of the grid.
     broken[0][110] = np.kron(np.eye(2), [[0.0, 1.0], [-1.0, 0.0]])
     found = margins(*broken)
     bad = [0, 10, 20, 30, 40, 50, 60, 100]
@@ -214,7 +215,8 @@ def test_elements_that_mean_nothing_leave_the_others_alone():
     same(Margins(*(M[rest] for M in found)), Margins(*(M[rest] for M in wanted)))
 
 
-# Sway speed, roll, roll rate, flapping and a lag of the servo; stick to roll with roll rate.
+# States are sway speed, roll, roll rate, flapping and a servo lag; the loop is from stick to roll
+# with roll rate.
 HELI = (
     np.array(
         [
@@ -231,7 +233,7 @@ HELI = (
 
 
 def with_chains(T=None):
-    """The same with position and heading, each fed by a speed of its own that does not fade."""
+    """Return the same with position and heading, each integrated from an undamped speed."""
     A = np.zeros((9, 9))
     A[:5, :5] = HELI[0]
     A[5, 0] = A[5, 1] = A[6, 5] = A[7, 2] = A[8, 7] = 1.0
@@ -247,7 +249,7 @@ def test_positions_that_the_output_does_not_see(gain):
     alone = margins(*(M[None] for M in HELI), [0.0], gain)
     chained = margins(*(M[None] for M in with_chains()), [0.0], gain)
     mixed = margins(*(M[None] for M in with_chains(T)), [0.0], gain)
-    # At 0.2 the crossing is slow, where most of what rounding leaves of the mixed chains is seen.
+    # At 0.2 the crossing is slow, where rounding of the mixed chains matters most.
     for found, tolerance in ((chained, 1e-9), (mixed, 1e-4)):
         assert found.stable[0] == alone.stable[0] == (0.1 < gain < 1.0)
         np.testing.assert_allclose(found.gain, alone.gain, rtol=tolerance)

@@ -1,4 +1,4 @@
-"""Where a model that is not linear is linearised for a record, against programs of their own."""
+"""Operating points of nonlinear models for a record, against independent programs."""
 
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -23,7 +23,7 @@ STILL = dict.fromkeys(("x_roll", "x_pitch", "x_yaw", "x_throttle"), np.zeros(N))
 
 @pytest.fixture(scope="module")
 def hovering():
-    """The independent program's response of z to the throttle in hover, as a function of omega."""
+    """Return the independent program's z over throttle in hover, as a function of omega."""
     v = oracle.XCELL
     state, inputs = oracle.hover(v)["consistent"]
     A, h = oracle.jacobian("consistent", v, state, inputs), 1e-6
@@ -48,7 +48,7 @@ def signals(outputs, inputs=STILL):
 
 @pytest.mark.slow
 def test_the_response_of_a_hovering_helicopter_is_that_of_hover(xcell, hovering):
-    # At zero throttle, where the rotor stands still, it is nothing at all.
+    # At zero throttle the rotor is at rest, and the response would be zero.
     model = models.helicopter("consistent")
     fit = SimpleNamespace(nuisance={}, signals=(signals({"z": np.zeros(N)}),))
     at = at_record(model, xcell, fit)
@@ -150,7 +150,7 @@ class Seen(NamedTuple):
 
 
 def test_a_fast_mode_that_is_there_in_flight_only_is_seen():
-    # A spring that the throttle stiffens: at zero throttle nothing moves.
+    # The throttle stiffens a spring: at zero throttle nothing moves.
     spring = Model(
         "spring",
         lambda p, s, u: Spin(x=s.y, y=-p.drag * s.y - 50.0**2 * u.throttle * s.x + u.throttle),

@@ -1,4 +1,4 @@
-"""The pilot: what is slow comes back, with as little stick as possible."""
+"""Pilot: slow motion is fed back, with little stick."""
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ def hover(vehicles_folder):
 
 
 def differences(f, at, names, steps):
-    """Central differences of the attitude's rates by the named fields of a record."""
+    """Return central differences of the attitude's rates by the named fields of a record."""
     columns = []
     for name, h in zip(names, steps, strict=True):
         x = getattr(at, name)

@@ -1,4 +1,4 @@
-"""How a model's responses agree with measured ones."""
+"""Agreement of a model's responses with measured ones."""
 
 from types import SimpleNamespace
 from typing import cast
@@ -11,7 +11,7 @@ from heli_jax.analysis.spectra import Windowed
 
 
 def test_what_lies_above_a_sweep_has_no_part_in_J():
-    """A right model, and a response that is noise past 4 Hz, as in any record of a sweep."""
+    """Test a right model, with a response that is noise above 4 Hz, as in records of sweeps."""
     rng, hz = np.random.default_rng(0), np.arange(1, 400) / 10.0
     H = 1.0 / (1.0 + 1j * hz)
     swept = hz < 4.0
@@ -28,6 +28,6 @@ def test_what_lies_above_a_sweep_has_no_part_in_J():
     ("chi_squared", "said"), [(0.4, True), (0.773, True), (1.0, False), (1.2, True)]
 )
 def test_squared_errors_outside_of_their_interval_are_said_on_either_side(chi_squared, said):
-    """0.773 where 0.906 to 1.1 is expected stood in a table, and no sentence said so."""
+    """Test that a ratio of 0.773, where 0.906 to 1.1 is expected, is reported in a sentence."""
     agreement = ResponseAgreement((), chi_squared, 0.906, 1.1, 800.0, 10.0, (), (), ())
     assert agreement.outside == said

@@ -1,4 +1,4 @@
-"""What windows cut off of a sweep's answers."""
+"""Parts of responses to sweeps that windows cut off."""
 
 import numpy as np
 from scipy.signal import lfilter
@@ -10,7 +10,7 @@ DT, SECONDS = 0.02, 120.0
 
 
 def test_a_sweep_without_noise_gives_its_response_to_a_quarter_of_a_percent() -> None:
-    """0.13 % in the median; with windows that overlap by half 1.1 %."""
+    """Test the median error: 0.13 %; with half-overlapping windows it was 1.1 %."""
     t = np.arange(0.0, SECONDS, DT)
     rate = np.log(8.0 / 0.2) / SECONDS
     u = 0.1 * np.sin(2.0 * np.pi * 0.2 * (np.exp(rate * t) - 1.0) / rate)
@@ -21,5 +21,5 @@ def test_a_sweep_without_noise_gives_its_response_to_a_quarter_of_a_percent() ->
     z = np.exp(-1j * found.omega * DT)
     H = np.polyval(b[::-1], z) / np.polyval(a[::-1], z)
     assert np.median(np.abs(found.outputs["p"].pairs["lat"].H / H - 1.0)) < 0.0025
-    # Of one that rests it is said, rather than that it asks for longer windows.
+    # For a stick at rest the note states this and does not ask for longer windows.
     assert ("w",) in [n.subjects for n in found.notes if n.code == "responses.still"]

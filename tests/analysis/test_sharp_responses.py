@@ -1,4 +1,4 @@
-"""Handling qualities of responses that local fits over half an octave cannot follow."""
+"""Handling qualities of responses too sharp for local fits over half an octave."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ OMEGA = 2.0 * np.pi * np.geomspace(0.1, 6.0, 100)
 
 
 def _curve(damping: float) -> Curve:
-    """Roll rate with a load that swings at 1 Hz, in random errors of 4 %."""
+    """Test a roll rate with a load that swings at 1 Hz, and random errors of 4 %."""
     s = 1j * OMEGA
     load = np.polyval([1.0, 2.0 * 5.6 * damping, 5.6**2], s) / np.polyval(
         [1.0, 2.0 * 6.28 * damping, 6.28**2], s

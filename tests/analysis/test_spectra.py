@@ -1,4 +1,4 @@
-"""Welch's spectra against matplotlib's, and against a response that is known."""
+"""Welch's spectra against matplotlib's and a known response."""
 
 import numpy as np
 import pytest

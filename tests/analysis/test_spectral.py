@@ -1,4 +1,4 @@
-"""Frequency responses of records: SciPy's numbers, several inputs at once, feedback."""
+"""Frequency responses of records: SciPy's numbers, several inputs, feedback."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from heli_jax.analysis.spectra import cross_spectra
 
 DT = 0.02
 BAND = 2.0 * np.pi * np.arange(4, 60) / 20.0
-"""multiples of 1/20 Hz, as SciPy has them for segments of 20 s [rad/s]"""
+"""Multiples of 1/20 Hz, SciPy's frequencies for segments of 20 s [rad/s]."""
 LAG = scipy.signal.cont2discrete(([2.0], [1.0, 2.0]), DT)
 
 
@@ -39,7 +39,7 @@ def test_spectra_and_coherence_are_those_of_scipy(noise):
 
 
 def test_partial_coherence_is_that_of_what_the_others_leave():
-    """Against a projection segment by segment, as Bendat and Piersol derive it."""
+    """Test against a projection segment by segment, as derived by Bendat and Piersol."""
     rng = np.random.default_rng(1)
     u = rng.standard_normal((2, 6000))
     u[1] += 0.5 * low_pass(u[0])
@@ -75,17 +75,17 @@ def test_inputs_that_move_together_are_told_apart_and_errors_are_as_large_as_sta
         inside.append(np.mean(np.abs(np.stack([error.real, error.imag])) < 1.96))
         bias.append(error)
     assert 0.92 < np.mean(inside) < 0.97
-    # Of the mean over thirty records; bins 1/20 Hz apart in a Hann window are not independent.
+    # The mean over thirty records; bins 1/20 Hz apart in a Hann window are dependent.
     assert np.mean(np.abs(np.mean(bias, axis=0))) < 2.0 / np.sqrt(30)
 
 
 def closed_loop(seed: int, n: int = 12000) -> np.ndarray:
-    """Stick, roll and sweep: the stick follows the roll, which gusts disturb."""
+    """Return stick, roll and sweep: the stick follows the roll, and gusts act on it."""
     rng = np.random.default_rng(seed)
     b, a = LAG[0].ravel(), LAG[1]
     sweep = low_pass(rng.standard_normal(n)) * 4.0
     gust = low_pass(rng.standard_normal(n)) * 4.0
-    # y = G u + gust, u = sweep - 2 y of the sample before: solved as one filter.
+    # y = G u + gust, u = sweep - 2 y of the previous sample, solved as one filter.
     y, u = np.zeros(n), np.zeros(n)
     x = 0.0
     for k in range(n):

@@ -20,7 +20,7 @@ def measured(seed: int | None = 0, relative: float = 0.02, omega: np.ndarray = O
     sd = relative * np.abs(H)
     rng = np.random.default_rng(seed)
     noise = 0.0 if seed is None else rng.standard_normal((2, omega.size)) * sd
-    # Windows of so many seconds that each frequency stands for itself.
+    # Windows are so long that frequencies are independent.
     e = noise if seed is None else noise[0] + 1j * noise[1]
     return Measured(omega, H + e, sd, 1000.0, np.full(omega.size, 0.95))
 
@@ -45,14 +45,14 @@ def test_intervals_cover_the_truth_and_chi_squared_is_near_one():
         truth = (3.2, 64.0, 9.6, 64.0, 0.06)
         inside += [c.lower95 <= v <= c.upper95 for c, v in zip(found, truth, strict=True)]
         chi.append(fitted.chi_squared)
-    # An upper limit too: chi-squared above one widens the intervals.
+    # There is an upper limit too: chi-squared above one widens the intervals.
     assert 0.92 < np.mean(inside) < 0.985
     assert np.mean(chi) == pytest.approx(1.0, abs=0.05)
 
 
 @pytest.mark.parametrize(("hold", "method"), [("zero-order", "zoh"), ("linear", "foh")])
 def test_of_samples_the_continuous_machine_comes_back(hold, method):
-    """SciPy's discrete equivalents, up to 0.8 of the Nyquist frequency, where images count."""
+    """Test SciPy's discrete equivalents up to 0.8 of the Nyquist frequency, where images matter."""
     dt = 0.05
     b, a, _ = scipy.signal.cont2discrete(([3.0, 40.0], [1.0, 9.0, 64.0]), dt, method=method)
     omega = np.linspace(1.0, 0.8 * np.pi / dt, 80)
@@ -75,7 +75,7 @@ def test_a_pole_that_nothing_shows_is_not_determined():
 
 
 def test_denser_frequencies_say_no_more():
-    """What two frequencies within one line of the window show is the same."""
+    """Test that two frequencies within one line of the window have equal information."""
     few, many = (
         measured(None, omega=np.linspace(0.5, 30.0, n))._replace(seconds=5.0) for n in (60, 600)
     )
@@ -84,7 +84,7 @@ def test_denser_frequencies_say_no_more():
 
 
 def test_mismatch_is_that_of_the_book():
-    """One dB and 10 degrees everywhere, coherence 0.95: by hand."""
+    """Test an error of 1 dB and 10 degrees everywhere, with coherence 0.95, by hand."""
     m = measured(None)
     model = m.H * 10 ** (1.0 / 20.0) * np.exp(1j * np.radians(10.0))
     weight = (1.58 * (1.0 - np.exp(-0.95))) ** 2

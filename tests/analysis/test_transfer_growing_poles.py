@@ -1,11 +1,11 @@
-"""Transfer functions whose data do not tell a fast pole from its mirror image behind a delay."""
+"""Transfer functions with a fast pole that the data do not separate from its mirror image."""
 
 import numpy as np
 
 from heli_jax.analysis.transfer_fit import Measured, fit_transfer
 
 NUMERATOR, DENOMINATOR, DELAY = [480.0], [1.0, 21.7, 160.0], 0.06
-"""roll rate by the stick: a mode at 2 Hz"""
+"""Roll rate over stick: a mode at 2 Hz."""
 
 
 def _response(omega: np.ndarray, numerator: list[float], denominator: list[float]) -> np.ndarray:
@@ -14,7 +14,7 @@ def _response(omega: np.ndarray, numerator: list[float], denominator: list[float
 
 
 def _fits(numerator: list[float], denominator: list[float], relative: float, last: float) -> list:
-    """Of ten responses known from 0.08 to `last` Hz, with relative random errors."""
+    """Fit ten responses known from 0.08 to `last` Hz, with relative random errors."""
     omega = 2.0 * np.pi * np.arange(0.08, last, 2.0 / 24.0)
     H = _response(omega, numerator, denominator)
     fits = []
@@ -27,7 +27,7 @@ def _fits(numerator: list[float], denominator: list[float], relative: float, las
 
 
 def test_a_pole_beyond_the_band_is_not_taken_for_a_growing_one() -> None:
-    # 1 / (p - s) with a longer delay fits about as well, and by chance better.
+    # 1 / (p - s) with a longer delay fits about as well, by chance better.
     fits = _fits(NUMERATOR, DENOMINATOR, 0.15, 2.2)
     assert all(np.all(np.real(f.poles) < 0) for f in fits)
     inside = [c.lower95 < 21.7 < c.upper95 for c in (f.denominator[0] for f in fits)]

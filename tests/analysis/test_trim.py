@@ -14,8 +14,8 @@ from heli_jax.dynamics import helicopter as whole
 from tests.dynamics import full_helicopter as second
 from tests.dynamics import whole_helicopter as oracle
 
-# As listed in the paper's reading; it has 0.006 for the slowest pair of `consistent`, which comes
-# out with the paper's (x_roll + x_pitch)/L1 left in eqs 10 and 13 and is 0.005 without.
+# As listed in the paper's reading. It has 0.006 for the slowest pair of `consistent`, which results
+# if (x_roll + x_pitch)/L1 stays in eqs 10 and 13. Without it the value is 0.005.
 MODES = {
     "paper": [
         -2.68 + 157j, -2.64 + 157j, -0.513 + 0.139j, -0.276, -0.155, -0.071, 0.046,
@@ -107,7 +107,7 @@ def test_linearisation_has_names_and_becomes_a_control_system(hovers, xcell):
     ],
 )
 def test_steady_flights_are_steady(condition, xcell):
-    """With drag, by the second program's derivatives."""
+    """Test trim with drag, by the second program's derivatives."""
     model = models.helicopter("consistent")
     p = naming.replace(xcell, Sx=jnp.asarray(0.1), Sy=jnp.asarray(0.22), Sz=jnp.asarray(0.15))
     found = trim(model, p, condition)
@@ -180,25 +180,27 @@ def full(xcell):
 
 
 def test_hover_banks_so_that_the_side_forces_balance(full, xcell):
-    """Weight along the body's y axis, the tilted thrust and the tail rotor's thrust add to zero."""
+    """Test that lateral forces add to zero: weight, tilted thrust and tail rotor."""
     model, found = full
     assert found.residual < 1e-10
     s = {n: float(v) for n, v in naming.asdict(found.state).items()}
     u = {n: float(v) for n, v in naming.asdict(found.inputs).items()}
     rates = second.rates(second.FULL, s, u)
     assert max(abs(rates[n]) for n in model.steady_flight.equations) < 1e-9
-    # The tail rotor pulls to the right (it turns the nose to the left), so the machine banks left.
+    # The tail rotor pulls to the right (it turns the nose to the left), so the vehicle banks left.
     weight = second.FULL["m"] * second.FULL["g"]
     tail = weight * np.sin(-s["phi"]) * np.cos(s["theta"]) - weight * s["b1"]
-    assert tail == pytest.approx(3.52, rel=0.05)  # as models.md has it
+    assert tail == pytest.approx(3.52, rel=0.05)  # as in models.md
     assert np.degrees(-s["phi"]) == pytest.approx(2.3, abs=0.3)
     assert s["Omega"] == pytest.approx(157.1)
     assert u["x_throttle"] == pytest.approx(1.0)
 
 
 def test_the_roll_mode_of_the_published_machine(full, xcell):
-    """The shipped file has a simulator's inertias; with those that go with k_beta (Gavrilets, 2003)
-    the roll mode is the published one of about 20 rad/s."""
+    """Test the roll mode with inertias that match k_beta (Gavrilets, 2003): about 20 rad/s.
+
+    The shipped file has a simulator's inertias.
+    """
     model, found = full
     published = {"Ixx": 0.18, "Iyy": 0.34, "hr": 0.235}
     p = naming.replace(xcell, **{n: jnp.asarray(x) for n, x in published.items()})
@@ -208,16 +210,20 @@ def test_the_roll_mode_of_the_published_machine(full, xcell):
 
 
 def johnson_descent(inflow):
-    """The descent, over the induced velocity of hover, at which W + v is `inflow` over the same:
-    the measured curve of axial flight (W. Johnson, NASA TP-2005-213477)."""
+    """Return the descent where W + v is `inflow`, both over the induced velocity of hover.
+
+    This is the measured curve of axial flight (W. Johnson, NASA TP-2005-213477).
+    """
     c = np.linspace(-2.0, -1.0, 100001)
     return -c[np.argmin(np.abs(c * (0.373 * c**2 - 0.991) - inflow))]
 
 
 @pytest.mark.slow
 def test_autorotation_sinks_as_measured(full, xcell):
-    """Straight down the rotor's power is nil where thrust times inflow makes up for the drag of
-    main blades and tail; the measured curve says how fast it sinks for that."""
+    """Test vertical autorotation against the measured curve.
+
+    The rotor's power is zero if thrust times inflow balances the drag of main blades and tail.
+    """
     model, _ = full
     found = trim(model, xcell, power_off=True)
     assert found.residual < 1e-10

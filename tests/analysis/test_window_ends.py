@@ -1,4 +1,4 @@
-"""What windows add to responses at the ends of parts between missing samples."""
+"""Errors that windows add to responses at the ends of parts between missing samples."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ B, A, _ = scipy.signal.cont2discrete(([80.0], [1.0, 5.0, 40.0]), DT)
 
 
 def swept(noise: float, gaps: int) -> Flight:
-    """A sweep of 120 s, with parts of half a second missing."""
+    """Return a sweep of 120 s with missing parts of half a second."""
     rng = np.random.default_rng(4)
     t = DT * np.arange(N)
     u = scipy.signal.chirp(t, 0.15, t[-1], 6.0, "logarithmic", -90)
@@ -26,7 +26,7 @@ def swept(noise: float, gaps: int) -> Flight:
 
 @pytest.mark.parametrize(("gaps", "noise"), [(0, 0.02), (3, 0.2), (9, 0.2)])
 def test_between_missing_samples_intervals_hold_the_truth(gaps, noise):
-    """With the ends left in a tenth lies outside, of intervals that allow for a fifth of them."""
+    """Test coverage: with the ends included, a tenth of the bins lies outside."""
     found = flight_responses([swept(noise, gaps)], Settings((0.3, 5.0), 10.0))
     pair = found.outputs["p"].pairs["lat"]
     off = pair.H - scipy.signal.freqz(B.ravel(), A, found.omega * DT)[1]
@@ -42,9 +42,12 @@ def test_between_missing_samples_intervals_hold_the_truth(gaps, noise):
     ("how", "size"), [("linear", 0.2), ("linear", 0.01), ("logarithmic", 0.01)]
 )
 def test_where_the_sweep_begins_in_a_long_window_errors_do_not_grow(how, size):
-    """Four sweeps of 60 s in windows of 24 s: slow frequencies are at the windows' ends, and what
-    is taken off of a response that is hardly known is noise. With little noise what a straight line
-    does not take off is all of the error, there and beyond the sweep's last frequency."""
+    """Test four sweeps of 60 s in windows of 24 s.
+
+    Slow frequencies are at the windows' ends. There the correction of an uncertain response is
+    noise. With little noise the error is what a straight line does not remove, also beyond the
+    sweep's last frequency.
+    """
     t = DT * np.arange(3000)
     u = scipy.signal.chirp(t, 0.15, t[-1], 5.0, how, -90)
     answer, inside = scipy.signal.lfilter(B.ravel(), A, u), []
@@ -56,15 +59,17 @@ def test_where_the_sweep_begins_in_a_long_window_errors_do_not_grow(how, size):
         off = np.abs(pair.H) - np.abs(scipy.signal.freqz(B.ravel(), A, found.omega * DT)[1])
         seen = np.isfinite(off)
         inside.append(np.mean(np.abs(off[seen]) < pair.half95 * pair.sd[seen]))
-    # 83 % with errors that grow from round to round, and where a response by frequency is taken for
-    # one at that frequency.
+    # It was 83 % if errors grow from round to round, or if a whole response is taken for its value
+    # at one frequency.
     assert np.mean(inside) > 0.93
 
 
 @pytest.mark.parametrize("seconds", [6.0, 60.0])
 def test_of_one_sine_intervals_hold_the_truth_and_no_band_is_usable_but_around_it(seconds):
-    """The window brings the sine's response to all of its main lobe: half of it at most inside
-    errors that know of noise alone."""
+    """Test a sine, which the window spreads over its main lobe.
+
+    At most half of the lobe is within errors from noise alone.
+    """
     t, rng = DT * np.arange(round(seconds / DT)), np.random.default_rng(1)
     u = np.sin(2.0 * np.pi * 3.4 * t)
     y = scipy.signal.lfilter(B.ravel(), A, u) + 0.01 * rng.standard_normal(t.size)

@@ -1,4 +1,4 @@
-"""What windows do to a sweep's answer, and inputs that move as one."""
+"""Effect of windows on the response to a sweep, and inputs that move as one."""
 
 import numpy as np
 import scipy.signal
@@ -11,7 +11,7 @@ DT, N = 0.02, 3000
 
 
 def swept() -> tuple[np.ndarray, np.ndarray]:
-    """A sweep of 60 s, and the answer 80 / (s^2 + 3 s + 40) to it held between samples."""
+    """Return a sweep of 60 s, and the response 80 / (s^2 + 3 s + 40) to it held between samples."""
     t = DT * np.arange(N)
     u = 0.2 * scipy.signal.chirp(t, 0.1, t[-1], 6.0, "logarithmic", -90)
     b, a, _ = scipy.signal.cont2discrete(([80.0], [1.0, 3.0, 40.0]), DT, "zoh")
@@ -27,7 +27,7 @@ def test_a_sweep_in_little_noise_gives_the_transfer_function_that_made_it():
     [(_, found)] = flight_responses([flight], settings).fits
     assert isinstance(found, TransferFit)
     assert found.delay is not None
-    # The order is right, and the windows' own error no sign of another one.
+    # The order is right, and the windows' error does not indicate another one.
     assert found.chi_squared < 2.0
     truth = (80.0, 3.0, 40.0, 0.0)
     for one, true in zip((*found.numerator, *found.denominator, found.delay), truth, strict=True):
@@ -37,7 +37,7 @@ def test_a_sweep_in_little_noise_gives_the_transfer_function_that_made_it():
 
 def test_inputs_that_move_as_one_are_named():
     u, y = swept()
-    # The standard deviation of one that stands still is rounding.
+    # The standard deviation of an input at rest is rounding.
     inputs = {"lat": u, "lat2": 0.5 * u, "col": np.full_like(u, 0.1570692120656821)}
     flight = Flight(dt=DT, inputs=inputs, outputs={"phi": y})
     found = flight_responses([flight], Settings((0.2, 6.0), 15.0))

@@ -1,4 +1,4 @@
-"""Errors of frequency responses: covariance against the linear map from samples, written out."""
+"""Errors of frequency responses: covariance against an explicit linear map from samples."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ DT, N, L = 0.05, 600, 100
 
 
 def flights(noise: np.ndarray) -> list[Flight]:
-    """Two inputs that move together, two outputs of which one misses a sample in one flight."""
+    """Return two correlated inputs and two outputs, one with a missing sample in one flight."""
     rng = np.random.default_rng(0)
     out = []
     for i, e in enumerate(noise):
@@ -34,10 +34,10 @@ def flights(noise: np.ndarray) -> list[Flight]:
 
 
 def by_hand(flights: list[Flight], output: str, line: int) -> np.ndarray:
-    """(2, samples of both flights) from white noise on an output to its two responses."""
+    """Return the map (2, samples of both flights) from noise on an output to its responses."""
     window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(L) / L)
     turn = window * np.exp(-2j * np.pi * line * np.arange(L) / L)
-    # A window less its mean: in the first line alone there is some of that.
+    # The mean of the segment is removed, which matters only near zero frequency.
     turn = turn - np.mean(turn)
     S_uu, rows = np.zeros((2, 2), complex), np.zeros((2, 2 * N), complex)
     for i, f in enumerate(flights):
@@ -124,8 +124,10 @@ def test_what_does_not_fit_the_flights_is_refused(options):
 
 
 def test_a_narrow_mode_is_not_smeared_where_averages_are_many():
-    """Noise of a mode at 0.3 Hz in windows of 10 s: its spectrum against the mean of many records,
-    each without any smoothing."""
+    """Test the noise spectrum of a mode at 0.3 Hz in windows of 10 s.
+
+    The reference is the mean of many records, each without smoothing.
+    """
     rng, n = np.random.default_rng(2), 2400
     b, a = scipy.signal.bilinear([1.0], [1.0, 0.2, (0.6 * np.pi) ** 2], 1.0 / DT)
 
@@ -136,7 +138,8 @@ def test_a_narrow_mode_is_not_smeared_where_averages_are_many():
     many = [windowed([record()], ResponseOptions(window=10.0)) for _ in range(60)]
     true = np.mean([np.mean(np.abs(w.Y[:, :, 0]) ** 2, axis=0) for w in many], axis=0)
     found = [np.real(noise_density(w, averages(w), w.Y))[:, 0, 0] for w in many[:20]]
-    # Three lines above the mode, where there is little: twice the width makes it 20 times as much.
+    # Three lines above the mode there is little power, and twice the width makes it 20 times as
+    # much.
     above = 5
     assert many[0].hz[above] == pytest.approx(0.6)
     assert np.mean(found, axis=0)[above] < 8.0 * true[above]

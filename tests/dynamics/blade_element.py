@@ -1,16 +1,17 @@
-"""Blade-element theory by quadrature: what (10), (13), (14), (15) approximate in closed form.
+"""Blade-element theory by quadrature, which eqs 10, 13, 14 and 15 approximate in closed form.
 
 The azimuth psi counts counter-clockwise seen from above, from the tail: 90 degrees is right. Radii
-are in R, speeds in R Omega. Blade pitch theta0 + theta_s sin psi + theta_c cos psi; flight in the
-direction chi, counter-clockwise from the nose (to the right: -90 degrees), inflow lam uniform.
-Nose-up cyclic is theta_s > 0, roll-right cyclic is theta_c < 0. No stall, no reversed flow.
+are in R, speeds in R Omega. The blade pitch is theta0 + theta_s sin psi + theta_c cos psi. The
+flight direction chi is counter-clockwise from the nose (to the right: -90 degrees); the inflow lam
+is uniform. Nose-up cyclic is theta_s > 0, roll-right cyclic is theta_c < 0. Stall and reversed flow
+are neglected.
 """
 
 import numpy as np
 
 
 def _mean(integrand, B, n_r=8, n_psi=64):
-    """Integral over r from 0 to B (Gauss-Legendre) of the mean over psi (trapezoid rule)."""
+    """Return the integral over r (Gauss-Legendre) to B of the mean over psi (trapezoid rule)."""
     x, weight = np.polynomial.legendre.leggauss(n_r)
     r, psi = np.meshgrid((x + 1) * B / 2, np.arange(n_psi) * 2 * np.pi / n_psi, indexing="ij")
     return float(weight @ integrand(r, psi).mean(axis=1)) * B / 2
@@ -22,7 +23,7 @@ def _pitch_and_flow(r, psi, theta0, theta_s, theta_c, mu, chi):
 
 
 def thrust_coefficient(a, sigma, theta0, lam, mu=0.0, theta_s=0.0, theta_c=0.0, chi=0.0, B=0.97):
-    """C_T = T / (rho pi R^4 Omega^2). Lift per unit of span goes as U_T^2 (pitch - lam/U_T)."""
+    """Return C_T = T / (rho pi R^4 Omega^2). Lift per unit of span is U_T^2 (pitch - lam/U_T)."""
 
     def lift(r, psi):
         pitch, flow = _pitch_and_flow(r, psi, theta0, theta_s, theta_c, mu, chi)
@@ -34,7 +35,7 @@ def thrust_coefficient(a, sigma, theta0, lam, mu=0.0, theta_s=0.0, theta_c=0.0, 
 def induced_torque_coefficient(
     a, sigma, theta0, lam, mu=0.0, theta_s=0.0, theta_c=0.0, chi=0.0, B=0.97
 ):
-    """Induced part of C_Q = Q / (rho pi R^5 Omega^2): lift leaning back by lam/U_T, at arm r."""
+    """Return the induced part of C_Q = Q / (rho pi R^5 Omega^2): tilted lift at arm r."""
 
     def torque(r, psi):
         pitch, flow = _pitch_and_flow(r, psi, theta0, theta_s, theta_c, mu, chi)
@@ -44,10 +45,10 @@ def induced_torque_coefficient(
 
 
 def rotor_moment_coefficient(theta_cyc, omega_per_Omega, theta0=0.1, lam=0.05, B=1.0):
-    """M / (rho Omega^2 a c R^4), averaged over a turn, of two blades fixed to a hub without hinges.
+    """Return M / (rho Omega^2 a c R^4), averaged over a turn, of two blades fixed to a rigid hub.
 
-    M and the body rate omega are about one axis in the disk; psi counts from it, so that a blade's
-    arm is r sin psi, it rises at omega r sin psi, and its pitch is theta0 + theta_cyc sin psi.
+    M and the body rate omega are about one axis in the disk, from which psi counts. A blade's arm
+    is r sin psi, and it rises at omega r sin psi. Its pitch is theta0 + theta_cyc sin psi.
     """
 
     def moment(r, psi):

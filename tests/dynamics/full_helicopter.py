@@ -1,7 +1,8 @@
 """The variant `full` as forces and moments on a rigid body, with NumPy and SciPy alone.
 
-Vectors in body axes (forward, right, down): every force acts at its place, moments are r x F, and
-Newton's and Euler's equations move the body. States, inputs and vehicles are mappings of floats.
+Vectors are in body axes (forward, right, down). Every force acts at its position, moments are r x
+F, and the body follows Newton's and Euler's equations. States, inputs and vehicles are mappings of
+floats.
 """
 
 import numpy as np
@@ -22,7 +23,7 @@ FULL = XCELL | {
 
 
 def rotor(v, R, c, a, speed, theta0, V2, W, edge):
-    """Thrust, whole inflow and torque of a rotor of two blades."""
+    """Return thrust, total inflow and torque of a rotor of two blades."""
     half, B, rho = a * c / (np.pi * R), v["B"], v["rho"]
     b = half * B**2 / 2 * R * speed
     T0 = half * B**3 / 3 * (R * speed) ** 2 * theta0 + b * (edge - W)
@@ -36,7 +37,7 @@ def rotor(v, R, c, a, speed, theta0, V2, W, edge):
 
 
 def rates(v, s, u, wind=(0.0, 0.0, 0.0)):
-    """d/dt of the 18 states."""
+    """Return the derivatives of the 18 states."""
     Om, B = s["Omega"], v["B"]
     air, omega = air_and_body_rates(s, wind)
     p, q, _ = omega

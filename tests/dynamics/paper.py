@@ -1,4 +1,4 @@
-"""Eqs 11, 12, 14, 21, 22 once more, written from the paper's page with NumPy alone: the oracle.
+"""Eqs 11, 12, 14, 21 and 22 from the paper, with NumPy alone, as an independent reference.
 
 A state is (phi, dphi, beta, dbeta); a vehicle is a mapping of the paper's names.
 """
@@ -26,7 +26,7 @@ BENCH = {
 
 
 def rates(v, state, x_roll, stand):
-    """d/dt of the state."""
+    """Return the derivative of the state."""
     phi, phi_dot, beta, beta_dot = state
     Ixx, If, Om = v["Ixx"], v["If"], v["Omega"]
     total = Ixx + v.get("Ixx_added", 0.0)
@@ -40,20 +40,20 @@ def rates(v, state, x_roll, stand):
     # (12): If b'' + Om^2 If b = 1/8 rho Om^2 a c (x/L5 - (b' + phi')/Om) (R2^4 - R1^4)
     lift = v["rho"] * Om**2 * v["a"] * v["c"] * (v["R2"] ** 4 - v["R1"] ** 4) / 8.0
     beta_ddot = lift * (x_roll / v["L5"] - (beta_dot + phi_dot) / Om) / If - Om**2 * beta
-    if stand:  # torques of the stand, physical: kappa Ixx and zeta Ixx, on the total inertia
+    if stand:  # physical torques of the stand: kappa Ixx and zeta Ixx, on the total inertia
         phi_ddot = phi_ddot - (v["kappa"] * Ixx * phi + v["zeta"] * Ixx * phi_dot) / total
     return np.array([phi_dot, phi_ddot, beta_dot, beta_ddot])
 
 
 def matrices(v, stand):
-    """A (4, 4) and B (4, 1): the rates at unit states and unit stick."""
+    """Return A (4, 4) and B (4, 1), the derivatives at unit states and unit stick."""
     eye = np.eye(4)
     A = np.stack([rates(v, e, 0.0, stand) for e in eye], axis=1)
     return A, rates(v, np.zeros(4), 1.0, stand)[:, None]
 
 
 def scattered(seed):
-    """Some vehicle, possible but no more than that."""
+    """Return a random vehicle within physical limits."""
     rng = np.random.default_rng(seed)
     v = {k: x * float(np.exp(0.4 * rng.standard_normal())) for k, x in BENCH.items()}
     v["R2"] = v["R1"] * (1.1 + rng.random())

@@ -1,9 +1,10 @@
-"""The flybar simulated in the frame that turns with the rotor: what eq. 12 stands for.
+"""The flybar simulated in the rotating frame, as a reference for eq. 12.
 
-A seesaw bar on a shaft, one hinge across it, a paddle at either end between R1 and R2 with the
-blade's chord c and slope a; If is the inertia of the whole (thin) bar about the hinge. The first
-paddle's azimuth chi = Omega t counts counter-clockwise seen from above, from the nose; beta is its
-angle up from the plane across the shaft. The shaft rolls right at p and pitches nose-up at q.
+A seesaw bar is on a shaft, with one hinge across it. At either end is a paddle between R1 and R2,
+with the blade's chord c and slope a. If is the inertia of the whole (thin) bar about the hinge. The
+first paddle's azimuth chi = Omega t counts counter-clockwise seen from above, from the nose. beta
+is its angle up from the plane across the shaft. The shaft rolls right at p and pitches nose-up at
+q.
 """
 
 import numpy as np
@@ -21,7 +22,7 @@ XCELL = {
 
 
 def rates(v, t, y, roll, pitch, p, q):
-    """d/dt of (beta, dbeta); `roll` and `pitch` are x/L5 [rad] of the fixed swashplate."""
+    """Return the derivatives of (beta, dbeta); `roll` and `pitch` are x/L5 [rad], not rotating."""
     beta, dbeta = y
     Om, chi = v["Omega"], v["Omega"] * t
     # 90 degrees of lead: roll right is most pitch at the nose, nose up is most pitch on the right
@@ -39,9 +40,10 @@ def rates(v, t, y, roll, pitch, p, q):
 
 
 def simulate(v, duration, roll=0.0, pitch=0.0, p=0.0, q=0.0, start=(0.0, 0.0)):
-    """Constant input: mean tilt (right, nose up) [rad] of the bar's disk in every whole turn.
+    """Return the mean tilt (right, nose up) [rad] of the disk by turn, for constant input.
 
-    The tilt from beta = right sin(chi) + up cos(chi) and its derivative; `start` is (beta, dbeta).
+    The tilt follows from beta = right sin(chi) + up cos(chi) and its derivative; `start` is (beta,
+    dbeta).
     """
     turns = round(duration * v["Omega"] / (2 * np.pi))
     t = np.arange(64 * turns) / 64 * 2 * np.pi / v["Omega"]
@@ -61,17 +63,17 @@ def simulate(v, duration, roll=0.0, pitch=0.0, p=0.0, q=0.0, start=(0.0, 0.0)):
 
 
 def time_constant(v, turns=20):
-    """Time constant [s] with which a bar let go at a tilt of 1e-3 returns to the shaft's plane."""
+    """Return the time constant [s] of a bar released at a tilt of 1e-3."""
     duration = turns * 2 * np.pi / v["Omega"]
     size = np.hypot(*simulate(v, duration, start=(1e-3, 0.0)).T)
     return (turns - 1) / turns * duration / np.log(size[0] / size[-1])
 
 
 def settled_tilt(v, axis="roll"):
-    """Tilt (right, nose up) per x/L5 after 18 time constants, for an input "roll" or "pitch"."""
+    """Return the tilt (right, nose up) per x/L5 after 18 time constants, for "roll" or "pitch"."""
     return simulate(v, 18 * time_constant(v), **{axis: 1e-3})[-1] / 1e-3
 
 
 def tilt_per_rate(v, axis="p"):
-    """Settled tilt (right, nose up) [rad] per shaft rate [rad/s], for a rate "p" or "q"."""
+    """Return the settled tilt (right, nose up) [rad] per shaft rate [rad/s], for "p" or "q"."""
     return simulate(v, 18 * time_constant(v), **{axis: 1e-4})[-1] / 1e-4

@@ -1,8 +1,8 @@
-"""A teetering rotor of two blades, blade elements in the rotating frame, with NumPy alone.
+"""Blade elements of a teetering rotor of two blades in the rotating frame, with NumPy alone.
 
-The azimuth psi counts counter-clockwise seen from above, from the tail. One blade stands beta above
-the hub's plane and the other below; the tip-path plane is beta = -a1 cos psi - b1 sin psi. The
-shaft may turn at steady rates p and q and move through the air at (forward, right).
+The azimuth psi counts counter-clockwise seen from above, from the tail. One blade is beta above the
+hub's plane and the other below; the tip-path plane is beta = -a1 cos psi - b1 sin psi. The shaft
+may turn at steady rates p and q and move through the air at (forward, right).
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ X, WEIGHT = np.polynomial.legendre.leggauss(8)
 
 
 def flap_moment(v, psi, beta, dbeta, flight):
-    """Moment of the air on one blade about the hub [N m]."""
+    """Return the moment of the air on one blade about the hub [N m]."""
     r, weight = (X + 1) * v["B"] * v["R"] / 2, WEIGHT * v["B"] * v["R"] / 2
     sin, cos = np.sin(psi), np.cos(psi)
     theta = flight["theta0"] + flight["pitch"] * sin - flight["roll"] * cos
@@ -27,7 +27,7 @@ STILL = dict.fromkeys(("theta0", "pitch", "roll", "forward", "right", "inflow", 
 
 
 def simulate(v, turns, tilt=(0.0, 0.0), **flight):
-    """The mean tilt (a1, b1) [rad] of each turn, (turns, 2), from a given one."""
+    """Return the mean tilt (a1, b1) [rad] of each turn, (turns, 2), from an initial tilt."""
     flight, Om, steps = STILL | flight, v["Omega"], 48
     h = 2 * np.pi / Om / steps
 

@@ -1,4 +1,4 @@
-"""Sine and cosine together against NumPy's."""
+"""Joint sine and cosine against NumPy's."""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ def test_to_the_last_digit(size):
 
 
 def test_near_the_multiples_of_a_right_angle():
-    """Where a sine or a cosine is small its digits are those of what the reduction leaves."""
+    """Test small sines and cosines, whose digits are those of the reduced argument."""
     k = np.arange(-4000, 4001)
     x = k * (np.pi / 2) + np.random.default_rng(1).normal(0, 1e-6, k.size)
     s, c = sincos(x)

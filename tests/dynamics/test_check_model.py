@@ -1,4 +1,4 @@
-"""Mistakes in a model of one's own end in a sentence that names the function and the remedy."""
+"""Mistakes in a user's model: the message names the function and the remedy."""
 
 import dataclasses
 from typing import Annotated, NamedTuple
@@ -138,7 +138,7 @@ def said_by(function, *arguments, error: type[Exception] = ValueError, **how):
 def test_a_broken_model_is_refused_with_a_sentence(case):
     said = said_by(check_model, made(**BROKEN[case]))
     assert said.startswith("model 'mine': ")
-    # What is wrong is named.
+    # The message names the fault.
     assert list(BROKEN[case])[-1] in said
 
 
@@ -171,7 +171,7 @@ def test_what_is_no_model(value):
 
 
 def test_sound_models_pass():
-    class Elsewhere(NamedTuple):  # the same fields by another class: for outputs that will do
+    class Elsewhere(NamedTuple):  # another class with the same fields, which is enough for outputs
         roll_rate: float
 
     check_model(made(start=beginning, noise_intensity=lambda p: State(0.0, p.La)))

@@ -1,4 +1,4 @@
-"""The disturbance against the theory of first- and second-order noise."""
+"""Disturbances against the theory of first- and second-order noise."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ DT, N, SIGMA, TAU = 0.02, 60_000, 1.04, 0.1
 
 @pytest.fixture(scope="module", params=[1, 2], ids=["one pole", "two poles"])
 def go(request, bench30):
-    """(poles, a run with a given sigma and key)"""
+    """Return (poles, function that simulates with a given sigma and key)."""
     model = with_disturbance(models.roll_on_stand, "roll", request.param)
     still, known = model.Inputs(np.zeros(N)), naming.asdict(bench30)
 
@@ -36,7 +36,7 @@ def run(go):
 
 
 def stationary(poles):
-    """Covariance of (phi, dphi, beta, dbeta, w1 ...) from the Lyapunov equation."""
+    """Return the covariance of (phi, dphi, beta, dbeta, w1 ...) from the Lyapunov equation."""
     n = 4 + poles
     A, G = np.zeros((n, n)), np.zeros((n, n))
     A[:4, :4] = matrices(BENCH, True)[0]
@@ -91,7 +91,7 @@ def test_autocorrelation_is_that_of_its_lags(run):
 def test_response_has_the_variance_that_lyapunov_gives(run):
     poles, found = run
     covariance = stationary(poles)
-    # Roll is slow (0.2 s) and lightly sampled: wider.
+    # Roll is slow (0.2 s), so it has fewer independent samples and a wider limit.
     assert np.var(found.states.phi[500:]) == pytest.approx(covariance[0, 0], rel=0.15)
     assert np.var(found.states.dphi[500:]) == pytest.approx(covariance[1, 1], rel=0.1)
 
@@ -144,9 +144,10 @@ D: {az: {col: Zc}, up: {col: -Zc}}
 
 @pytest.mark.slow
 def test_an_output_that_is_the_pushed_derivative_has_the_push(tmp_path):
-    """az is w' and up is -w'; lift lacks the control and w is a state: they have the motion alone.
+    """Test outputs that equal a disturbed derivative.
 
-    az of a run against the differences of its own w.
+    az is w' and up is -w'. lift lacks the control, and w is a state, so they show the motion alone.
+    The reference is the difference of a run's w.
     """
     path = tmp_path / "heave.yaml"
     path.write_text(HEAVE)
@@ -160,7 +161,7 @@ def test_an_output_that_is_the_pushed_derivative_has_the_push(tmp_path):
     az, up, lift = (np.asarray(getattr(run.outputs, k)) for k in ("az", "up", "lift"))
     slope = np.diff(np.asarray(run.states.w)) / dt
     steady = np.diff(col) == 0
-    # What the push does within a sample has no more than its rms: sigma sqrt(2 dt/(3 tau)).
+    # The effect of the disturbance within a sample has at most the rms sigma sqrt(2 dt/(3 tau)).
     within = 0.4 * np.sqrt(2.0 * dt / (3.0 * 0.5))
     assert np.std((0.5 * (az[1:] + az[:-1]) - slope)[steady]) < within
     push = np.asarray(run.states.w1_w)

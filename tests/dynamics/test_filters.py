@@ -1,4 +1,4 @@
-"""Filters of a flight controller around a model, against SciPy's and closed formulas."""
+"""Filters of a flight controller around a model, against SciPy and closed formulas."""
 
 import math
 
@@ -27,7 +27,7 @@ def transfer(model, output):
 
 
 def by_filter(filters=(), delay=0.0):
-    """What stands between p and the log of it, at W."""
+    """Return the response at W of what is between p and its log."""
     model = with_filters(ROLL.model, {"p": filters}, {"p": delay})
     return transfer(model, "p") / transfer(ROLL.model, "p")
 
@@ -44,13 +44,13 @@ def test_low_passes_are_three_decibels_down_where_they_say():
 
 
 def test_low_passes_in_a_row_are_three_decibels_down_together():
-    # A Bessel filter of the fourth order is two of the second, each with a corner of its own.
+    # A Bessel filter of fourth order is two of second order with different corners.
     _, poles, _ = scipy.signal.besselap(4, norm="mag")
     pairs = poles[poles.imag > 0]
     bessel = [Filter("biquad", 250 * abs(p), abs(p) / (-2 * p.real)) for p in pairs]
     assert cutoff(bessel) == pytest.approx(250, rel=2e-3)
     assert cutoff([Filter("pt2", 30.0)]) == pytest.approx(30, rel=2e-3)
-    # Two first-order lags at 40 Hz are what a cascade of two is stated for, corrected.
+    # A cascade of two is specified by its own cut-off, here corrected to two lags of 40 Hz.
     assert cutoff([Filter("pt1", 40.0)] * 2) == pytest.approx(40 * (2**0.5 - 1) ** 0.5, rel=2e-3)
 
 
@@ -62,7 +62,7 @@ def test_a_notch_takes_its_centre_and_its_width():
         _, expected = scipy.signal.freqs(num, den, W)
         notch = Filter("notch", 20.0, q, attenuation)
         np.testing.assert_allclose(by_filter([notch]), expected, rtol=1e-8, atol=1e-9)
-        # What the phase does near zero is a delay.
+        # The phase near zero frequency is a delay.
         np.testing.assert_allclose(-np.angle(expected[0]) / W[0], notch.delay, rtol=2e-3)
 
 
@@ -83,13 +83,13 @@ def test_the_log_is_the_filtered_motion_sample_by_sample():
     model = with_filters(ROLL.model, {"p": [Filter("biquad", 30.0)]}, {"phi": 0.02})
     assert model.linear
     assert linear_misfit(model, PARAMS) < 1e-12
-    # Names and units of what was added; params are those of the model.
+    # Names and units of the added states; params are those of the model.
     assert model.Params is ROLL.model.Params
     assert naming.unit(model.State, "p_filter1_rate") == "rad/s^2"
     rng = np.random.default_rng(1)
     u = np.repeat(rng.standard_normal(12), 8)
     run = simulate(model, PARAMS, model.Inputs(lat=u), dt=0.01)
-    # In steps of 0.1 ms with SciPy, the stick held.
+    # SciPy in steps of 0.1 ms, with the stick held.
     num, den = scipy.signal.butter(2, 2 * math.pi * 30, analog=True)
     roll = ([166.1 * 0.1398 / 0.04631], [1, 1 / 0.04631, 166.1])
     times = np.arange(u.size * 100) * 1e-4
@@ -107,7 +107,7 @@ def test_the_log_is_the_filtered_motion_sample_by_sample():
 def test_fixed_steps_follow_a_fast_filter():
     model = with_filters(models.roll, {"roll_rate": [Filter("pt1", 300.0)]})
     assert model.fastest == 2 * math.pi * 300
-    # RK4 with the four steps that do without a filter would diverge: 0.02 / 4 * 1885 > 2.8.
+    # RK4 with four steps, which are enough without a filter, would diverge: 0.02 / 4 * 1885 > 2.8.
     assert substeps_for(0.02) == 4
     assert 0.02 / substeps_for(0.02, model.fastest) * model.fastest <= 1.4
     assert with_filters(model, {}, {"roll": 0.003}).fastest == model.fastest

@@ -23,7 +23,7 @@ STICKS = {
 
 
 def scattered(rng, model):
-    """Some vehicle, state and inputs."""
+    """Return a random vehicle, state and inputs."""
     v = {k: x * float(np.exp(0.2 * rng.standard_normal())) for k, x in oracle.FULL.items()}
     v |= {"B": 0.97, "R2": v["R1"] * (1.1 + rng.random()), "Ixx_added": 0.1, "Iyy_added": 0.05}
     s = {n: SCALES.get(n, 1.0) * rng.standard_normal() for n in naming.names(model.State)}
@@ -67,7 +67,7 @@ MOVED = {
 
 @pytest.mark.parametrize("switch", MOVED)
 def test_each_switch_acts_alone_on_what_it_is_about(switch):
-    """Beside the consistent variant: what moves, and what is a state or an input of its own."""
+    """Test the additional states and inputs, compared with the consistent variant."""
     plain, model = helicopter("consistent"), helicopter("consistent", **{switch: True})
     assert model.name == f"helicopter-consistent+{switch}"
     rng = np.random.default_rng(2)
@@ -81,7 +81,7 @@ def test_each_switch_acts_alone_on_what_it_is_about(switch):
 
 
 def test_a_measured_rotor_speed_is_that_of_the_rotor():
-    """All but the motor: what the fuselage feels is the torque that the rotor takes."""
+    """Test everything but the motor, whose torque on the fuselage equals the rotor's."""
     rng = np.random.default_rng(4)
     v, s, u = scattered(rng, helicopter())
     steady = s | {"governor": 0.0}
@@ -89,7 +89,7 @@ def test_a_measured_rotor_speed_is_that_of_the_rotor():
     whole = rates(helicopter(governor=False), v, steady, u)
     for name in ("dx", "dy", "dz", "a1", "b1", "beta_roll"):
         assert float(found[name]) == pytest.approx(float(whole[name]), rel=1e-12)
-    # The throttle at which the rotor keeps its speed gives the same turn.
+    # The throttle that keeps the rotor speed gives the same turn.
     keeps = u["x_throttle"] - float(whole["Omega"]) / v["K_throttle"]
     kept = rates(helicopter(governor=False), v, s, u | {"x_throttle": keeps})
     assert float(kept["Omega"]) == pytest.approx(0.0, abs=1e-9)
@@ -103,7 +103,7 @@ def test_a_machine_without_a_flybar_needs_none(vehicles_folder):
     at, u = naming.asdict(model.initial_state(trex)), STICKS | {"x_roll": 1e-3, "x_pitch": 0.0}
     moved = rates(model, naming.asdict(trex), at, u)
     assert all(np.isfinite(float(x)) for x in moved.values())
-    # All of the stick: eq. 11 with L2 = 0.
+    # The whole stick: eq. 11 with L2 = 0.
     gamma = trex.rho * trex.a * trex.c * trex.R**4 / trex.I_beta
     k = gamma * trex.B**4 * trex.Omega / 16
     assert float(moved["b1"]) == pytest.approx(float(k * 1e-3 / trex.L1), rel=1e-12)
@@ -117,7 +117,7 @@ def test_the_governor_is_a_pi_with_limits():
         assert float(held) == pytest.approx(np.clip(free, 0.0, 1.0))
         if 0 < free < 1:
             assert float(slope) == pytest.approx(0.02 * error)
-    # Switched off it comes to rest at no throttle and an empty integral.
+    # Switched off, the governor rests at zero throttle and a zero integral.
     held, slope = throttle(p, 0.0, 157.1, 0.0)
     assert float(held) == 0.0
     assert float(slope) == pytest.approx(0.0, abs=1e-12)

@@ -21,7 +21,7 @@ SCALES = {
 
 
 def scattered(rng):
-    """Some vehicle, state and inputs."""
+    """Return a random vehicle, state and inputs."""
     v = {k: x * float(np.exp(0.2 * rng.standard_normal())) for k, x in oracle.XCELL.items()}
     v |= {"B": 0.97, "R2": v["R1"] * (1.1 + rng.random()), "Ixx_added": 0.1, "Iyy_added": 0.05}
     s = {n: SCALES.get(n, 1.0) * rng.standard_normal() for n in oracle.STATES["paper"]}
@@ -61,7 +61,7 @@ def test_unknown_variants_and_switches_are_refused():
 
 
 def test_wind_is_the_airspeed_s_other_side():
-    """Standing in a wind is flying through still air the other way."""
+    """Test that hover in wind equals flight through still air in the opposite direction."""
     rng = np.random.default_rng(3)
     v, s, u = scattered(rng)
     blown = helicopter("consistent", wind=True)
@@ -75,7 +75,7 @@ def test_wind_is_the_airspeed_s_other_side():
 
 @pytest.mark.parametrize("chi", [0.0, 0.7, -1.57, 3.0])
 def test_thrust_and_torque_are_those_of_blade_elements(chi):
-    """In any direction of flight; but for the term in mu^2 theta0 that eq. 13 drops."""
+    """Test all flight directions, without the term in mu^2 theta0 that eq. 13 neglects."""
     p = params_of(oracle.XCELL)
     Omega, theta0, lam, mu, by_pitch, by_roll = 157.0, 0.15, 0.04, 0.1, 0.03, -0.02
     tip = p.R * Omega
@@ -136,7 +136,7 @@ def test_leaving_the_range_is_told():
 
 @pytest.mark.parametrize("variant", ["paper", "consistent"])
 def test_nothing_is_not_a_number_at_rest(variant):
-    """A parked machine with its rotor stopped: finite derivatives, and only gravity acts."""
+    """Test a parked vehicle with its rotor stopped: finite derivatives, gravity alone."""
     model, p = helicopter(variant), params_of(oracle.XCELL)
     at = model_zeros(model.State)
     A, B, _, _ = jacobians(model, p, at)
@@ -148,7 +148,7 @@ def test_nothing_is_not_a_number_at_rest(variant):
 
 
 def test_dynamic_inflow_settles_where_momentum_theory_is():
-    """From any start vi goes to the static one, as fast as the inertia of the air lets it."""
+    """Test that vi converges to the static one, at a rate limited by the inertia of the air."""
     model = helicopter("consistent", dynamic_inflow=True)
     u = model.Inputs(0.0, 0.0, -0.5, 0.5)
     _, s, _ = scattered(np.random.default_rng(5))

@@ -1,4 +1,4 @@
-"""Inflow in any flow: against bracketing, long double, W. Johnson's measured curve, and itself."""
+"""Inflow in any flow, against bracketing, long double and W. Johnson's measured curve."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ solve = jax.jit(jax.vmap(induced_velocity))
 
 
 def scattered(n, least_b=-1.5):
-    """Flows of rotors of any loading, from a fast climb to a descent at five times v_h."""
+    """Return flows of rotors of any loading, from a fast climb to a descent at five times v_h."""
     rng = np.random.default_rng(0)
     h = np.exp(rng.uniform(-2.0, 2.0, n))
     mu = np.where(rng.random(n) < 0.3, 0.0, np.exp(rng.uniform(-4.0, 2.0, n)))
@@ -21,7 +21,7 @@ def scattered(n, least_b=-1.5):
 
 
 def off(v, V2, W, T0, b):
-    """Relative error of roots v (n,): a Newton step in long double, its slope by differences."""
+    """Return the relative error of roots v (n,), by a Newton step in long double."""
     v, V2, W, T0, b = (np.asarray(x, np.longdouble) for x in (v, V2, W, T0, b))
 
     def surplus(v):
@@ -35,7 +35,7 @@ def off(v, V2, W, T0, b):
 
 
 def johnson(c, mu):
-    """Induced velocity over that of hover, c and mu the speeds through and along over the same."""
+    """Return induced velocity, with c and mu the speeds through and along, all over hover's."""
     if 1.5 * mu**2 + (2 * c + 3) ** 2 < 1:
         return c * (0.373 * c**2 + 0.598 * mu**2 - 0.991) - c
     v = np.linspace(1e-3, 4.0, 40001)
@@ -85,7 +85,7 @@ def test_every_root_is_the_only_one():
 
 @pytest.mark.parametrize("mu", [0.0, 0.25, 0.5, 0.8])
 def test_descents_are_those_that_were_measured(mu):
-    """At a given thrust, b = 0; momentum theory's own cliff at c = -2 is left out."""
+    """Test at a given thrust, b = 0, without the discontinuity of momentum theory at c = -2."""
     c = np.setdiff1d(np.round(np.arange(-4.0, 1.01, 0.1), 1), [-2.0])
     ones = jnp.ones(c.size)
     found = solve(mu**2 * ones, jnp.asarray(c), 2.0 * ones, 1e-6 * ones)
@@ -95,7 +95,7 @@ def test_descents_are_those_that_were_measured(mu):
 def test_derivatives_are_those_of_the_root():
     mode = jax.jacrev
     V2, W, T0, b = scattered(60)
-    # A difference to below V2 = 0 has no root.
+    # Below V2 = 0 there is no root for a difference.
     flows = np.stack([V2 + 1e-2, W, T0, b], axis=1)
     f = lambda z: induced_velocity(*z)  # noqa: E731
     first, second = jax.vmap(mode(f)), np.asarray(jax.vmap(mode(mode(f)))(flows))

@@ -1,4 +1,4 @@
-"""Rigid-body kinematics against a motion in closed form, and what sensors' errors do."""
+"""Rigid-body kinematics against a motion in closed form, and the effects of sensor errors."""
 
 import runpy
 from pathlib import Path
@@ -45,7 +45,7 @@ def test_errors_of_every_kind_are_undone(truth):
         n: jnp.asarray((1 + ERRORS[f"lambda_{n}"]) * sensors[:, i] + ERRORS[f"b_{n}"])
         for i, n in enumerate(("p", "q", "r", "ax", "ay", "az"))
     }
-    # The states are those of the IMU: at the arm from where velocities are measured.
+    # The states are those of the IMU, at its arm from the measured velocities.
     R, w = truth.attitude(late), truth.omega(late)
     first = np.concatenate(
         [
@@ -75,11 +75,11 @@ def test_errors_of_every_kind_are_undone(truth):
         ]
     )
     found = np.column_stack([np.asarray(getattr(run.outputs, n)) for n in model.Outputs._fields])
-    # Straight lines between samples of 20 ms; what the IMU, which is late, shows after the end of
-    # the record is unknown.
+    # Straight lines between samples of 20 ms. The IMU is late, so its values after the record are
+    # unknown.
     error = np.abs(found - expected)[:-2].max(axis=0)
     np.testing.assert_array_less(error, [1e-3] * 3 + [0.02] * 7 + [0.05] * 3)
-    # That the lever arm is seen: without it velocities would be off by omega times it.
+    # Without the lever arm velocities would be off by omega times it.
     assert np.abs(np.cross(w, arm)).max() > 0.2
 
 
@@ -112,7 +112,7 @@ def a_configuration(**more):
 def test_a_configuration_may_leave_out_what_follows_from_its_signals():
     full = completed(a_configuration(vehicle={"b_r": 0.0}), "a.yaml")
     assert full["model"] == "kinematics-attitude"
-    # Who gives a value knows the error.
+    # A stated value is a known error.
     assert "b_q" in full["fit"]["free"]
     assert "b_r" not in full["fit"]["free"]
     assert full["fit"]["nuisance"] == {"bias": False, "input_offset": False}
@@ -121,7 +121,7 @@ def test_a_configuration_may_leave_out_what_follows_from_its_signals():
     other = {"model": "roll"}
     assert completed(other, "a.yaml") is other
     for wrong in ({"flights": 3}, {"flights": [3]}, {"fit": [1]}, {"fit": {"nuisance": 3}}):
-        completed(a_configuration(**wrong), "a.yaml")  # the validation refuses it
+        completed(a_configuration(**wrong), "a.yaml")  # validation refuses it
 
 
 def test_rates_move_between_samples_unless_the_configuration_says_otherwise():
@@ -139,7 +139,7 @@ def test_lines_between_sharpened_samples_have_the_area_of_the_motion(delay):
     flight = Flight(dt=dt, inputs=dict.fromkeys("pqr", np.cos(omega * t)), outputs={}, hold=held)
     inputs = sharpened(kinematics.attitude, flight).inputs
     np.testing.assert_array_equal(inputs["r"], flight.inputs["r"])
-    # Wherever in an interval the delayed lines are begun with.
+    # The delayed lines may start anywhere in an interval.
     fine = np.arange(5.0, 15.0, dt / 200)
 
     def amplitude(u):
@@ -169,7 +169,7 @@ def test_noise_of_the_gyros_is_a_random_walk_of_the_angle():
     rng, dt, sd = np.random.default_rng(0), 0.01, 0.02
     rates = {n: np.sin(0.01 * np.arange(5000)) + sd * rng.standard_normal(5000) for n in "pqr"}
     flight = Flight(dt=dt, inputs=rates, outputs={"phi": np.zeros(5000)})
-    # An independent count: the spread of many angles after a second of such noise.
+    # An independent result: the scatter of many angles after a second of such noise.
     drift = np.std(dt * sd * rng.standard_normal((4000, 100)).sum(axis=1))
     assert noise_of(kinematics.attitude, [flight])["noise_gyro"] == pytest.approx(drift, rel=0.05)
 

@@ -1,4 +1,4 @@
-"""Loops of the whole helicopter close on the body's rates; delay lines of no and of less delay."""
+"""Rate loops of the whole helicopter use body rates; delay lines with zero and negative delay."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +17,7 @@ LOOP = models.with_rate_loop(LATE, ["lat"], feedforward=False, integral=False)
 
 
 def body_rates(phi, theta, dphi, dtheta, dpsi):
-    """From the product of the turns itself: the turning of R is R times the rates' cross matrix."""
+    """Return the body rates from the rotation matrix: R' = R times their cross matrix."""
 
     def turned(t):
         f, h, y = phi + dphi * t, theta + dtheta * t, dpsi * t
@@ -43,9 +43,9 @@ def flybarless(**options):
 
 
 def point(bare, model):
-    """Parameters, state and inputs of both at a large bank and pitch."""
+    """Return parameters, state and inputs of both at a large bank and pitch."""
     gains = {f"{gain}_{stick}": value for gain, value in GAINS.items() for stick in STICKS}
-    # Of one type all, so that one program serves every test.
+    # All have one type, so that one program serves every test.
     one = np.float64(1.0)
     gains = {n: v * one for n, v in gains.items() if n in naming.names(model.Params)}
     p = model.Params(**naming.asdict(bare.Params(**FULL)), **gains)
@@ -65,7 +65,7 @@ def test_the_loops_of_a_helicopter_close_on_the_rates_of_its_body():
     found = [getattr(d, f"{stick}_integral") for stick in STICKS]
     commands = np.array([0.2, 0.0, -0.4])
     np.testing.assert_allclose(found, commands - expected, atol=1e-9)
-    # What reaches the swashplate is Kp times the same error, in everything that it moves.
+    # Kp times the same error reaches the swashplate.
     asked = dict(zip(STICKS, 0.05 * (commands - expected), strict=True))
     inner = bare.State(**{n: getattr(s, n) for n in naming.names(bare.State)})
     driven = bare.vector_field(p, inner, u._replace(**asked))
@@ -86,12 +86,12 @@ def test_the_rate_of_a_loop_may_be_named():
     bare = models.helicopter(flybarless=True)
     by_name = models.with_gyro(bare, {"x_yaw": "r"})
     assert by_name is models.with_gyro(bare)
-    # Gusts around the machine leave its rates what they are.
+    # Gusts do not change body rates.
     gusty = models.with_gyro(with_disturbance(bare, "yaw"))
     p, s, u = point(bare, gusty)
     d = gusty.vector_field(p, s, u)
     assert float(d.x_yaw_gyro) == pytest.approx(body_rates(**ATTITUDE)[2] / 0.02)
-    # The paper has no other rates than the angles' derivatives.
+    # The paper's only rates are the angles' derivatives.
     paper = models.helicopter("paper")
     with pytest.raises(ValueError, match="x_yaw: model helicopter-paper has no state 'r'"):
         models.with_gyro(paper, {"x_yaw": "r"})
@@ -109,7 +109,7 @@ def late(delay):
 
 
 def test_a_delay_line_of_no_delay_passes_its_signal_on():
-    # p/lat of the rotor, times the servo, in the loop: written out by hand.
+    # p/lat of the rotor and the servo, in the loop, by hand.
     gain = 166.1 * 0.1398 / 0.04631 * 50.0**2
     open_loop = np.polymul([1, 1 / 0.04631, 166.1], [1, 2 * 0.7 * 50.0, 50.0**2])
     closed = np.polyadd(open_loop, [0.05 * gain])
@@ -123,10 +123,10 @@ def test_a_delay_line_of_no_delay_passes_its_signal_on():
     assert int(run.status) == 0
     np.testing.assert_allclose(run.outputs.p, expected, atol=1e-9)
     found = modes(LOOP, late(0.0))
-    # Those of the line come besides, and the angle's zero.
+    # In addition there are the line's poles and the angle's zero.
     for pole in np.roots(closed):
         assert np.min(np.abs(found - pole)) < 1e-6
-    # The output's line likewise.
+    # The same for the output's line.
     seen = models.with_delays(ROLL.model, outputs=["p"])
     p = seen.Params(**naming.asdict(ROLL.vehicle().params), delay_p=0.0)
     s = seen.State(**dict.fromkeys(naming.names(seen.State), 0.0))._replace(p=jnp.asarray(0.3))

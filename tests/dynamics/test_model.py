@@ -1,4 +1,4 @@
-"""Anyone's own model, its linearisation, and how models are named."""
+"""A user's model, its linearisation, and the names of models."""
 
 import dataclasses
 import importlib.machinery
@@ -120,7 +120,7 @@ def test_own_model_by_import_path(tmp_path):
     )
     found = models.by_name("beside_the_configuration:mine", folder=tmp_path)
     assert found.name == "own"
-    # A file beside a configuration never stands for what is installed.
+    # A file beside a configuration never replaces an installed module.
     (tmp_path / "llvmlite.py").write_text("raise SystemExit('ran')\n")
     import llvmlite
 
@@ -161,7 +161,7 @@ class TurnParams(NamedTuple):
 
 
 def turning(**changes):
-    """A machine on one axis under names of its own."""
+    """Return a vehicle on one axis with its own names."""
     return Model(
         "turn",
         lambda p, s, u: TurnState(s.p, u.x_roll / (p.J + p.J_added)),

@@ -1,7 +1,7 @@
-"""Accelerometers, angular accelerations and airspeed against a rigid body followed by hand.
+"""Accelerometers, angular accelerations and airspeed against a rigid body's positions.
 
-The second program knows no forces: it follows the states in small steps, puts the sensor into earth
-axes and takes differences of where it is.
+The second program uses no forces. It integrates the states in small steps, computes the sensor's
+position in earth axes, and takes its differences.
 """
 
 import numpy as np
@@ -12,14 +12,14 @@ from heli_jax.dynamics.disturbance import with_disturbance
 from tests.dynamics.test_full_helicopter import scattered
 
 STEP = 1e-3
-# Central differences of eighth order (Fornberg, 1988), of the points from -4 to 4.
+# Central differences of eighth order (Fornberg, 1988), for the points from -4 to 4.
 FIRST = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
 SECOND = np.array([-1 / 560, 8 / 315, -1 / 5, 8 / 5, -205 / 72, 8 / 5, -1 / 5, 8 / 315, -1 / 560])
 PLACES = {"imu": np.array([0.3, -0.2, 0.15]), "air": np.array([0.8, 0.1, -0.05])}
 
 
 def followed(model, p, u, state):
-    """States (9, n) from four steps before to four behind, by Runge-Kutta with NumPy."""
+    """Return states (9, n) from four steps before to four after, by Runge-Kutta with NumPy."""
     names = naming.names(model.State)
 
     def field(x):
@@ -43,7 +43,7 @@ def followed(model, p, u, state):
 
 
 def to_earth(phi, theta, psi):
-    """Body axes forward, right, down into earth axes ahead, right, down: three turns."""
+    """Return the rotation from body to earth axes, both forward, right, down."""
     c, s = np.cos, np.sin
     yaw = np.array([[c(psi), -s(psi), 0], [s(psi), c(psi), 0], [0, 0, 1]])
     pitch = np.array([[c(theta), 0, s(theta)], [0, 1, 0], [-s(theta), 0, c(theta)]])
@@ -79,7 +79,7 @@ def test_the_helicopters_sensors_are_where_a_rigid_body_carries_them(variant):
     np.testing.assert_allclose([shown.u_air, shown.v_air, shown.w_air], air, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(shown.airspeed, np.linalg.norm(air), rtol=1e-6)
 
-    # omega x is R' dR/dt. The paper takes the angles' derivatives for the rates of the body.
+    # omega x is R' dR/dt. The paper uses the angles' derivatives as body rates.
     first = np.einsum("k,kij->ij", FIRST, turns) / STEP
     second = np.einsum("k,kij->ij", SECOND, turns) / STEP**2
     turning = first.T @ first + into_body @ second
@@ -107,7 +107,7 @@ def test_a_linear_model_shows_what_it_knows():
 
 
 def test_an_accelerometer_feels_what_disturbs():
-    """A push on the derivative of w is a force: az and pdot show it, behind a low-pass too."""
+    """Test a disturbance of w', which is a force: az and pdot show it, also after a low-pass."""
     hover = linear_model("r50-hover")
     sensed = models.with_sensors(hover.model, ["ay"], imu=True, angular_acceleration=True)
     model = with_disturbance(sensed, ["w", "p"])

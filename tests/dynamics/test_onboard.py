@@ -1,4 +1,4 @@
-"""Devices around a model against transfer functions and simulations written out by hand."""
+"""Devices around a model against transfer functions and simulations by hand."""
 
 import math
 from typing import Annotated, Any, NamedTuple
@@ -23,7 +23,7 @@ def params(model, base=ROLL, **more: Any):
 
 
 def transfer(model, p, frequencies, output, stick):
-    """y/u at frequencies [rad/s] from the model's matrices."""
+    """Return y/u at frequencies [rad/s] from the model's matrices."""
     A, B, C, D = (np.asarray(M) for M in jacobians(model, p))
     i = naming.names(model.Outputs).index(output)
     j = naming.names(model.Inputs).index(stick)
@@ -34,7 +34,7 @@ def transfer(model, p, frequencies, output, stick):
 
 
 def by_hand(frequencies):
-    """p/lat of the flybarless roll: Lb Blat/tau_f / (s (s + 1/tau_f) + Lb)."""
+    """Return p/lat of the flybarless roll: Lb Blat/tau_f / (s (s + 1/tau_f) + Lb)."""
     s = 1j * np.asarray(frequencies)
     return 166.1 * 0.1398 / 0.04631 / (s * (s + 1 / 0.04631) + 166.1)
 
@@ -96,7 +96,7 @@ def test_a_servo_is_limited_in_rate_as_simulated_by_hand():
     np.testing.assert_allclose(run.states.u_servo, positions, atol=2e-3)
     assert np.max(np.abs(run.states.u_servo_rate)) <= 2.0 + 1e-9
     assert max(speeds) > 1.9  # the limit is reached
-    # Far from the limit the same numbers as the linear servo.
+    # Far from the limit the numbers equal those of the linear servo.
     faint = simulate(model, p, model.Inputs(u=1e-3 * u), dt=0.01, substeps=10).states.x
     linear = models.with_servos(INTEGRATOR, ["u"])
     same = simulate(linear, linear.Params(k=1.0, **SERVO), linear.Inputs(u=1e-3 * u), dt=0.01)
@@ -148,7 +148,7 @@ def test_a_damper_on_the_tail_is_the_published_yaw_gyro():
     model = models.with_gyro(YAW, {"ped": "r"}, heading_hold=False)
     p = model.Params(Nr=-4.129, Nped=33.07, Kp_ped=2.163 / 8.258, tau_gyro_ped=1 / 8.258)
     poles = np.roots(np.poly(np.asarray(jacobians(model, p).A)))
-    # Without the couplings to the rest of the machine, which move the fourth digit.
+    # Without the couplings to other axes, which change the fourth digit.
     np.testing.assert_allclose(sorted(poles.imag), [-8.1990, 8.1990], atol=5e-3)
     np.testing.assert_allclose(poles.real, -6.1966, atol=5e-3)
     np.testing.assert_allclose(np.prod(poles), 4.129 * 8.258 + 33.07 * 2.163, rtol=1e-12)
@@ -164,13 +164,13 @@ def test_an_output_is_late():
     model = models.with_delays(ROLL.model, outputs=["p"])
     assert model.linear
     p = params(model, delay_p=0.05)
-    w = np.array([1.0, 10.0, 40.0])  # up to two over the delay
+    w = np.array([1.0, 10.0, 40.0])  # up to 2 / delay
     got = transfer(model, p, w, "p", "lat")
     np.testing.assert_allclose(got, by_hand(w) * np.exp(-0.05j * w), rtol=1e-3)
     np.testing.assert_allclose(
         transfer(model, p, w, "phi", "lat"), by_hand(w) / (1j * w), rtol=1e-10
     )
-    # The delay line has the numbers of the Pade approximation [3/4].
+    # The delay line equals the Pade approximation [3/4].
     f = math.factorial
     num = [f(7 - k) * f(3) / (f(7) * f(k) * f(3 - k)) * (-1) ** k for k in range(4)]
     den = [f(7 - k) * f(4) / (f(7) * f(k) * f(4 - k)) for k in range(5)]
@@ -185,7 +185,7 @@ def test_a_late_output_has_the_derivative_of_its_delay():
     def response(delay, w):
         A, B, C, D = jacobians(model, params(model, delay_p=delay))
         n, eye = len(A), jnp.eye(len(A))
-        # Real and imaginary part side by side: (i w - A) x = B.
+        # Real and imaginary part separately: (i w - A) x = B.
         both = jnp.block([[-A, -w * eye], [w * eye, -A]])
         x = jnp.linalg.solve(both, jnp.concatenate([B[:, 0], jnp.zeros(n)]))
         return jnp.stack([C[1] @ x[:n] + D[1, 0], C[1] @ x[n:]])
@@ -207,7 +207,7 @@ def test_an_input_is_late_in_front_and_within_a_loop():
     omega, zeta = SERVO.values()
     s = 1j * W
     plant = by_hand(W) * omega**2 / (s**2 + 2 * zeta * omega * s + omega**2) * np.exp(-0.02 * s)
-    expected = plant * 0.15 / (1 + plant * 0.05)  # the radio's delay is in no matrix
+    expected = plant * 0.15 / (1 + plant * 0.05)  # matrices do not contain the radio's delay
     np.testing.assert_allclose(transfer(model, p, W, "p", "lat"), expected, rtol=2e-3)
 
 
@@ -274,7 +274,7 @@ class Gravity(NamedTuple):
 
 
 def test_an_accelerometer_in_a_body_that_turns():
-    """A body on which a known force acts: that over its mass, and the lever, is what is felt."""
+    """Test a body under a known force: the sensor shows force over mass and the lever's part."""
     force, turning = np.array([1.0, 2.0, -9.5]), np.array([0.3, -0.2, 0.1])
 
     def field(p, s, u):

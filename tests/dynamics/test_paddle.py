@@ -1,4 +1,4 @@
-"""A flybar whose paddle has a chord and a lift slope of its own."""
+"""A flybar whose paddle has its own chord and lift slope."""
 
 import dataclasses
 
@@ -18,9 +18,9 @@ from tests.responses import polynomials
 
 C, A = 0.03, 3.4
 FACTOR = A * C / (BENCH["a"] * BENCH["c"])
-"""by which the paddle's lift is less than the paper's"""
+"""Ratio of the paddle's lift to the paper's."""
 OWN = {**BENCH, "If": BENCH["If"] / FACTOR}
-"""the paper's machine that moves as one with this paddle does: a larger If alone"""
+"""Paper's vehicle with the same motion: only If is larger."""
 
 
 def with_paddle(**more):
@@ -29,7 +29,7 @@ def with_paddle(**more):
 
 @pytest.mark.parametrize("stand", [False, True])
 def test_a_smaller_paddle_is_a_larger_flybar(stand):
-    """Against the independent program, whose If is larger by the lift of the paddle."""
+    """Test against the independent program with If larger by the lift ratio."""
     p = with_paddle()
     model = models.roll_on_stand if stand else models.roll
     num, den = polynomials(model, p)
@@ -69,7 +69,7 @@ def test_a_vehicle_need_not_give_them(tmp_path, vehicles_folder):
 
 
 def flight(noise=2e-3):
-    """A run of the machine with the small paddle, by the independent program."""
+    """Return a run of the vehicle with the small paddle, by the independent program."""
     made = record(OWN, seed=6, n=1000, dt=0.02, noise=noise)
     return dataclasses.replace(made)
 

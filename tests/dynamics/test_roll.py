@@ -100,7 +100,7 @@ def test_ixx_if_a_times_one_number_change_nothing(bench30, factor):
 
 
 def test_two_parameters_not_three(bench30):
-    """The sensitivity of the field to log Ixx, log If, log a has rank 2, null vector (1, 1, 1)."""
+    """Test the sensitivity to log Ixx, log If, log a: rank 2, null vector (1, 1, 1)."""
     rng = np.random.default_rng(3)
     states = rng.standard_normal((6, 4))
 
@@ -127,7 +127,7 @@ def test_the_stand_stays_what_it_is_when_inertia_is_added(bench30, added):
     still = models.roll.Inputs(jnp.asarray(0.0))
     free, stand = free_and_stand(p, x, still)
     torque = (0.024 + added) * (stand.dphi - free.dphi)
-    # kappa Ixx = 0.096 N m/rad and zeta Ixx = 0.0048 N m s/rad, whatever is fixed to the fuselage
+    # kappa Ixx = 0.096 N m/rad and zeta Ixx = 0.0048 N m s/rad, whatever is fixed to the fuselage.
     assert float(torque) == pytest.approx(-(0.096 * 0.1 + 0.0048 * 0.7), rel=1e-13)
 
 

@@ -1,4 +1,4 @@
-"""Models that cannot begin at zero: told with the state and the remedy, and begun elsewhere."""
+"""Models that cannot start at zero: the message, and other initial states."""
 
 from typing import NamedTuple
 
@@ -113,7 +113,7 @@ def test_a_configuration_says_where_to_begin(config, capsys):
     assert main(["check", str(config), "--set", "initial_state.v=5.0"]) == 2
     out = config.parent / "b"
     assert main(["fit", str(config), "--set", "initial_state.V=5.0", "--out", str(out)]) == 0
-    # The run directory's configuration begins there too.
+    # The run directory's configuration also starts there.
     assert yaml.safe_load((out / "config.yaml").read_text())["initial_state"] == {"V": 5.0}
     table = np.genfromtxt(out / "signals.csv", delimiter=",", names=True, dtype=None)
     wanted = by_scipy(8.0, 5.0)

@@ -26,7 +26,7 @@ class Rates(NamedTuple):
 
 
 def settled(p, driven, rates):
-    """Where flapping_rates stays, which is linear in the tilt."""
+    """Return the equilibrium of flapping_rates, which is linear in the tilt."""
 
     def field(a1, b1):
         return np.array(
@@ -65,7 +65,7 @@ def test_the_time_constant_is_that_of_the_blades():
 
 @pytest.mark.parametrize("axis", ["p", "q"])
 def test_the_rotor_stays_behind_a_body_that_turns(axis):
-    """About the axis of the turn; across it a tilt of the rate over Omega is left out."""
+    """Test the tilt about the turn's axis; across it a tilt of rate over Omega is neglected."""
     v = FULL | {"k_beta": 0.0}
     wanted = rotating.simulate(v, 12, **{axis: 0.5})[-1]
     found = settled(vehicle(k_beta=0.0), Tilt(0.0, 0.0), Rates(**{axis: 0.5}))
@@ -93,7 +93,7 @@ def test_the_first_harmonic_of_a_rigid_hub_is_that_of_quadrature():
     mu = V / tip
 
     def excess(r, psi):
-        # Of two blades; what is even in psi has no first harmonic and cancels.
+        # Two blades: terms even in psi cancel and have no first harmonic.
         flow = r + mu * np.sin(psi)
         return 2 * r * (flow**2 * theta0 - flow * lam) * np.sin(psi)
 

@@ -1,8 +1,8 @@
-"""Eqs 2-20 and their corrected form, written from the paper's page with NumPy and SciPy alone.
+"""Eqs 2-20 of the paper and their corrected form, with NumPy and SciPy alone.
 
-States, inputs and vehicles are mappings of floats. Earth axes x, y, z with z up; body axes forward,
-right, down; phi, theta, psi ordinary yaw-pitch-roll Euler angles, dphi, dtheta, dpsi their time
-derivatives. Run as a program to see the numbers of hover.
+States, inputs and vehicles are mappings of floats. Earth axes x, y, z have z up; body axes are
+forward, right, down. phi, theta, psi are yaw-pitch-roll Euler angles, dphi, dtheta, dpsi their
+derivatives. Run as a program, it prints the numbers of hover.
 """
 
 import numpy as np
@@ -56,13 +56,13 @@ INPUTS = ("x_roll", "x_pitch", "x_yaw", "x_throttle")
 
 
 def flow_through(vi, V2, W):
-    """The flow through a rotor [m/s] as `heli_jax.dynamics.aerodynamics` has it, vi above zero."""
+    """Return the flow through a rotor [m/s], as in `heli_jax.dynamics.aerodynamics`, for vi > 0."""
     q = max(0.0, (-W - 0.5 * vi) * (2.2 * vi + W))
     return np.sqrt(V2 + (W + vi) ** 2 + 0.37 * q**2 / (vi**2 + 5.8 * V2))
 
 
 def induced_velocity(V2, W, T0, b):
-    """The root of 2 v s(v) = T0 - b v; T0 and b are a thrust's over rho pi R^2."""
+    """Return the root of 2 v s(v) = T0 - b v; T0 and b are a thrust's over rho pi R^2."""
     if T0 < 0:
         return -induced_velocity(V2, -W, -T0, b)
     return brentq(
@@ -71,14 +71,14 @@ def induced_velocity(V2, W, T0, b):
 
 
 def by_thrust(thrust, inplane, axial, rho, R):
-    """The same by the thrust [N] as a function of vi, which falls linearly with it."""
+    """Return the same from the thrust [N] as a linearly falling function of vi."""
     area = rho * np.pi * R**2
     slope = (thrust(0.0) - thrust(1.0)) / area
     return induced_velocity(inplane**2, axial, thrust(0.0) / area, slope)
 
 
 def rotor(v, Omega, x_throttle, inplane, nu, tilt):
-    """(10), (13), inflow: T [N], vi [m/s], lam, drag torque [N m]; `tilt` is mu times cyclic."""
+    """Return T [N], vi [m/s], lam and drag torque [N m] (eqs 10, 13); `tilt` is mu times cyclic."""
     R, B, rho, a = v["R"], v["B"], v["rho"], v["a"]
     sigma = 2 * v["c"] / (np.pi * R)
     th0 = v["K_theta0"] * x_throttle  # (18)
@@ -96,12 +96,12 @@ def rotor(v, Omega, x_throttle, inplane, nu, tilt):
 
 
 def blade_cyclic(v, x_cyc, beta):
-    """(11): theta_cyc [rad]."""
+    """Return theta_cyc [rad] (eq. 11)."""
     return (v["L3"] * x_cyc + v["L2"] * v["L4"] * beta) / ((v["L2"] + v["L3"]) * v["L1"])
 
 
 def paper_rotor(v, s, u):
-    """(8), (9) as printed, then the rotor: T, vi, lam, torque."""
+    """Return T, vi, lam and torque, with eqs 8 and 9 as printed."""
     sin, cos = np.sin, np.cos
     phi, theta, hr, RO = s["phi"], s["theta"], v["hr"], v["R"] * s["Omega"]
     forward = s["dx"] - hr * s["dtheta"]
@@ -113,7 +113,7 @@ def paper_rotor(v, s, u):
 
 
 def paper_rates(v, s, u):
-    """d/dt of the 17 states, eqs 2-20 to the letter, the drag D_F (a disturbance there) zero."""
+    """Return the derivatives of the 17 states, eqs 2-20 as printed, without the drag D_F."""
     sin, cos = np.sin, np.cos
     phi, theta, psi, Om, m, rho = s["phi"], s["theta"], s["psi"], s["Omega"], v["m"], v["rho"]
     got = paper_rotor(v, s, u)
@@ -144,7 +144,7 @@ def paper_rates(v, s, u):
 
 
 def body_to_earth(s):
-    """Rotation from forward, right, down to x, y, z up."""
+    """Return the rotation from forward, right, down to x, y, z up."""
     (sf, st, sp), (cf, ct, cp) = (f([s["phi"], s["theta"], s["psi"]]) for f in (np.sin, np.cos))
     yaw = np.array([[cp, -sp, 0.0], [sp, cp, 0.0], [0.0, 0.0, 1.0]])
     pitch = np.array([[ct, 0.0, st], [0.0, 1.0, 0.0], [-st, 0.0, ct]])
@@ -153,7 +153,7 @@ def body_to_earth(s):
 
 
 def euler_to_body(s):
-    """E with (p, q, r) = E (dphi, dtheta, dpsi), and dE/dt."""
+    """Return E with (p, q, r) = E (dphi, dtheta, dpsi), and dE/dt."""
     (sf, st), (cf, ct) = (f([s["phi"], s["theta"]]) for f in (np.sin, np.cos))
     df, dt = s["dphi"], s["dtheta"]
     E = np.array([[1.0, 0.0, -st], [0.0, cf, sf * ct], [0.0, -sf, cf * ct]])
@@ -168,26 +168,26 @@ def euler_to_body(s):
 
 
 def air_and_body_rates(s, wind):
-    """Velocity through the air of the centre of gravity and (p, q, r), both in body axes."""
+    """Return the airspeed vector of the centre of gravity and (p, q, r), both in body axes."""
     velocity = np.array([s["dx"], s["dy"], s["dz"]]) - np.asarray(wind)
     E, _ = euler_to_body(s)
     return body_to_earth(s).T @ velocity, E @ [s["dphi"], s["dtheta"], s["dpsi"]]
 
 
 def consistent_rotor(v, s, u, wind=(0.0, 0.0, 0.0)):
-    """The rotor at the hub's velocity through the air: T, vi, lam, torque."""
+    """Return T, vi, lam and torque of the rotor at the hub's airspeed."""
     air, omega = air_and_body_rates(s, wind)
     u_h, v_h, w_h = air + np.cross(omega, [-v["lr"], 0.0, -v["hr"]])
     RO = v["R"] * s["Omega"]
     roll = blade_cyclic(v, u["x_roll"], s["beta_roll"])
     pitch = blade_cyclic(v, u["x_pitch"], s["beta_pitch"])
-    # pitch cyclic sits on the right (advancing) side, roll cyclic at the nose (moving left)
+    # pitch cyclic acts on the right (advancing) side, roll cyclic at the nose (moving left)
     tilt = (u_h * pitch - v_h * roll) / RO
     return rotor(v, s["Omega"], u["x_throttle"], np.hypot(u_h, v_h), w_h / RO, tilt)
 
 
 def consistent_tail(v, s, u, wind=(0.0, 0.0, 0.0)):
-    """(16) with inflow: T_T [N], positive to the left (nose right), vi_T [m/s], lam_T."""
+    """Return T_T [N], positive to the left (nose right), vi_T [m/s] and lam_T (eq. 16)."""
     (u_b, v_b, w_b), (_, q, r) = air_and_body_rates(s, wind)
     R_T, Om_T, B = v["R_T"], v["K_Omega"] * s["Omega"], v["B"]
     axial = -(v_b - r * v["L_T"])
@@ -204,7 +204,7 @@ def consistent_tail(v, s, u, wind=(0.0, 0.0, 0.0)):
 
 
 def consistent_rates(v, s, u, wind=(0.0, 0.0, 0.0)):
-    """d/dt of the 15 states with all corrections; `wind` [m/s] in x, y, z up."""
+    """Return the derivatives of the 15 states with all corrections; `wind` [m/s] in x, y, z up."""
     Om, rho = s["Omega"], v["rho"]
     T = (got := consistent_rotor(v, s, u, wind))["T"]
     air, omega = air_and_body_rates(s, wind)
@@ -237,7 +237,7 @@ RATES = {"paper": paper_rates, "consistent": consistent_rates}
 
 
 def hover(v):
-    """Trim of both variants: {variant: (s, u)}, level, at rest, psi = 0."""
+    """Return the trim of both variants, {variant: (s, u)}: level, at rest, psi = 0."""
     trims = {}
     for variant, rates in RATES.items():
         bar = "dbeta_pitch" if variant == "paper" else "beta_pitch"
@@ -253,7 +253,7 @@ def hover(v):
             return [d[k] for k in zero]
 
         solution = root(residual, [1.5, 0.5, 0.1, -0.25, 0.1], tol=1e-14)
-        # at machine precision hybr may report slow progress: judge by the residual
+        # at machine precision hybr may report slow progress, so the residual decides
         if np.max(np.abs(residual(solution.x))) > 1e-8:
             raise ValueError(f"no hover for {variant}: {solution.message}")
         trims[variant] = state_and_inputs(solution.x)
@@ -261,7 +261,7 @@ def hover(v):
 
 
 def jacobian(variant, v, s, u, h=1e-6):
-    """d(rates)/d(states) by central differences."""
+    """Return d(rates)/d(states) by central differences."""
     names, rates, columns = STATES[variant], RATES[variant], []
     for k in names:
         step = h * max(1.0, abs(s[k]))

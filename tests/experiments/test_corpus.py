@@ -1,4 +1,4 @@
-"""Ten cases of the corpus say what was stored; what counts as a difference."""
+"""Ten cases of the corpus against their stored results, and the definition of a difference."""
 
 import importlib
 import json
@@ -48,7 +48,7 @@ def test_differences_are_those_that_count(corpus):
     assert count(estimates={}) == 1
     assert count(numbers={"rate": 50.01, "rows": 10}) == 0
     assert count(numbers={"rate": 51.0}) == 2
-    # A code that changes its rank counts twice, as one that goes and one that comes.
+    # A code that changes its rank counts twice, as one removed and one added.
     assert count(codes={"exit": ["a"], "note": ["b"]}) == 2
     assert count(skipped="absent") == 0
 

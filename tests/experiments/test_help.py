@@ -1,4 +1,4 @@
-"""Every file of experiments/ answers --help."""
+"""Every file of experiments/ has --help."""
 
 import subprocess
 import sys
@@ -6,7 +6,7 @@ from pathlib import Path
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 SCRIPTS = sorted([*EXPERIMENTS.glob("*.py"), *EXPERIMENTS.glob("benchmarks/*.py")])
-# Read, not run: to import them takes a second each.
+# The files are read and not run, since each import takes a second.
 PARTS = [p for p in SCRIPTS if "by itself it does nothing" in p.read_text(encoding="utf-8")]
 
 

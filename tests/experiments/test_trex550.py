@@ -1,4 +1,4 @@
-"""The flybarless model on a real log, where the log is."""
+"""The flybarless model on a real log, if the log is available."""
 
 import runpy
 from pathlib import Path
@@ -13,7 +13,7 @@ LOG = ROOT.parent / "shared" / "data" / "trex550" / "Pitchtest.csv"
 @pytest.mark.skipif(not LOG.exists(), reason="the T-Rex 550 log is not part of the project")
 def test_the_shipped_rate_loop_follows_the_log():
     experiment = runpy.run_path(str(ROOT / "experiments" / "trex550.py"))
-    # As the configuration has it: the estimates, rounded.
+    # The configuration has the rounded estimates.
     model, params, _ = experiment["flybarless"](str(LOG), feedforward=False)
     seen = experiment["agreement"](model, params, experiment["read"](str(LOG)))
     # The Kim-Tilbury structure reached 0.979 in the window, a first-order lag 0.938 of the whole.
@@ -33,5 +33,5 @@ def test_the_rest_is_predicted_where_the_lateral_stick_moves():
     seconds, agreed = found[0.25]
     assert agreed > 0.90
     assert 10.0 < seconds < 25.0
-    # The more the stick moves, the more of the rate is its answer.
+    # The more the stick moves, the larger is its share of the rate.
     assert found[0.2][1] < agreed < found[0.3][1]

@@ -21,7 +21,7 @@ def test_there_are_a_hundred_and_half_are_sound():
     assert sum(count for _, count in ZOO["UNSOUND"]) == 50
 
 
-# Where time is short: what the others show in another way, or the ten cases of the corpus do.
+# In short runs: other tests or the ten cases of the corpus cover the rest.
 SLOW = {
     "with_prior", "total", "gain_nuisance", "two_inputs", "product", "plain", "something_else",
     "swapped_sign", "alike_inputs", "short_period", "constant_known_bias", "on_the_stand",

@@ -1,10 +1,10 @@
-"""Small logs of autopilots, written from the formats' documentation with struct alone."""
+"""Writers of small autopilot logs, from the formats' documentation with struct alone."""
 
 import struct
 
 import numpy as np
 
-# ULog: sizes and struct codes of the types that the tests use.
+# ULog: sizes and struct codes of the types used in tests.
 _ULOG = {"uint64_t": "Q", "int32_t": "i", "float": "f", "uint8_t": "B", "uint16_t": "H"}
 
 
@@ -13,7 +13,11 @@ def _message(kind, body):
 
 
 def ulog(topics, parameters=(), information=(), dropouts=(), start=10_000_000):
-    """`topics`: (name, instance, [(type, field), ...], rows); timestamps in us come first."""
+    """Return a ULog.
+
+    Args:
+        topics: (name, instance, [(type, field), ...], rows); timestamps [us] come first.
+    """
     out = [b"ULog\x01\x12\x35\x01", struct.pack("<Q", start)]
     out.append(_message("B", bytes(40)))
     for key, text in information:
@@ -31,7 +35,7 @@ def ulog(topics, parameters=(), information=(), dropouts=(), start=10_000_000):
         out.append(_message("A", struct.pack("<BH", instance, i) + name.encode()))
     data = []
     for i, (_, _, fields, rows) in enumerate(topics):
-        # Firmware leaves out the padding at the end.
+        # Firmware omits the padding at the end.
         kinds = [_code(kind) for kind, field in fields if "_padding" not in field]
         count = sum(int(kind[:-1] or 1) for kind in kinds)
         code = "<H" + "".join(kinds)
@@ -53,7 +57,12 @@ _DATAFLASH = {
 
 
 def dataflash(messages, rows):
-    """`messages`: name -> (number, kinds, columns); `rows`: (name, values), as they are stored."""
+    """Return a DataFlash log.
+
+    Args:
+        messages: name -> (number, kinds, columns).
+        rows: (name, values) as stored.
+    """
     out = []
     known = {"FMT": (128, "BBnNZ", "Type,Length,Name,Format,Columns")} | messages
     for name, (number, kinds, columns) in known.items():
@@ -68,14 +77,14 @@ def dataflash(messages, rows):
 
 
 def dataflash_text(messages, rows):
-    """The same as text: what stands in a cell is what the field means."""
+    """Return the same as text; a cell has the meaning of the field."""
     lines = ["FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns"]
     lines += [f"FMT, {n}, 50, {name}, {k}, {c}" for name, (n, k, c) in messages.items()]
     lines += [", ".join([name, *map(str, values)]) for name, values in rows]
     return ("\n".join(lines) + "\n").encode()
 
 
-# Blackbox: how one group of fields becomes bytes, by the number of its encoding.
+# Blackbox: conversion of a group of fields to bytes, by the number of its encoding.
 def unsigned(value):
     value &= 0xFFFFFFFF
     out = bytearray()
@@ -117,7 +126,7 @@ def _three(values, widths):
         if all(_fits(v, b) for v, b in zip(values, bits, strict=True)):
             text = "".join(f"{v & (1 << b) - 1:0{b}b}" for v, b in zip(values, bits, strict=True))
             size = 8 * (code + 1)
-            # The fields end with the last bit; between the code and them stand zeros.
+            # The fields end at the last bit; zeros fill the space after the code.
             return int(f"{code:02b}" + text.rjust(size - 2, "0"), 2).to_bytes(code + 1, "big")
     sizes = [next(n for n in (1, 2, 3, 4) if _fits(v, 8 * n)) for v in values]
     lead = 0b11000000 | sum((n - 1) << 2 * i for i, n in enumerate(sizes))
@@ -126,7 +135,7 @@ def _three(values, widths):
 
 
 def tag2_3s32(values):
-    # 6, 6 and 6 bits stand in a byte each, so that the fields are spread.
+    # 6, 6 and 6 bits have a byte each, so the fields are spread.
     if all(_fits(v, 2) for v in values) or not all(_fits(v, 6) for v in values):
         return _three(values, ((2, 2, 2),))
     if all(_fits(v, 4) for v in values):
@@ -157,7 +166,7 @@ ENCODERS = {
 
 
 def encode(values, encodings):
-    """The fields of one frame as bytes; fields of one encoding share tags as far as they can."""
+    """Return the fields of one frame as bytes; fields of one encoding share tags if possible."""
     out, at = b"", 0
     while at < len(values):
         encoder, most = ENCODERS[encodings[at]]
@@ -179,18 +188,18 @@ END = b"E\xffEnd of log\x00"
 def blackbox(
     names, values, predictors, encodings, *, every=32, step=1, settings=(), slow=(), gps=()
 ):
-    """One flight.
+    """Return one flight of a blackbox log.
 
     Args:
-        names: of the fields behind loopIteration and time [us].
-        values: (N, 2 + F), those two included.
+        names: fields after loopIteration and time [us].
+        values: (N, 2 + F), including those two.
         predictors: of the F fields in P frames: 0 none, 1 previous, 2 straight line, 3 mean.
         encodings: of the F fields in P frames.
         every: iterations between I frames.
         step: iterations between frames.
         settings: lines of the header, (name, value).
         slow: (row, value) of S frames of one field, each before the frame of that row.
-        gps: (row, us behind the last frame, satellites) of G frames, each before that row's frame.
+        gps: (row, us after the last frame, satellites) of G frames, each before that row's frame.
     """
     count = len(names)
     head = [MARK, "H Data version:2", f"H I interval:{every}", f"H P interval:{step}"]
@@ -218,7 +227,7 @@ def blackbox(
         if row in gps:
             out.append(b"G" + encode(gps[row], [1, 1]))
         if value[0] % every == 0:
-            stamp = value[1] % 2**32  # the firmware's counter begins anew
+            stamp = value[1] % 2**32  # the firmware's counter restarts
             out.append(b"I" + encode([value[0], stamp, *value[2:]], [1, 1, *[0] * count]))
             before = earlier = value
             continue

@@ -1,4 +1,4 @@
-"""Two logs of one flight, their clocks brought together by a motion that both hold."""
+"""Two logs of one flight, aligned by a motion that both contain."""
 
 import dataclasses
 
@@ -16,14 +16,14 @@ from .test_configured_logs import BENCH
 
 
 def motion(seed, fastest=2.0):
-    """Random motion of a limited band, as a function of time."""
+    """Return a random motion of limited band, as a function of time."""
     rng = np.random.default_rng(seed)
     w, phase = 2 * np.pi * rng.uniform(0.05, fastest, 60), rng.uniform(0, 6.3, 60)
     return lambda t: 0.3 * np.sin(np.multiply.outer(t, w) + phase).mean(axis=-1)
 
 
 def pair(seed, lag, rates=(100, 50), noise=(0.02, 0.02)):
-    """The same motion on two clocks, the second one's behind by `lag` [s]."""
+    """Return the same motion on two clocks, the second late by `lag` [s]."""
     rng, x = np.random.default_rng(seed), motion(seed)
     t = [np.arange(a * f, b * f) / f for (a, b), f in zip([(0, 40), (8, 35)], rates, strict=True)]
     t = [s + rng.uniform(-0.1, 0.1, s.size) / f for s, f in zip(t, rates, strict=True)]
@@ -34,7 +34,7 @@ def pair(seed, lag, rates=(100, 50), noise=(0.02, 0.02)):
 
 
 def test_lags_are_found_to_a_part_of_a_sample():
-    """Over 6 records; experiments/alignment.py has more, and other rates and noise."""
+    """Test 6 records; experiments/alignment.py has more, with other rates and noise."""
     z = []
     for seed in range(6):
         lag = np.random.default_rng(seed + 99).uniform(-5, 5) + 1.6e9 * (seed % 2)
@@ -42,7 +42,7 @@ def test_lags_are_found_to_a_part_of_a_sample():
         assert found.sd < 2e-3
         assert found.correlation > 0.99
         z.append((found.lag - lag) / found.sd)
-    # 1.6e9 s are 200 ns in float64: the epoch costs nothing.
+    # At 1.6e9 s float64 resolves 200 ns, so an epoch costs no accuracy.
     assert np.abs(z).max() < 3.0
     assert 0.4 < np.std(z) < 1.6
 
@@ -70,12 +70,12 @@ def test_what_cannot_be_told_is_refused():
 
 
 def written(tmp_path):
-    """Sticks and p at 100 Hz; roll and p by a motion capture at 30 Hz, by a clock of its own."""
+    """Write sticks and p at 100 Hz, and roll and p of a motion capture at 30 Hz."""
     x, t, s = motion(5), np.arange(4000) / 100, 7.0 + np.arange(900) / 30
     table = np.stack([t, np.sin(t), x(t)], axis=1)
     np.savetxt(tmp_path / "log.csv", table, delimiter=",", header="t,u,p", comments="")
     table = np.stack([1.6e9 + 12.3456 + s, 0.5 * s, -57.3 * x(s)], axis=1)
-    table[400:403, 2] = -9999.0  # no motion: a mark for no value
+    table[400:403, 2] = -9999.0  # a mark for a missing value, not a motion
     fmt = ["%.6f", "%.9g", "%.9g"]
     np.savetxt(
         tmp_path / "mocap.csv", table, delimiter=",", header="at,phi,q", comments="", fmt=fmt
@@ -141,7 +141,7 @@ def test_by_configuration(tmp_path):
         return config.read_flights(config.load(tmp_path / "flight.yaml"))
 
     (made,) = read(flight)
-    # As a run writes it out, for whoever repeats it from another folder.
+    # As in a run's resolved configuration, which is repeated from another folder.
     written_out = config.resolved(config.load(tmp_path / "flight.yaml"))["flights"][0]["also"][0]
     assert written_out["log"] == str((tmp_path / "mocap.csv").resolve())
     assert written_out["align"] == also["align"]
@@ -152,7 +152,7 @@ def test_by_configuration(tmp_path):
 
 
 def one_clock(tmp_path, begins):
-    """A flight of sticks and rates, and its attitude in a file of its own, beginning then [s]."""
+    """Write sticks and rates, and the attitude in a separate file that starts at `begins` [s]."""
     x = motion(3)
     t, late = 5.0 + np.arange(3000) / 100, begins + np.arange(1200) / 50
     rows = [f"{a:.3f},{np.sign(b):.1f},{b:.9f}" for a, b in zip(t, x(t), strict=True)]

@@ -1,4 +1,4 @@
-"""Arrays with clocks of their own, by where they stand in a file."""
+"""Arrays with separate clocks, assigned by their place in a file."""
 
 from pathlib import Path
 
@@ -35,13 +35,13 @@ def test_new_takes_the_clock_of_each_group(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("names", "of"),
     [
-        # By the group, and by the nearest above.
+        # By the group, and by the nearest group above.
         (("imu.t", "rc.t", "imu.x", "rc.x"), {"imu.x": "imu.t", "rc.x": "rc.t"}),
         (("time", "rc.t", "imu.x", "rc.x"), {"imu.x": "time", "rc.x": "rc.t"}),
     ],
 )
 def test_clocks_of_one_length_are_told_apart(tmp_path: Path, names, of) -> None:
-    """Both clocks are as long as all: only where they stand tells whose they are."""
+    """Test two clocks of equal length: only their place assigns them to arrays."""
     content: dict = {}
     for i, name in enumerate(names):
         *group, leaf = name.split(".")

@@ -1,4 +1,4 @@
-"""MATLAB, NetCDF, HDF5 and columns with blanks between them, beside what SciPy and xarray wrote."""
+"""MATLAB, NetCDF, HDF5 and blank-separated columns, against SciPy and xarray."""
 
 import io
 import struct
@@ -36,7 +36,7 @@ def test_structures_of_matlab(tmp_path):
     assert (flight.dt, flight.t0) == (pytest.approx(0.02), 3.0)
     np.testing.assert_allclose(flight.outputs["roll"], np.deg2rad(ROLL), rtol=1e-15)
     np.testing.assert_array_equal(flight.inputs["stick"], T**2)
-    # A matrix is its columns.
+    # A matrix consists of its columns.
     table = open_log(path)
     column = table.numbers(["log.matrix[1]"])["log.matrix[1]"]
     np.testing.assert_array_equal(column, 3.0 * np.arange(N) + 1)
@@ -107,7 +107,7 @@ def test_a_file_over_which_its_reader_dies_or_loops_is_no_log(tmp_path, monkeypa
     with h5py.File(path, "w") as file:
         file["t"] = T
     assert open_log(path).names == ("t",)
-    # What libhdf5 does over damage, in the process that reads.
+    # libhdf5's behaviour with damaged files, in the reading process.
     for fault in ("import os; os.abort()", "while True: pass"):
         (tmp_path / "h5py").mkdir(exist_ok=True)
         (tmp_path / "h5py" / "__init__.py").write_text(fault)
@@ -147,7 +147,7 @@ def test_a_matlab_file_that_claims_much(tmp_path):
 
 
 def an_object(name: str, kind: str) -> bytes:
-    """A variable of MATLAB whose class is its own, as 'MAT-File Format' leaves it undescribed."""
+    """Return a MATLAB variable of an opaque class, which 'MAT-File Format' does not describe."""
 
     def element(code: int, data: bytes) -> bytes:
         return struct.pack("<2I", code, len(data)) + data + bytes(-len(data) % 8)
@@ -181,7 +181,7 @@ def test_structures_of_matlab_7_3_have_the_paths_of_older_ones(tmp_path):
         file["out/time"], file["out/roll/data"] = t[None, :], np.cos(t)[None, :]
         letters = file.create_dataset("out/title", data=np.array([[97], [98]], np.uint16))
         letters.attrs["MATLAB_class"] = np.bytes_("char")
-        # Of a cell the elements are kept apart, by names that mean nothing.
+        # Elements of a cell stay separate, with names that have no meaning.
         cell = file.create_dataset("C", (1, 1), dtype=h5py.ref_dtype)
         cell[0, 0] = file.create_dataset("#refs#/c", data=t[None, :]).ref
     log = open_table(tmp_path / "log.mat")

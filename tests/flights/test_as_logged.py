@@ -1,4 +1,4 @@
-"""What is known of signals before they are resampled: rails, steps, marks for no value, turns."""
+"""Facts of signals before resampling: limits, steps, marks for no value, wrapped angles."""
 
 from types import SimpleNamespace
 
@@ -25,7 +25,7 @@ RATE = np.sin(1.7 * T) + np.sin(2.9 * T) + 0.02 * RNG.standard_normal(N)
 
 
 def of(flight, sd=0.0):
-    """What the diagnostics of signals ask for."""
+    """Input of the diagnostics of signals."""
     noise = {f"one/{n}": sd for n in flight.outputs}
     return SimpleNamespace(flights=[("one", flight)], noise=noise)
 
@@ -51,7 +51,7 @@ def test_flat_tops_are_seen_at_any_rate(tmp_path, rate):
     (found,) = saturation(of(f))
     assert (found.code, found.severity, found.denies) == ("quality.saturation", "doubt", True)
     assert found.value == pytest.approx(np.mean((RATE <= -1.0) | (RATE >= 1.2)), abs=1e-6)
-    # Of a part of it the share is that of the part.
+    # The share refers to the part that is read.
     half = part(f, 0, f.n_samples // 2)
     assert half.source is not None
     low, high = half.source.facts["p", "output"].shares
@@ -79,17 +79,17 @@ def test_marks_for_no_value_are_missing_and_not_spread(tmp_path):
     assert [n.value for n in f.source.notes if n.code == "samples.marks"] == [11]
     with pytest.raises(InputError):
         read(tmp_path, u=np.where((T > 3) & (T < 3.025), 65535.0, STICK), p=RATE)
-    # However often: of a sensor at 5 Hz most rows hold nothing else.
+    # Any number of marks: most rows of a 5 Hz sensor have no value.
     f = read(tmp_path, p=np.where(np.arange(N) % 20 == 0, RATE, -9999.0), q=RATE)
     np.testing.assert_array_equal(np.isfinite(f.outputs["p"]), np.arange(N) % 20 == 0)
     assert [n.value for n in f.source.notes if n.code == "samples.marks"] == [1900]
-    # Among rotor speeds -9999 is not far, but the only one below zero; 1e20 measures nothing.
+    # -9999 is not far from rotor speeds, but is the only negative value; 1e20 is not physical.
     speed = 6000 + 5500 * np.sin(0.4 * T)
     speed[500] = -9999.0
     f = read(tmp_path, p=speed, q=np.where(T > 8, 1e20, RATE))
     assert np.flatnonzero(np.isnan(f.outputs["p"])).tolist() == [500]
     np.testing.assert_array_equal(np.isnan(f.outputs["q"]), T > 8)
-    # The same number among others of its size is a value.
+    # The same number among values of its size is a value.
     near = read(tmp_path, p=1e4 + 10 * np.round(RATE)).outputs["p"]
     assert np.isfinite(near).all()
 
@@ -105,7 +105,7 @@ def test_samples_that_no_motion_leads_to_are_said_and_kept(tmp_path):
     assert [(s.severity, s.value) for s in strays(of(f))] == [("doubt", 3.0)]
     (found,) = strays(of(part(f, 0, 400)))
     assert found.value == 2.0
-    # Doublets out of rest, at any rate, in steps of the log or not, and a landing are motions.
+    # Doublets from rest at any rate, in the log's steps or not, and a landing are motions.
     u = np.where((T > 5) & (T < 5.2), 0.3, 0.0) - np.where((T > 5.2) & (T < 5.4), 0.3, 0.0)
     motion = lfilter([0.2], [1, -0.8], u) + 1e-3 * RNG.standard_normal(N)
     shock = np.where(T > 9, np.exp(-(T - 9) / 0.1) * np.cos(60 * T), 0) + motion

@@ -1,4 +1,4 @@
-"""ULog and DataFlash: what was written comes out, equal to pyulog's and pymavlink's own numbers."""
+"""ULog and DataFlash: values as written, equal to pyulog's and pymavlink's."""
 
 import itertools
 import math
@@ -76,7 +76,7 @@ def test_a_ulog_comes_back(tmp_path):
     assert (log.format, log.firmware) == ("ulog", "PX4 BOARD")
     assert log.parameters == {"IMU_GYRO_CUTOFF": 40.0, "SYS_HITL": 0}
     assert [(n.code, n.value) for n in log.notes] == [("damage.dropouts", 0.15)]
-    # Two instances are told apart, and the time is that of the sample, not of its publication.
+    # Two instances are separate, and the time is that of the sample, not of its publication.
     times, p = log.channel("vehicle_angular_velocity[0].xyz[0]")
     np.testing.assert_array_equal(times, [1e-6 * row[1] for row in GYRO_ROWS])
     np.testing.assert_array_equal(p, np.float32([row[2] for row in GYRO_ROWS]).astype(float))
@@ -94,8 +94,8 @@ def test_channels_of_a_ulog_become_a_flight(tmp_path):
         "outputs": {"p": Signal("vehicle_angular_velocity[0].xyz[0]", "rad/s", "rad/s")},
     }
     flight = read_flight(path, **signals, rate=100.0)
-    # Each from its own clock: at 100 Hz every fourth gyro sample, the stick on a straight line
-    # between its own 50 Hz.
+    # Each by its own clock: at 100 Hz every fourth gyro sample, the stick interpolated between its
+    # 50 Hz samples.
     np.testing.assert_allclose(flight.outputs["p"], np.sin(np.arange(99) * 4 / 20), atol=2e-2)
     at = np.arange(99) / 100
     wanted = np.interp(at, np.arange(50) / 50, np.cos(np.arange(50) / 5))
@@ -121,7 +121,7 @@ def test_a_dataflash_log_comes_back(tmp_path):
     np.testing.assert_array_equal(roll, [-100 * i * 0.01 for i in range(30)])
     assert log.channel("ATT.Yaw").values[1] == 35999 * 0.01
     assert log.channel("GPS.Lat").values[1] == 473_000_001 * 1e-7
-    # Where the log says which field counts instances, each is a topic.
+    # If the log states the instance field, each instance is a topic.
     np.testing.assert_array_equal(log.channel("IMU[1].GyrX").values, np.arange(60) + 0.5)
     units = {t.name: t.units for t in log.topics}
     assert units["ATT"]["ATT.Roll"] == "deg"
@@ -133,7 +133,7 @@ def test_a_dataflash_log_as_text(tmp_path):
     rows = [("ATT", (1_000_000 + 40_000 * i, -0.5 * i, 0.25)) for i in range(20)]
     rows.append(("MSG", (0, "ArduCopter V4.5.1, with a comma")))
     log = open_log(written(tmp_path, writers.dataflash_text(messages, rows), "12.log"))
-    # In text a centidegree is written as degrees.
+    # Text has centidegrees as degrees.
     np.testing.assert_array_equal(log.channel("ATT.Roll").values, [-0.5 * i for i in range(20)])
     assert log.channel("ATT.Roll").times[-1] == 1e-6 * 1_760_000
     assert log.firmware == "ArduCopter V4.5.1, with a comma"
@@ -144,7 +144,8 @@ RATE_ROWS = [(1000 * i, 10.0 + i, 5.0 + i, 0.1 * i) for i in range(60)]
 
 @pytest.mark.parametrize("writer", [writers.dataflash, writers.dataflash_text])
 def test_a_new_description_holds_from_where_it_stands(tmp_path, writer):
-    # Three boots: the columns in another order and hundredths, then as at first, then one more.
+    # Three boots: columns in another order and hundredths, then the first layout, then one more
+    # column.
     boots = [
         {"RATE": (1, "Qfff", "TimeUS,RDes,R,ROut")},
         {"RATE": (1, "Qfcf", "TimeUS,ROut,R,RDes"), "ACC": (2, "Qf", "TimeUS,X")},
@@ -168,7 +169,7 @@ def test_a_new_description_holds_from_where_it_stands(tmp_path, writer):
         np.testing.assert_allclose(times, [1e-6 * row[0] for row in RATE_ROWS])
     added = log.channel("RATE.Y").values
     np.testing.assert_array_equal(added, [np.nan] * 45 + [1.5] * 15)
-    # One name under two numbers, and no damage.
+    # One name has two numbers, which is not damage.
     np.testing.assert_allclose(
         log.channel("ACC.X").values, [2 * row[2] for row in RATE_ROWS[15:45]]
     )
@@ -195,7 +196,7 @@ def test_a_new_unit_makes_another_topic(tmp_path):
 @pytest.mark.parametrize("writer", [writers.dataflash, writers.dataflash_text])
 @pytest.mark.parametrize("board", [True, False])
 def test_a_time_of_week_is_not_the_boards_clock(tmp_path, writer, board):
-    # ArduCopter before 3.3: TimeMS is the board's clock but in GPS, where T is.
+    # ArduCopter before 3.3: TimeMS is the board's clock except in GPS, where T is.
     end = ("IHfI", "TimeMS,Week,Spd,T") if board else ("IHf", "TimeMS,Week,Spd")
     messages = {"IMU": (2, "If", "TimeMS,GyrX"), "GPS": (3, *end)}
     rows = [("IMU", (50_000 + 20 * i, 0.5 * i)) for i in range(300)]
@@ -207,7 +208,7 @@ def test_a_time_of_week_is_not_the_boards_clock(tmp_path, writer, board):
     if board:
         np.testing.assert_allclose(log.channel("GPS.Spd").times, 50.003 + 0.2 * np.arange(30))
     else:
-        # Nothing tells how the two clocks belong together.
+        # The relation of the two clocks is unknown.
         assert log.topic_of("GPS.Spd").clock == ""
     assert log.channel("IMU.GyrX").times[-1] == pytest.approx(55.98)
 
@@ -260,7 +261,7 @@ def test_damage_in_a_ulog_is_noted(tmp_path):
     assert rows == {"a": 600}
     np.testing.assert_array_equal(log.channel("a.x").values, np.arange(600))
     assert len(log.notes) == 1
-    # 31 bytes are gone from within the rows.
+    # 31 bytes are missing within the rows.
     rows, log = rows_of(tmp_path, whole[: at + 5] + whole[at + 36 :])
     assert 0 < rows["a"] < 600
     assert set(log.channel("a.x").values) <= set(range(600))
@@ -322,7 +323,7 @@ def test_the_numbers_are_pyulogs():
     for data in theirs.data_list:
         topic = f"{data.name}[{data.multi_id}]" if data.name in several else data.name
         for field, values in data.data.items():
-            if "_padding" in field:  # bytes between the fields, which are no signal
+            if "_padding" in field:  # bytes between the fields, which are not a signal
                 continue
             names.add(f"{topic}.{field}")
             np.testing.assert_array_equal(log.channel(f"{topic}.{field}").values, values)

@@ -1,4 +1,4 @@
-"""Resampling to a lower rate: what fits stays, what does not folds onto nothing."""
+"""Resampling to a lower rate: lower frequencies remain, higher ones do not fold."""
 
 import numpy as np
 import pytest
@@ -63,7 +63,7 @@ def test_missing_samples_are_bridged_while_few():
 
 @pytest.mark.parametrize(("jitter", "lost"), [(0.2, 0.05), (0.0, 0.2), (0.45, 0.2)])
 def test_noise_passes_as_the_filter_lets_it(jitter, lost):
-    """White noise of sd 1 at 200 Hz has 0.47 at 50 Hz: lost samples may not multiply it."""
+    """Test white noise of sd 1 at 200 Hz, which has 0.47 at 50 Hz, also with lost samples."""
     rng = np.random.default_rng(5)
     t = (np.arange(6000) + jitter * rng.uniform(-1.0, 1.0, 6000)) / 200.0
     t = t[rng.random(6000) > lost]
@@ -72,6 +72,6 @@ def test_noise_passes_as_the_filter_lets_it(jitter, lost):
     found = decimate(t, noise, at)
     assert 0.4 < np.nanstd(found) < 0.6
     assert np.nanmax(np.abs(found)) < 3.0
-    # A slow motion below it comes through as it is, within what noise is left.
+    # A slow motion below the noise is unchanged within the remaining noise.
     moved = decimate(t, np.sin(2.0 * np.pi * t) + 0.01 * noise, at)
     assert np.nanstd(moved - np.sin(2.0 * np.pi * at)) < 0.008

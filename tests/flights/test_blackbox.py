@@ -1,4 +1,4 @@
-"""Blackbox logs: what a writer of its own put in comes out; damage costs no more than it has to."""
+"""Blackbox logs: values of an independent writer; damage loses as little as possible."""
 
 from pathlib import Path
 
@@ -34,7 +34,7 @@ def some_flight(**changes):
 
 
 def first_frame(data):
-    """Where the frames begin: behind the last line of the header."""
+    """Return the position of the first frame, after the last line of the header."""
     return data.index(b"\n", data.index(b"H Field P encoding")) + 1
 
 
@@ -92,7 +92,7 @@ def test_a_damaged_frame_costs_what_depends_on_it(tmp_path):
     del data[at : at + 3]
     (log,) = opened(tmp_path, bytes(data))
     _, iterations = log.channel("loopIteration")
-    # Of the first 32 some are lost; from the next I frame on all are there, each with its values.
+    # Some of the first 32 are lost; from the next I frame all are read with their values.
     assert np.all(iterations[iterations >= 32] == np.arange(32, 200))
     assert iterations.size < 200
     for i, name in enumerate(NAMES):
@@ -125,7 +125,7 @@ def test_several_flights_in_one_file(tmp_path):
         "outputs": {"p": Signal("gyroADC[0]", "deg/s", "rad/s")},
     }
     flight = read_flight(path, **signals, rate=500.0, number=2)
-    # The stamps jitter by 3 us, so samples move by 3/2000 of their neighbours' difference.
+    # Stamps jitter by 3 us, so samples move by 3/2000 of their neighbours' difference.
     wanted = some_values(80, 1)[:, 2] * np.pi / 180
     np.testing.assert_allclose(flight.outputs["p"][:78], wanted[:78], atol=0.1 * np.pi / 180)
     assert (flight.n_samples, flight.dt) == (pytest.approx(80, abs=1), 1 / 500)
@@ -164,12 +164,12 @@ def test_a_header_alone_is_no_flight(tmp_path):
 def test_the_rotorflight_log():
     (log,) = open_flights(REAL)
     times, headspeed = log.channel("headspeed")
-    # Two decoders of others found 9389 and 9390 frames, and 3566 rpm.
+    # Two other decoders give 9389 and 9390 frames, and 3566 rpm.
     assert times.size in (9389, 9390)
     assert (headspeed.min(), headspeed.max()) == (0.0, 3566.0)
     assert np.median(np.diff(times)) == pytest.approx(1 / 500, rel=1e-3)
     assert times[-1] - times[0] == pytest.approx(18.8, abs=0.05)
     assert "Rotorflight 4.3.0" in log.firmware
     assert log.topics[0].units["gyroADC[0]"] == "deg/s"
-    # The loop counts on by four without a hole: no frame is missing in between.
+    # The loop count increases by four throughout: no frame is missing.
     assert set(np.diff(log.channel("loopIteration")[1])) == {4.0}

@@ -1,4 +1,4 @@
-"""Clocks of logs: their units, which column is one, rates that contradict them, faults in them."""
+"""Clocks of logs: units, choice of the column, contradicting rates, faults."""
 
 import numpy as np
 import pytest
@@ -92,7 +92,7 @@ def test_a_unit_in_the_file_counts_and_one_in_a_name_is_a_hint(tmp_path):
     assert contradicted == [(), ("p",)]
     path = written(tmp_path, ROWS, "time_ms,u,p")
     assert "units.contradicted" in {n.code for n in read(path, "time_ms").source.notes}
-    # Steps of 10 s are no flight's: those that the name says are meant.
+    # Flights do not have steps of 10 s: the unit in the name applies.
     path = stamped(tmp_path, [f"{1e3 * t:.1f}" for t in T], "time_ms,u,p")
     with pytest.raises(InputError):
         read(path, "time_ms")
@@ -109,7 +109,7 @@ def test_times_in_ms_are_not_taken_in_seconds(tmp_path, step, rows):
         assert f.dt == pytest.approx(scale * step)
 
 
-# Which column is the clock.
+# Choice of the clock's column.
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def test_times_in_ms_are_not_taken_in_seconds(tmp_path, step, rows):
     ],
 )
 def test_what_increases_along_a_table_and_is_no_time(tmp_path, names, column):
-    # Packets of several sensors are counted together, so that those of one are not one by one.
+    # A common count of several sensors' packets does not increase by one in each of them.
     numbers = np.cumsum(np.tile([2, 1, 2, 1, 1], 40))
     path = written(tmp_path, [f"{n},{np.sin(n / 9):.5f}" for n in numbers], names)
     time = describe_log(path).time

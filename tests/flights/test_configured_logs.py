@@ -1,4 +1,4 @@
-"""A configuration names channels of autopilots' logs with the keys that it has for columns."""
+"""Configurations with channels of autopilot logs, with the same keys as for columns."""
 
 from pathlib import Path
 

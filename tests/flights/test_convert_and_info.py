@@ -62,11 +62,11 @@ def test_what_is_missing_is_said_and_stays_empty(tmp_path, capsys):
     rows = [f"{10 * i},{'' if i == 50 else x},{i // 100}" for i, x in rows]
     path.write_text("\n".join(["t_ms,x,mode", *rows]))
     assert main(["convert", str(path), str(out), "--rate", "100"]) == 0
-    # The gap of 61 steps is longer than anything should bridge.
+    # A gap of 61 steps is too long to bridge.
     columns = table_of(out)
     assert np.isnan(columns["mode"]).sum() == 60
     assert np.isnan(columns["x"][50])
-    # Steps stay steps: nothing lies between two modes.
+    # Steps stay steps: there are no values between two modes.
     assert set(columns["mode"][~np.isnan(columns["mode"])]) == {0.0, 1.0, 2.0, 3.0, 4.0}
 
 
@@ -191,7 +191,8 @@ def test_info_goes_without_jax(name):
 def test_topics_are_told_apart_in_a_conversion_of_all(tmp_path):
     path = some_ulog(tmp_path)
     converted = convert_log(path, Selection(rate=50.0))
-    # The second gyro logged 0.07 s of one second, and is left out rather than all cut to it.
+    # The second gyro logged 0.07 s of one second; it is left out, so that the others are not cut to
+    # it.
     assert not any(name.startswith(f"{ATTITUDE}[1]") for name in converted.columns)
     assert "channels.left-out" in {n.code for n in converted.notes}
     assert converted.columns["time"].size == 50

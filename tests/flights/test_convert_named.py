@@ -1,4 +1,4 @@
-"""Derived channels, presets and configurations as what `heli-jax convert` writes."""
+"""`heli-jax convert` of derived channels, presets and configurations."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def log(tmp_path_factory):
 def test_derived_channels(tmp_path):
     path, out = tmp_path / "log.csv", tmp_path / "out.csv"
     angle = np.linspace(0.0, 0.6, 60)
-    # Half the angle about the axis of roll; a heading that passes north.
+    # Half the angle about the roll axis; a heading that passes north.
     w, x, heading = np.cos(angle / 2), np.sin(angle / 2), (350 + np.arange(60)) % 360
     rows = zip(np.arange(60) / 50, w, x, heading, strict=True)
     lines = [f"{t:.2f},{float(a)!r},{float(b)!r},0,0,{c}" for t, a, b, c in rows]
@@ -54,6 +54,6 @@ def test_the_signals_of_a_configuration(log, tmp_path):
     selection = as_configured(load(ARDUPILOT), Selection(["ccpm.roll", "RATE.R"], 100.0))
     unmixed = convert_log(log, selection).columns
     np.testing.assert_array_equal(unmixed["ccpm.roll"], columns["lat"])
-    # Of two servos that stand 60 degrees from the nose, in whole microseconds.
+    # Two servos at 60 degrees from the nose, in whole microseconds.
     lift = 0.002 * np.round(STICK * 0.75**0.5 / 0.002) / 0.75**0.5
     np.testing.assert_allclose(unmixed["ccpm.roll"], lift, atol=1e-12)

@@ -1,4 +1,4 @@
-"""Delimited text: each file with the numbers that it holds, or with the place that refuses it."""
+"""Delimited text: the numbers of each file, or the place of the fault."""
 
 import datetime
 import gzip
@@ -21,7 +21,7 @@ U, P = np.round(np.sin(9.0 * T), 6), np.round(np.cos(7.0 * T), 6)
 
 
 def lines(between=",", form="{:.6f}", end="", first=None):
-    """Rows of T, U and P."""
+    """Return rows of T, U and P."""
     rows = zip(T if first is None else first, U, P, strict=True)
     return [
         between.join(x if isinstance(x, str) else form.format(x) for x in row) + end for row in rows
@@ -33,7 +33,7 @@ def text(*above, rows=None, **how):
 
 
 def with_cell(row, name, cell, **how):
-    """The table with one other cell."""
+    """Return the table with one cell replaced."""
     rows = [row.split(",") for row in lines(**how)]
     rows[row]["tup".index(name)] = cell
     return text("t,u,p", rows=[",".join(row) for row in rows])
@@ -54,7 +54,7 @@ BEGIN = datetime.datetime(2024, 2, 29, 23, 59, 59, 600_000)
 
 
 def times(form, digits=3):
-    """Of the rows, over midnight, `%F` being the fraction of a second."""
+    """Return stamps of the rows across midnight; `%F` is the fraction of a second."""
     at = [BEGIN + datetime.timedelta(seconds=float(t)) for t in T]
     return [t.strftime(form.replace("%F", f"{t.microsecond:06d}"[:digits])) for t in at]
 
@@ -135,7 +135,7 @@ def test_read(tmp_path, case):
     assert info.time is not None
     assert (info.time.column, info.time.rate) == ("t", pytest.approx(50.0))
     assert (info.columns[2].max, info.columns[1].kind) == (P.max(), "number")
-    # A row stands where it does in the file.
+    # The number of a row is that in the file.
     place = open_log(path).place(7 + skip).removeprefix("line ")
     if case not in ("old mac", "utf-16", "gzip", "latin letters"):
         raw = path.read_text(encoding="utf-8-sig").split("\n")[int(place) - 1]
@@ -252,7 +252,7 @@ def test_columns_of_text(tmp_path):
     path = written(tmp_path, text("t,u,p,fix,mode", rows=rows))
     t, u, p, fix, mode = describe_log(path).columns
     assert [c.kind for c in (t, u, p, fix, mode)] == ["number"] * 2 + ["text"] * 3
-    # A single cell among numbers is named with its place.
+    # A single bad cell is reported with its place.
     assert "line 14" in p.strays
     assert (fix.strays, mode.strays, mode.count) == ("", "", 25)
     made = convert_log(path, Selection())

@@ -1,4 +1,4 @@
-"""Quaternions, wrapped angles and swashplates: against SciPy and by hand."""
+"""Quaternions, wrapped angles and swashplates, against SciPy and by hand."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from heli_jax.flights.open_log import open_log
 
 from . import log_writers as writers
 
-# Twice round in yaw, over the vertical in roll.
+# Two turns in yaw, over the vertical in roll.
 ANGLES = np.stack(
     [np.linspace(-3, 5, 200), 0.9 * np.sin(np.arange(200) / 9), np.linspace(0, 13, 200)]
 )
@@ -69,7 +69,7 @@ def test_marks_in_the_sources_are_missing_in_what_is_derived(tmp_path):
     got = convert_log(path, Selection(signals=(roll,)))
     assert np.isnan(got.columns[roll][50:60]).all()
     assert 10 in [n.value for n in got.notes if n.code == "samples.missing"]
-    # Of another part of the log nothing is said.
+    # Other parts of the log are not mentioned.
     f = read_flight(path, time="t", inputs=inputs, outputs=outputs, window=(1.0, 1.9))
     assert f.source is not None
     assert "samples.marks" not in {n.code for n in f.source.notes}
@@ -92,7 +92,7 @@ SPEED = [("uint64_t", "timestamp"), ("float", "vx"), ("float", "vy"), ("float", 
 
 @pytest.fixture
 def flown(tmp_path):
-    """Attitude at 100 Hz, a turn in yaw, with a gap; 3 m/s to the north at 20 Hz."""
+    """Write attitude at 100 Hz in a yaw turn with a gap; 3 m/s to the north at 20 Hz."""
     yaw = np.linspace(0, 2 * np.pi, 200)
     q = quaternions(np.stack([0 * yaw, 0 * yaw, yaw]))
     q[:, 20::2] *= -1.0
@@ -109,7 +109,7 @@ def test_derived_channels_of_a_log(flown):
     times, yaw = log.channel("euler(att.q).yaw")
     np.testing.assert_allclose(yaw, times / 1.99 * 2 * np.pi, atol=1e-6)
     assert log.topic_of("euler(att.q).yaw").name == "att"
-    # On the clock of the speed, the attitude between its samples; in the gap nobody knows it.
+    # Attitude is interpolated to the speed's clock; within the gap it is unknown.
     times, u = log.channel("body_velocity(att.q, pos.vx, pos.vy, pos.vz).u")
     lost = (times > 1.0) & (times < 1.5)
     assert (np.isnan(u) == lost).all()
@@ -171,7 +171,8 @@ SIN40, COS40 = np.sin(np.radians(40)), np.cos(np.radians(40))
 @pytest.mark.parametrize(
     ("angles", "collective", "roll", "pitch"),
     [
-        # Front left, front right, rear: 120 degrees apart. To the right the right one goes down.
+        # Front left, front right, rear: 120 degrees apart. In a roll to the right the right servo
+        # lowers.
         ((-60, 60, 180), (1, 1, 1), (SIN60, -SIN60, 0), (HALF, HALF, -1)),
         # 140 degrees from the rear servo.
         ((-40, 40, 180), (1, 1, 1), (SIN40, -SIN40, 0), (COS40, COS40, -1)),
@@ -185,7 +186,7 @@ def test_a_swashplate_by_hand(angles, collective, roll, pitch):
     wanted = np.array([[0.3, 0.0], [-0.2, 0.5], [0.1, -0.4]])
     lifts = np.stack([collective, roll, pitch], axis=1) @ wanted
     np.testing.assert_allclose(unmix(plate(angles), lifts), wanted, atol=1e-12)
-    # The same as PWM around 1500, the second servo turned round, at half the radius.
+    # The same as PWM around 1500, with the second servo inverted, at half the radius.
     n = len(angles)
     invert = tuple(i == 1 for i in range(n))
     pwm = 1500 + lifts / 0.002 * np.where(invert, -1, 1)[:, None]
@@ -195,7 +196,7 @@ def test_a_swashplate_by_hand(angles, collective, roll, pitch):
 
 
 def test_more_servos_than_three_are_a_least_squares_problem():
-    # A fourth servo that sticks, by hand: (1, 1, -1, -1)/4 of its error is no motion of a plane.
+    # A fourth servo that sticks, by hand: (1, 1, -1, -1)/4 of its error is not a motion of a plane.
     lifts = np.array([[1.0], [0.0], [0.0], [0.0]])
     got = unmix(plate((0, 90, 180, 270)), lifts)
     np.testing.assert_allclose(got, [[0.25], [0.0], [0.5]], atol=1e-12)
@@ -204,7 +205,7 @@ def test_more_servos_than_three_are_a_least_squares_problem():
 def test_the_phase_turns_the_axes():
     swashplate = plate((-60, 60, 180), phase=90.0)
     got = unmix(swashplate, np.array([[SIN60], [-SIN60], [0.0]]))
-    # What tilts a plate without phase to the right tilts this one about the other axis.
+    # A tilt to the right of a plate without phase is one about the other axis here.
     np.testing.assert_allclose(got, [[0.0], [0.0], [-1.0]], atol=1e-12)
 
 

@@ -1,4 +1,4 @@
-"""What `describe_log` says of a log."""
+"""Results of `describe_log`."""
 
 import math
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A flight refuses what is no uniform, finite record."""
+"""Refusal of flights that are not uniform, finite records."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Joins of topics: outputs keep the samples that were measured."""
+"""Joined topics: outputs keep only measured samples."""
 
 import numpy as np
 import pandas as pd
@@ -35,7 +35,7 @@ def column(name, hz, start, f):
 
 @pytest.fixture
 def joined():
-    """A gyro at 100 Hz, an angle at 50 Hz and a stick at 50 Hz, in the rows of all three."""
+    """Return a gyro at 100 Hz, an angle and a stick at 50 Hz, joined in common rows."""
     table = column("gyro_x", 100, 0.0021, noisy(rate, 1))
     table = table.join(column("roll", 50, 0.0013, noisy(angle, 2)), how="outer")
     return table.join(column("aileron_cmd", 50, 0.0041, stick), how="outer")

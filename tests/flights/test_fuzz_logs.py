@@ -1,6 +1,6 @@
 """Damaged logs of every format end in a flight or in one sentence.
 
-`experiments/fuzz_logs.py` does the same more often.
+`experiments/fuzz_logs.py` has more attempts.
 """
 
 import json
@@ -23,7 +23,7 @@ FUZZ = runpy.run_path(str(Path(__file__).parents[2] / "experiments" / "fuzz_logs
 damaged, outcome = FUZZ["damaged"], FUZZ["outcome"]
 T, X = np.arange(60) / 50, np.sin(np.arange(60) / 3)
 COUNT, COUNT_APART = 20, 4
-"""the second of formats that are read in a process of its own"""
+"""Seconds for formats that are read in a separate process."""
 
 
 def text(path):

@@ -1,4 +1,4 @@
-"""A run with gaps that are too long to be bridged, as several."""
+"""Runs with gaps too long to bridge, split into parts."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ SIGNALS = {
 
 
 def run(tmp_path, *gaps, until=20.0):
-    """A table of 50 Hz without what lies within the gaps (first, last) [s]."""
+    """Write a table of 50 Hz without the rows within the gaps (first, last) [s]."""
     t = np.arange(round(50 * until)) / 50
     t = t[[not any(a < x < b for a, b in gaps) for x in t]]
     slow = np.where(np.rint(50 * t) % 50 == 0, t, np.nan)
@@ -41,7 +41,7 @@ def test_a_run_is_split_at_its_gaps(tmp_path):
     assert (first.t0, second.t0) == (0.0, 15.0)
     assert (first.duration, second.duration) == pytest.approx((8.98, 4.98))
     np.testing.assert_allclose(second.outputs["roll"], np.cos(15.0 + second.times), atol=1e-12)
-    # One second between two gaps is left out, and said.
+    # One second between two gaps is left out, with a note.
     (note,) = [n for n in first.source.notes if n.code == "windows.left-out"]
     assert note.value == 1
     # A part with five samples of the slow output is fitted without it.
@@ -53,7 +53,7 @@ def test_a_run_is_split_at_its_gaps(tmp_path):
 @pytest.mark.parametrize(
     ("gaps", "parts"),
     [
-        # One row behind the last gap, before the first, or between two.
+        # One row after the last gap, before the first, or between two.
         ([(8.99, 19.97)], [0.0]),
         ([(0.0, 9.0)], [9.0]),
         ([(5.0, 10.0), (10.0, 15.0)], [0.0, 15.0]),

@@ -1,4 +1,4 @@
-"""What the record of an input says of the time between its samples."""
+"""Behaviour of inputs between samples, decided from records."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def with_pauses():
 
 
 def pilot(dt=DT, n=N):
-    """Smooth: random accelerations through two lags of 0.15 s."""
+    """Return a smooth stick: random accelerations through two lags of 0.15 s."""
     r, x, v, u = rng(), 0.0, 0.0, []
     for _ in range(n):
         v += dt * ((2 * r.standard_normal() / np.sqrt(dt) - x) / 0.0225 - 2 * v / 0.15)
@@ -40,7 +40,7 @@ def pilot(dt=DT, n=N):
 
 
 def doublets(ramp):
-    """A stick that takes `ramp` samples from stop to stop, not in step with the clock."""
+    """Return a stick with ramps of `ramp` samples, not synchronous with the clock."""
     corners, values = [0.0], [0.0]
     for start in np.arange(2.0037, T[-1] - 4, 3.0111):
         for level in (1.0, -1.0, 0.0):
@@ -51,13 +51,13 @@ def doublets(ramp):
 
 
 def multistep(unit):
-    """3-2-1-1 with pauses: three values."""
+    """Return a 3-2-1-1 with pauses: three values."""
     pattern = [1] * 3 + [-1] * 2 + [1] + [-1] + [0] * 8
     return np.resize(np.repeat(np.array(pattern, float), unit), N)
 
 
 def counts(u, per_unit=400, centre=1500):
-    """As pulse widths of whole microseconds."""
+    """Return the stick as pulse widths of whole microseconds."""
     return np.round(centre + per_unit * u)
 
 
@@ -84,7 +84,7 @@ STEPS = {
 
 
 def card(dt=DT, n=N):
-    """Doublets of the stick, then a chirp of it, in one record."""
+    """Return doublets of the stick followed by a chirp, in one record."""
     u, t = np.zeros(n), dt * np.arange(n)
     for k, (width, size) in enumerate([(0.4, 3.0), (0.3, -4.0), (0.6, 3.0), (0.24, 5.0)]):
         first, length = round((1.0 + 3.0 * k) / dt), round(width / dt)
@@ -140,7 +140,7 @@ def test_both_in_one_record(name):
 
 
 def test_the_jumps_of_a_test_card():
-    """The edges of the doublets and no sample of the chirp."""
+    """Test that the edges of the doublets are jumps, and no sample of the chirp."""
     at = np.flatnonzero(jumps(card()))
     edges = np.flatnonzero(np.diff(card()))
     np.testing.assert_array_equal(at, edges[edges < 690])

@@ -1,4 +1,4 @@
-"""Tables whose rows hold one topic each: every column at its own rows' times."""
+"""Tables whose rows contain one topic each: every column has its own rows' times."""
 
 import numpy as np
 import pandas as pd
@@ -33,8 +33,10 @@ def topic(step, start, jitter=0.0, **columns):
 
 @pytest.fixture(params=[0.0, 0.2])
 def path(request, tmp_path):
-    """An outer merge by pandas of a gyro at 400 Hz, sticks at 50 Hz and a GPS at 5 Hz, some of
-    whose stamps coincide."""
+    """Return pandas' outer merge of a gyro at 400 Hz, sticks at 50 Hz and a GPS at 5 Hz.
+
+    Some of the stamps coincide.
+    """
     fast = topic(1 / 400, 0.0, request.param, p=gyro, q=np.cos)
     merged = fast.join(topic(0.02, 0.0, lat=stick), how="outer")
     merged = merged.join(topic(0.2, 0.0031, v=speed), how="outer")
@@ -104,7 +106,7 @@ def test_a_stick_that_lacks_a_sample_here_and_there_is_refused_as_before(tmp_pat
 
 
 def filled(path, lat):
-    """A table in which every cell has the last value, but where there is none yet."""
+    """Return a table in which every cell has the last value, if there is one."""
     rows = pd.DataFrame({"t": 0.01 * np.arange(200), "lat": lat, "p": np.arange(200.0)})
     rows.to_csv(path, index=False)
     return path

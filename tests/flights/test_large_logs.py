@@ -1,4 +1,4 @@
-"""What large files need: a fingerprint beside the reading, a bar, and no memory that is claimed."""
+"""Large files: a parallel hash, a progress bar, and no memory for false claims."""
 
 import gzip
 import hashlib
@@ -53,7 +53,7 @@ def test_columns_of_parquet_in_pieces_are_whole(tmp_path, monkeypatch, kind):
 
 
 def compressed(size, content):
-    """A MATLAB file with one compressed piece that claims `size` bytes."""
+    """Return a MATLAB file with one compressed element that claims `size` bytes."""
     whole = io.BytesIO()
     scipy.io.savemat(whole, {"t": np.arange(3.0)}, do_compression=True)
     piece = zlib.compress(struct.pack("<2I", 14, size) + content)
@@ -69,7 +69,7 @@ def test_arrays_are_refused_before_they_are_unpacked(tmp_path, size):
 
 
 ZEROS = np.zeros(40_000_000, np.int8)
-"""which are 320 MB of float64, and 40 kB of a file"""
+"""Elements: 320 MB of float64, 40 kB in the file."""
 
 
 def many_keys(path):

@@ -1,4 +1,4 @@
-"""`heli-jax new` of autopilots' logs: what the settings say of filters, and the grid's rate."""
+"""`heli-jax new` for autopilot logs: filters from their settings, and the grid's rate."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ RATE = 0.3 * np.sin(np.arange(800) / 60) + 0.01 * np.random.default_rng(1).norma
 
 
 def px4_log(path, settings):
-    """A gyro at 100 Hz, stick and attitude at 50 Hz."""
+    """Write a gyro at 100 Hz, stick and attitude at 50 Hz."""
     rate = [(t, t, p, 0, 0) for t, p in zip(US, RATE, strict=True)]
     stick = [(t, t, u, 0, 0) for t, u in zip(US, STICK, strict=True)]
     topics = [
@@ -45,7 +45,7 @@ def ardupilot_log(path, settings):
 
 
 def cautions(tmp_path, log, model=None):
-    """The configuration, and the codes of what a fit has to say of its flight."""
+    """Return the configuration, and the codes of a fit's findings on its flight."""
     out = tmp_path / "new.yaml"
     write_config(log, out, model)
     (flight,) = read_flights(load(out))

@@ -1,4 +1,4 @@
-"""Logs as users of Python and of web tools store them, and files that are refused in words."""
+"""Logs of Python users and web tools, and files that are refused."""
 
 import io
 import json
@@ -139,12 +139,12 @@ def archive(name: str) -> bytes:
         ("a.csv", b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n"),
         ("a.h5", b"/annex/objects/SHA256E-s1--0.h5\n"),
         ("a.xyz", b"t,p\n"),
-        # Only their names make them logs.
+        # Only their names identify them as logs.
         *(
             (f"a{end}", b"ULog")
             for end in (".ulg", ".bin", ".log", ".bbl", ".mat", ".nc", ".h5", "")
         ),
-        # Runs with lists of samples each.
+        # Runs, each with lists of samples.
         ("a.json", json.dumps([{"u": [0.1] * 20, "y": [0.2] * 20}] * 3).encode()),
     ],
 )

@@ -1,4 +1,4 @@
-"""Outputs with uneven stamps on a grid of their own rate: noise stays white, the motion its own."""
+"""Outputs with uneven stamps on a grid of their own rate: noise and motion are unchanged."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def test_noise_stays_white_and_motion_is_in_time(jitter, phase):
     at = stamps(jitter, phase)
     noise = np.random.default_rng(5).standard_normal(at.size)
     made = at_own_rate(Timed(at, noise), TIMES)[5:-5]
-    # A straight line has up to +0.5.
+    # Linear interpolation gives up to +0.5.
     for lag in (1, 2, 3):
         r, own = (float(np.mean(x[lag:] * x[:-lag]) / np.var(x)) for x in (made, noise[5:-5]))
         assert abs(r - own) < 0.06, lag

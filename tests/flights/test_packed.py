@@ -1,4 +1,4 @@
-"""Packed numbers of NetCDF and HDF5, beside what xarray makes of them and the conventions' text."""
+"""Packed numbers of NetCDF and HDF5, against xarray and the text of the conventions."""
 
 from pathlib import Path
 
@@ -30,7 +30,7 @@ PACKED = {
 
 
 def written(path: Path, sets=PACKED) -> Path:
-    """The stored numbers and attributes as they are, in NetCDF 3 or HDF5."""
+    """Write stored numbers and attributes unchanged, in NetCDF 3 or HDF5."""
     if path.name.endswith("3.nc"):
         raw = {n: ("time", x, attributes) for n, (x, attributes) in sets.items()}
         xarray.Dataset(raw).to_netcdf(path, engine="scipy")
@@ -56,7 +56,7 @@ def test_all_files_are_unpacked_as_xarray_does(tmp_path, name):
     assert (units["roll"], units["p"]) == ("degrees", "rad/s")
     said = {n.code: n for n in info.notes}
     assert "p" in said["samples.marks"].subjects
-    # In radians at last, as a fit reads it; and as `new` guesses and `convert` writes it.
+    # In radians for a fit; and as guessed by `new` and written by `convert`.
     signals = {"inputs": {}, "outputs": {"phi": Signal("roll", "deg", "rad")}}
     flight = read_flight(path, time="time", **signals)
     np.testing.assert_allclose(flight.outputs["phi"], 0.3 * np.sin(T), atol=1e-4)
@@ -69,7 +69,7 @@ def test_all_files_are_unpacked_as_xarray_does(tmp_path, name):
 def test_marks_of_all_kinds_and_unsigned_numbers():
     several, _ = unpack(np.int16([1, -1, -9, 4]), {"missing_value": np.int16([-1, -9])})
     np.testing.assert_array_equal(several, [1, np.nan, np.nan, 4])
-    # A mark that is no number of the type is none of its values; a NaN needs no mark.
+    # A mark outside the type's range never occurs; NaN needs no mark.
     assert unpack(np.int8([0, 1]), {"_FillValue": np.nan, "missing_value": 300.5})[1] == 0
     assert unpack(np.float64([0, np.nan]), {"_FillValue": np.nan})[1] == 0
     assert unpack(np.int16([0, 1]), {"missing_value": "none"})[1] == 0
@@ -90,7 +90,7 @@ def test_a_scale_that_is_none_leaves_its_data_set_out(tmp_path):
 def test_the_attribute_of_a_unit(tmp_path):
     clock = (np.arange(N) * 20_000, {"Units": np.bytes_("us")})
     name = np.bytes_("This is a netCDF dimension but not a netCDF variable.        50")
-    # And a dimension of NetCDF 4 without values, which is no channel.
+    # Also a dimension of NetCDF 4 without values, which is not a channel.
     sets = {"clock": clock, "phi": (T, {"unit": "deg"}), "x": (np.zeros(N), {"NAME": name})}
     info = describe_log(written(tmp_path / "flight.h5", sets))
     assert info.time is not None
@@ -107,7 +107,7 @@ def test_tables_of_named_fields_in_hdf5(tmp_path):
     with h5py.File(path, "w") as file:
         file["run/log"] = rows
         file["run/log"].attrs["units"] = ["s", "deg", "rad/s", ""]
-        file["run/log"].attrs["scale_factor"] = 7.0  # of which field nobody knows
+        file["run/log"].attrs["scale_factor"] = 7.0  # of an unknown field
     table = open_log(path)
     assert table.names == ("run/log/t", "run/log/phi", *(f"run/log/gyro[{i}]" for i in range(3)))
     assert table.units["run/log/gyro[1]"] == "rad/s"

@@ -1,4 +1,4 @@
-"""Presets: what they say fits together, and configurations with one read and fit a log."""
+"""Presets: consistency, and configurations that read and fit a log with one."""
 
 from pathlib import Path
 
@@ -42,7 +42,7 @@ def test_a_preset_is_consistent(name):
             units.factor(a.unit, meanings()[signal].unit)
             assert sources(a.channel, ())
             assert a.source
-            assert a.scale > 0  # a sign is said by `invert`
+            assert a.scale > 0  # `invert` states the sign
     assert not set(table.missing) & set(table.signals)
     assert set(table.missing) <= set(meanings())
     commands = {s.command for s in model_inputs().values()}
@@ -67,7 +67,7 @@ STEPS = [(3, 1), (2, -1), (1, 1), (1, -1), (4, 0)]
 
 
 def flown():
-    """13 s of roll at 100 Hz by SciPy's own discretisation: stick, roll rate, roll angle."""
+    """Return 13 s of roll at 100 Hz by SciPy's discretisation: stick, roll rate, roll angle."""
     stick = (
         np.repeat([0.0, *[s for n, s in STEPS for _ in range(n)]] * 5, 27)[:1300] * 0.2 / 0.75**0.5
     )
@@ -92,13 +92,13 @@ def px4_log(path, **topics):
     us = [20_000_000 + 10_000 * k for k in range(1300)]
     half = np.cos(PHI / 2), np.sin(PHI / 2)
     rows = {
-        # Published 3 ms after it was measured.
+        # Published 3 ms after the measurement.
         "vehicle_angular_velocity": (VECTOR, [(t + 3000, t, P[k], 0, 0) for k, t in enumerate(us)]),
         "vehicle_attitude": (
             QUATERNION,
             [(t, c, s, 0, 0) for t, c, s in zip(us, *half, strict=True)],
         ),
-        # Of the gyro's sample that it answers, 2 ms before it acts.
+        # The stamp of the gyro sample that it uses, 2 ms before it acts.
         "actuator_controls_0": (
             CONTROL,
             [(t, t - 2000, STICK[k], 0, 0, 0.5) for k, t in enumerate(us)],
@@ -148,7 +148,7 @@ def test_a_command_acts_when_it_is_published_and_a_rate_was_so_when_it_was_measu
 
 
 def read(tmp_path, log, signals, **changes):
-    """The flight of a configuration for the given log and section `signals`."""
+    """Return the flight of a configuration with a log and a section `signals`."""
     content = {"model": {"linear": "roll-flybarless"}}
     content |= {k: v for k, v in changes.items() if k in ("model", "onboard", "vehicle")}
     flight = {k: v for k, v in changes.items() if k not in content}
@@ -209,7 +209,7 @@ def test_alternatives_instances_and_what_was_left_out(tmp_path):
     assert list(flight.outputs) == ["p"]
     (note,) = (n for n in flight.source.notes if n.code == "channels.lacking")
     assert "phi" in note.subjects
-    # The newer topic goes before the older one; of two instances the first is taken.
+    # The newer topic has precedence, and the first of two instances is used.
     us = [20_000_000 + 10_000 * k for k in range(1300)]
     torque = [(t, t, 0.5 * STICK[k], 0, 0) for k, t in enumerate(us)]
     made = [("vehicle_torque_setpoint", i, VECTOR, torque) for i in (0, 1)]
@@ -281,7 +281,7 @@ def test_a_table_with_the_channels_names_will_do(tmp_path):
 @pytest.mark.skipif(not ULOG.exists(), reason=ABSENT)
 def test_the_real_ulog_by_its_preset(tmp_path):
     (flight,) = [read(tmp_path, ULOG, {"preset": "px4-helicopter"}, window=[1, 6])]
-    # The mean turn of the attitude is the mean rate that the gyro shows.
+    # The attitude's mean rate equals the gyro's.
     turn = flight.outputs["phi"][-1] - flight.outputs["phi"][0]
     assert turn == pytest.approx(np.trapezoid(flight.outputs["p"], dx=flight.dt), abs=0.1)
     model = {"linear": "hybrid-flybarless"}
@@ -314,7 +314,7 @@ def test_the_real_blackbox_by_its_preset(tmp_path):
     pitch = read(
         tmp_path, BLACKBOX, {"preset": "rotorflight"}, model={"linear": "pitch-flybarless"}
     )
-    # Gyro and attitude agree in sign and size, as flown: nose up in both.
+    # Gyro and attitude agree in sign and size as flown: nose up in both.
     turn = np.cumsum(pitch.outputs["q"]) * pitch.dt
     slope = np.polyfit(turn, pitch.outputs["theta"], 1)[0]
     assert slope == pytest.approx(1.0, abs=0.25)

@@ -1,4 +1,4 @@
-"""Everything that can be wrong with a log or a request ends in one sentence that says where."""
+"""Faults of a log or a request end in one sentence with the place."""
 
 import math
 import os
@@ -38,7 +38,7 @@ def csv_text(cells: list[list[str]], header: str = "t,stick,phi") -> str:
 
 
 def refused(path: Path, *places: str, **request) -> str:
-    """Read, and check that the one sentence names the file and the places."""
+    """Read, and check that the sentence has the file and the places."""
     asked = {"time": "t", "inputs": {"x_roll": STICK}, "outputs": {"roll": PHI}} | request
     with pytest.raises(InputError) as caught:
         read_flight(path, **asked)

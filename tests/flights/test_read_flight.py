@@ -1,4 +1,4 @@
-"""What is written to a log comes back: values, units, window, Parquet."""
+"""Values written to a log are read back: units, window, Parquet."""
 
 from pathlib import Path
 
@@ -111,7 +111,7 @@ def test_what_is_wrong_outside_the_window_is_no_matter(tmp_path):
     assert read_flight(path, **ASKED, window=(0.02, 1.0)).n_samples == 11
 
 
-# Single numbers beyond 1e9 among small ones stand for none: test_as_logged.py.
+# Single numbers above 1e9 among small ones mean no value: test_as_logged.py.
 NUMBERS = st.floats(-1e8, 1e8, allow_subnormal=False)
 
 
@@ -180,7 +180,7 @@ def test_no_bytes_break_the_reader(tmp_path_factory, data, ending):
 @settings(max_examples=60, deadline=None)
 @given(place=st.floats(0, 1, exclude_max=True), byte=st.integers(0, 255))
 @example(0.55078125, 128)  # in the name of a column
-@example(569 / 1266, 182)  # pyarrow ends the process where the metadata of this column are asked
+@example(569 / 1266, 182)  # pyarrow ends the process when it reads this column's metadata
 def test_no_damaged_parquet_breaks_the_reader(tmp_path_factory, place, byte):
     path = tmp_path_factory.getbasetemp() / "damaged.parquet"
     pq.write_table(pa.table({"t": T, "stick": STICK, "phi": PHI}), path)
@@ -201,10 +201,10 @@ def test_missing_outputs_are_read_and_told(tmp_path):
     assert flight.source is not None
     said = [(n.code, n.subjects, n.value) for n in flight.source.notes]
     assert said == [("samples.missing", ("roll",), 2)]
-    # On another clock what lies beside a missing sample is missing too, the rest stays.
+    # On another clock neighbours of a missing sample are missing too; the rest is unchanged.
     near = read_flight(path, **ASKED, rate=60).outputs["roll"]
     assert np.array_equal(np.flatnonzero(np.isnan(near)), [3, 4, 8, 9])
-    # To a much higher rate nothing is invented.
+    # Resampling to a much higher rate adds no outputs.
     fast = read_flight(path, **ASKED, rate=100).outputs["roll"]
     assert np.array_equal(np.flatnonzero(~np.isnan(fast)), [0, 2, 4, 8, 10, 12, 16, 18, 20, 22])
     np.testing.assert_allclose(fast[[0, 4, 8, 22]], PHI[[0, 2, 4, 11]], rtol=1e-12)
@@ -249,7 +249,7 @@ def test_resampling_goes_by_the_hold_of_the_raw_record(tmp_path):
 
 
 def test_only_the_window_decides(tmp_path):
-    """Beside the window the stick may do what it likes."""
+    """Test that the stick outside the window has no effect."""
     flight = two_sticks(tmp_path, window=(0.0, 0.17))
     assert flight.hold_reason["a"] == "never moves"
 

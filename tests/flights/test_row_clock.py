@@ -1,4 +1,4 @@
-"""Logs without times: the rate at which their rows were sampled is stated."""
+"""Logs without times, with a stated sample rate of the rows."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Several runs in one table become flights of their own."""
+"""Several runs in one table become separate flights."""
 
 from pathlib import Path
 
@@ -51,7 +51,7 @@ def test_a_column_numbers_runs_of_a_time_that_goes_on(tmp_path: Path) -> None:
     info = describe_log(path)
     assert info.time is not None
     assert info.time.runs == 1
-    # Without it, what was never one flight is one.
+    # Without the split, several flights would become one.
     assert read_flight(path, time="t", **SIGNALS).n_samples == T.size
 
 
@@ -79,8 +79,8 @@ def test_what_is_no_new_run(tmp_path: Path) -> None:
     times = DT * np.arange(200)
     assert not restarts(times).size
     for change in (
-        lambda t: t[50:51].fill(0.1),  # one stamp that went back
-        lambda t: t[50:51].fill(5e9),  # one from which all others go back
+        lambda t: t[50:51].fill(0.1),  # one stamp goes back
+        lambda t: t[50:51].fill(5e9),  # all stamps go back from one on
         lambda t: t[50:51].fill(-1e300),
         lambda t: t[100:].__isub__(0.5),  # a clock that was set back
         lambda t: t.__setitem__(slice(None), np.sin(9 * t)),

@@ -1,4 +1,4 @@
-"""Outputs that were sampled more slowly than the grid: missing between their samples."""
+"""Outputs slower than the grid: missing between their samples."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from heli_jax.numerics.white_noise import noise_guess
 from . import log_writers as writers
 
 N = 400
-"""samples at 100 Hz"""
+"""Samples at 100 Hz."""
 
 
 def motion(t):
@@ -20,7 +20,7 @@ def motion(t):
 
 
 def ulog_of_a_slow_sensor(tmp_path, stamps):
-    """Sticks and a gyro at 100 Hz from 0 s, positions at the `stamps` [s]."""
+    """Write sticks and a gyro at 100 Hz from 0 s, and positions at the `stamps` [s]."""
     fast = np.arange(N) / 100
     start = 10_000_000
     rows = [(start + round(1e6 * t), np.sin(t), np.cos(t)) for t in fast]
@@ -45,12 +45,12 @@ def test_a_slow_sensor_is_missing_between_its_samples(tmp_path):
     rng = np.random.default_rng(0)
     stamps = 0.15 + 0.2 * np.arange(19) + rng.uniform(-0.004, 0.004, 19)
     flight = read_flight(ulog_of_a_slow_sensor(tmp_path, stamps), **SIGNALS, rate=100.0)
-    # Its first sample comes late, which costs the others nothing.
+    # Its late first sample does not shorten the others.
     assert flight.n_samples == N
     at = np.rint(100 * stamps).astype(int)
     assert np.array_equal(np.flatnonzero(np.isfinite(flight.outputs["x"])), at)
     assert np.isfinite(flight.outputs["p"]).all()
-    # Half of what not moving it would do wrong is left at most.
+    # At most half of the error without moving it remains.
     error = np.abs(flight.outputs["x"][at] - motion(at / 100))
     still = np.abs(motion(stamps) - motion(at / 100))
     assert error.max() < 0.25 * still.max()
@@ -68,7 +68,7 @@ def test_an_output_near_the_rate_is_resampled_as_before(tmp_path):
 def test_two_samples_never_share_an_instant():
     seconds = np.array([0.0, 0.041, 0.043, 0.08, 0.12, 0.161])
     placed = at_nearest(Timed(seconds, 3.0 * seconds), np.arange(9) * 0.02)
-    # A straight line is moved along itself.
+    # A straight line stays on itself.
     np.testing.assert_allclose(placed[[0, 2, 4, 6, 8]], [0, 0.12, 0.24, 0.36, 0.48])
     assert np.isnan(placed[[1, 3, 5, 7]]).all()
 
@@ -83,7 +83,7 @@ def test_the_noise_of_a_moved_sample_stays_its_own():
 
 
 def table(tmp_path, x, **options):
-    """A flight of a table of 100 Hz with a stick, a fast output and `x`."""
+    """Return a flight of a 100 Hz table with a stick, a fast output and `x`."""
     t = np.arange(len(x)) / 100
     cells = ["" if np.isnan(v) else repr(float(v)) for v in x]
     rows = [
@@ -102,12 +102,12 @@ def test_a_column_filled_in_every_twentieth_row(tmp_path):
     t = np.arange(N) / 100
     x = np.where(np.arange(N) % 20 == 3, motion(t), np.nan)
     np.testing.assert_array_equal(table(tmp_path, x).outputs["x"], x)
-    # At half the rate its samples stand at other instants, and there are as many.
+    # At half the rate its samples are at other instants; their number is the same.
     half = table(tmp_path, x, rate=50.0)
     assert np.isfinite(half.outputs["x"]).sum() == 20
     seen = np.isfinite(half.outputs["x"])
     np.testing.assert_allclose(half.outputs["x"][seen], motion(half.times[seen]), atol=2e-3)
-    # At its own rate it is whole.
+    # At its own rate no sample is missing.
     own = table(tmp_path, x, rate=5.0).outputs["x"]
     assert np.isfinite(own[1:-1]).all()
 
@@ -130,7 +130,7 @@ def test_what_is_not_unmistakable_is_kept(tmp_path):
     assert usual_run(np.round(20.0 * motion(t))) is None
     assert usual_run(motion(t)) is None
     assert usual_run(np.zeros(2000)) is None
-    # Few runs: stated by somebody who knows, it is taken.
+    # The runs are few, but a user's statement is accepted.
     x = motion(t[:200])[np.arange(200) // 20 * 20]
     assert np.isfinite(table(tmp_path, x).outputs["x"]).all()
     assert np.isfinite(table(tmp_path, x, repeats="missing").outputs["x"]).sum() == 10
@@ -168,7 +168,7 @@ def test_stale_rows_of_a_noisy_output_are_missing():
         for k in range(first, first + int(rng.integers(1, 4))):
             written[k], again[k] = written[k - 1], True
     np.testing.assert_array_equal(stale(written), again)
-    # Coarse steps, a smooth signal and a clipped one repeat values by themselves.
+    # Coarse steps, a smooth signal and a clipped one also repeat values.
     assert not stale(np.round(fresh, 1)).any()
     assert not stale(np.sin(2.0 * t)).any()
     assert not stale(np.clip(fresh, -0.8, 0.8)).any()

@@ -1,4 +1,4 @@
-"""Runs in a stack, (segment, sample, channel), of files of arrays."""
+"""Stacked runs, (segment, sample, channel), in files of arrays."""
 
 from pathlib import Path
 
@@ -46,9 +46,9 @@ def flights(path: Path, u: str = "u", y: str = "x[1]", **options):
         (".npz", {"t": TIMES, "x": X, "u": U}),
         (".mat", {"t": TIMES, "x": X, "u": U}),
         (".h5", {"t": TIMES, "x": X, "u": U}),
-        # One clock for all.
+        # One clock for all runs.
         (".npz", {"t": T, "x": X, "u": U}),
-        # A channel by itself is a matrix.
+        # A single channel is a matrix.
         (".npz", {"t": TIMES, "x": X, "u": U[:, :, 0]}),
     ],
 )
@@ -72,7 +72,7 @@ def test_a_stack_without_times_needs_its_numbers(tmp_path: Path) -> None:
 
 
 def test_what_is_no_stack_is_named(tmp_path: Path) -> None:
-    # Images, a matrix of inertia, a rotation matrix a sample: beside signals of one run.
+    # Images, an inertia matrix and rotation matrices beside the signals of one run.
     others = {"img": np.ones((300, 8, 9)), "J": np.ones((3, 3, 3)), "R": np.ones((300, 3, 3))}
     path = written(tmp_path, ".npz", {"t": T, "p": X[0, :, 0], "deep": np.ones((2,) * 4), **others})
     assert open_table(path).names == ("t", "p")

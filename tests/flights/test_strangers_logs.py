@@ -1,4 +1,4 @@
-"""Logs in the shapes in which others publish them, each made by its test."""
+"""Logs in published layouts, each made by its test."""
 
 from pathlib import Path
 
@@ -9,8 +9,8 @@ from heli_jax.flights.open_log import open_log
 from heli_jax.new_config import guess
 
 RUNS = ((0, 1), (1, -1), (2, 2))
-# As planners and mavlogdump write it: ids of units as numbers, counts of instances, hundredths as
-# what they mean, and the last line of a log that was cut off.
+# As written by planners and mavlogdump: unit ids as numbers, instance counts, scaled hundredths,
+# and a truncated last line.
 FORMATS = """FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns
 FMT, 203, 76, UNIT, QbZ, TimeUS,Id,Label
 FMT, 202, 44, FMTU, QBNN, TimeUS,FmtType,UnitIds,MultIds
@@ -38,7 +38,7 @@ def test_a_text_of_dataflash_has_units_instances_and_a_torn_end(tmp_path: Path) 
     log = open_log(path)
     assert isinstance(log, ChannelLog)
     topics = {t.name: t for t in log.topics}
-    # A height that is stored in hundredths is in metres, a count of them in centimetres.
+    # A height stored in hundredths is in metres, a count of them in centimetres.
     assert topics["GPS"].units["GPS.Alt"] == "m"
     assert topics["GPS"].units["GPS.AltErr"] == "cm"
     for k in (0, 1):

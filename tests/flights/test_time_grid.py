@@ -1,4 +1,4 @@
-"""Which stamps pass for a uniform grid, and what resampling does with the others."""
+"""Stamps that count as a uniform grid, and resampling of the others."""
 
 from bisect import bisect_right
 
@@ -112,11 +112,11 @@ def test_rate_of_a_rounded_log_keeps_its_samples(tmp_path, rate):
 
 @pytest.mark.parametrize("part", [2, 3, 5])
 def test_a_slower_clock_takes_whole_samples(tmp_path, part):
-    # Slow enough that the low-pass filter of outputs leaves it alone.
+    # Slow enough to pass the low-pass filter of outputs unchanged.
     x = np.sin(2 * np.pi * 0.3 * np.arange(300) / 30)
     stamps = [f"{i / 30:.3f}" for i in range(300)]
     flight = read(tmp_path / "log.csv", stamps, x, rate=30.0 / part)
-    # A held input has the mean over each step; behind the last sample that stays.
+    # A held input has the mean over each step; after its last sample it is constant.
     means = np.r_[x, np.repeat(x[-1], part)][: part * flight.n_samples].reshape(-1, part).mean(1)
     np.testing.assert_allclose(flight.inputs["u"], means, rtol=0, atol=1e-9)
     assert np.allclose(flight.outputs["y"][3:-3], x[::part][3:-3], atol=2e-3)
@@ -175,7 +175,7 @@ def test_a_held_input_on_its_own_grid_stays_to_the_last_bit():
     values = np.random.default_rng(3).normal(size=5000) * 1e300
     seconds = 1.7e9 + np.arange(5000) / 100
     assert np.array_equal(held_mean(seconds, values, seconds[0] + np.arange(5000) * 0.01), values)
-    # Ten samples a step of the grid, all of one value.
+    # Ten samples per step of the grid, all with one value.
     held = np.repeat(values[:500], 10)
     assert np.array_equal(held_mean(seconds, held, seconds[::10]), values[:500])
 
@@ -191,14 +191,17 @@ def test_a_flight_at_a_lower_rate_keeps_the_impulse_of_its_stick(tmp_path):
         inputs={"x_roll": Signal("stick", "m", "m", hold="zero-order")},
         outputs={"roll": Signal("phi", "rad", "rad")},
     )
-    # The step at 0.53 s leaves 0.02 s of the step of the grid from 0.5 s.
+    # After the step at 0.53 s, 0.02 s of the grid's step from 0.5 s remain.
     expected = [0.0] * 10 + [0.4] + [1.0] * 9
     assert flight.inputs["x_roll"] == pytest.approx(expected, abs=1e-9)
 
 
 def _heave(tmp_path, fine, rate, follows):
-    """Stick, acceleration and vertical rate of a heaving rotor with inflow at `rate` [Hz], from a
-    log of `fine` [Hz] whose stick jumps; and what the same machine does with that stick."""
+    """Return a flight of a heaving rotor with inflow, and its response to the logged stick.
+
+    The flight is at `rate` [Hz], from a log of `fine` [Hz] whose stick jumps. Outputs are
+    acceleration and vertical rate.
+    """
     A, B = np.array([[-0.55, 6.0], [0.0, -1 / 0.11]]), np.array([[-28.0], [1.26 / 0.11]])
     # The acceleration, and its integral.
     C, D = np.array([[-0.55, 6.0], [1.0, 0.0]]), np.array([[-28.0], [0.0]])
@@ -223,7 +226,7 @@ def _heave(tmp_path, fine, rate, follows):
         follows=follows,
     )
     kind = "zoh" if flight.hold["col"] == "zero-order" else "foh"
-    # scipy's triangle hold changes the state; its output is what counts.
+    # scipy's triangle hold changes the state; only its output is valid.
     made = dlsim(cont2discrete((A, B, C, D), 1 / rate, kind), flight.inputs["col"])[1].T
     inside = slice(2 * rate, -2 * rate)
     error = {
@@ -237,7 +240,7 @@ def _heave(tmp_path, fine, rate, follows):
 def test_an_acceleration_and_its_stick_are_filtered_alike(tmp_path, fine, rate):
     flight, error = _heave(tmp_path, fine, rate, {("col", "az"): True})
     assert error["az"] < 0.008
-    # The integral is what it was with the mean of each step, and no worse.
+    # The integral equals that with the mean of each step.
     assert error["w"] < 0.004
     assert flight.hold == {"col": "linear"}
     assert is_low_passed(flight, "col")

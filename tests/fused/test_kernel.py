@@ -1,4 +1,4 @@
-"""What is translated against JAX itself, operation by operation and in random expressions."""
+"""Translated programs against JAX, by operations and by random expressions."""
 
 import os
 
@@ -17,11 +17,11 @@ RECORD = np.array([0.3, -0.7, 1.1, 0.2, -0.4])
 
 
 def compiled(step, stays, carry, dtype=np.float64, vehicles=LANES, threads=1):
-    """The carry after N samples: by the program, and by JAX vehicle by vehicle.
+    """Return the carry after N samples, by the program and by JAX for each vehicle.
 
     Args:
-        step: of (what stays, the record, carry, sample).
-        stays: an array with the vehicles last, or a number for all.
+        step: function of (constants, record, carry, sample).
+        stays: constants: an array with the vehicles last, or a number for all.
         carry: an array (vehicles,).
     """
     stays = [np.asarray(v, dtype) for v in stays]
@@ -45,7 +45,7 @@ def compiled(step, stays, carry, dtype=np.float64, vehicles=LANES, threads=1):
 
 
 def by_jax(step, stays, carry, vehicles=LANES):
-    """The same without a program of ours; arguments as `compiled` has them."""
+    """Return the same by JAX alone; arguments as in `compiled`."""
 
     def alone(i):
         own = [jnp.asarray(v[..., i] if np.ndim(v) else v, carry.dtype) for v in stays]
@@ -91,7 +91,7 @@ UNARY = {
     "atan2": lambda x: jnp.arctan2(x, x - 0.5),
     "minimum": lambda x: jnp.minimum(x, 0.3) + jnp.maximum(x, -0.2),
 }
-# Several in a program, which takes as long to compile as one.
+# A program of several compiles as fast as one of one.
 GROUPS = {
     "slopes": lambda x: sum(
         jax.grad(f)(x)
@@ -196,7 +196,7 @@ LOOKUPS = {
 
 
 def _several(names, count=4):
-    """A few of them in a program, which takes as long to compile as one."""
+    """Return a program of a few, which compiles as fast as one of one."""
     return [tuple(names)[i::count] for i in range(count)]
 
 
@@ -222,23 +222,23 @@ def test_axes_of_length_one_are_repeated():
     def step(stays, u, x, k):
         pair = jnp.stack([x, stays[0]])
         arrays = [f(pair) if n != "outer" else f(pair, pair) for n, f in _PAIRS.items()]
-        # Of a record too, which is not taken apart.
+        # A record also, which is not split.
         late = (2.0 * u[:, None] + jnp.ones((1, 2)))[k]
         return 0.1 * jnp.tanh(sum(jnp.sum(a) for a in arrays)) + 0.1 * jnp.sum(late)
 
-    # As users have JAX; the tests' own setting refuses such sums.
+    # JAX's default setting; the tests' setting refuses such sums.
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
         agree(step)
 
 
-# Sweeps in single precision are compared in tests/sweeps/test_fused.py.
+# tests/sweeps/test_fused.py compares sweeps in single precision.
 @pytest.mark.slow
 def test_records_loops_and_small_arrays():
     def step(stays, u, x, k):
         a, b = stays
-        # Clipped, as the simulation reads its records; before the first the first.
+        # Clipped, as in the simulation; before the first sample the first applies.
         before = u[jnp.clip(k - 1, 0, N - 1)]
-        late = 2.0 * u + 1.0  # of a whole record: computed of the element that is read
+        late = 2.0 * u + 1.0  # a function of a whole record is computed for the element read
         M = jnp.stack([jnp.stack([a, b]), jnp.stack([-b, x])])
         v = M @ jnp.stack([x, before])
         reach = jnp.asarray([0.0, 0.5, 0.5, 1.0], x.dtype)
@@ -265,7 +265,7 @@ def _drawn(s, u, x, k):
 
 
 def _called(s, u, x, k):
-    # Not called while it is translated, though all that it is given is known.
+    # Not called during translation, although all its arguments are known.
     return x + jax.pure_callback(_never, jax.ShapeDtypeStruct((), float), jnp.zeros(()))
 
 
@@ -314,7 +314,7 @@ _NEWER = {
 
 @st.composite
 def expressions(draw, depth=4):
-    """Functions of (a, b, u, x) that JAX can trace, of bounded size."""
+    """Return random functions of (a, b, u, x), traceable by JAX, of bounded size."""
     if depth == 0 or (draw(st.booleans()) and depth < 3):
         pick = draw(st.integers(0, 4))
         number = draw(st.floats(-2, 2, allow_nan=False, width=32))
@@ -339,7 +339,7 @@ def expressions(draw, depth=4):
 @given(expressions())
 def test_a_random_expression(expression):
     def once(stays, u, x):
-        # The derivative is computed in the same way; bounded, since both may be large.
+        # The derivative is computed in the same way; it is bounded, since both may be large.
         def value(x):
             return expression(stays[0], stays[1], u, x)
 
@@ -352,7 +352,7 @@ def test_a_random_expression(expression):
         lambda stays, u, x, k: jnp.where(k == 0, once(stays, u[k], x), x), [gain, 0.7], carry
     )
 
-    # As near as what one digit of what is given, the last one, makes of the result.
+    # The tolerance is the effect of one unit in the last digit of the arguments.
     def at(gain, carry):
         return np.asarray(jax.vmap(lambda a, x: once([a, 0.7], RECORD[0], x))(gain, carry))
 

@@ -1,4 +1,4 @@
-"""Records of the roll model from a program of its own: scipy and the coefficients of eq. 23."""
+"""Records of the roll model from an independent program: scipy and the coefficients of eq. 23."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from heli_jax import Flight, Helicopter
 
 
 def denominators(v: dict[str, float], stand: bool) -> tuple[np.ndarray, np.ndarray]:
-    """num and den of H(s), written from the paper's eq. 23 and the stand's two terms."""
+    """Return num and den of H(s), from the paper's eq. 23 and the stand's two terms."""
     q = v["rho"] * v["Omega"] ** 2 * v["a"] * v["c"]
     inertia = v["Ixx"] + v.get("Ixx_added", 0.0)
     k1 = q * (v["R2"] ** 4 - v["R1"] ** 4) / (8.0 * v["If"])
@@ -33,13 +33,13 @@ BENCH = {
 
 
 def response(v: dict[str, float], u: np.ndarray, dt: float, stand: bool) -> np.ndarray:
-    """Roll angle (N,) for a held input (N,), from rest."""
+    """Return the roll angle (N,) for a held input (N,), from rest."""
     b, a, _ = scipy.signal.cont2discrete(denominators(v, stand), dt)
     return scipy.signal.lfilter(np.ravel(b), a, u)
 
 
 def steps(rng: np.random.Generator, n: int, dt: float, amplitude: float) -> np.ndarray:
-    """Random steps of 0.2 to 1.5 s."""
+    """Return random steps of 0.2 to 1.5 s."""
     u = np.empty(n)
     k = 0
     while k < n:
@@ -50,7 +50,7 @@ def steps(rng: np.random.Generator, n: int, dt: float, amplitude: float) -> np.n
 
 
 def amplitude_for(v: dict[str, float], dt: float, stand: bool, rms: float = 0.17) -> float:
-    """The stick that moves the machine by a given rms in a fixed record."""
+    """Return the stick that gives the vehicle a certain rms in a fixed record."""
     u = steps(np.random.default_rng(1), 4000, dt, 1.0)
     return rms / float(np.std(response(v, u, dt, stand)))
 
@@ -66,7 +66,7 @@ def record(
     amplitude: float | None = None,
     **more: Any,
 ) -> Flight:
-    """A roll run with white measurement noise."""
+    """Return a roll run with white measurement noise."""
     rng = np.random.default_rng(seed)
     amplitude = amplitude_for(v, dt, stand) if amplitude is None else amplitude
     u = steps(rng, n, dt, amplitude)
@@ -75,7 +75,7 @@ def record(
 
 
 def stable_geometry(seed: int) -> dict[str, float]:
-    """Constants scattered about the bench machine's, stable and not too slow or fast."""
+    """Return constants scattered about the bench vehicle's, stable and not too slow or fast."""
     rng = np.random.default_rng(seed)
     while True:
         v = {k: x * float(np.exp(0.15 * rng.standard_normal())) for k, x in BENCH.items()}

@@ -1,4 +1,4 @@
-"""The smallest machine, p' = Lp p + Ld d: as a model, and its response by SciPy."""
+"""The simplest vehicle, p' = Lp p + Ld d: as a model, and its response by SciPy."""
 
 from typing import Annotated, NamedTuple
 
@@ -31,6 +31,6 @@ LAG = Model(
 
 
 def response(Lp: float, Ld: float, d: np.ndarray, dt: float) -> np.ndarray:
-    """p (N,) from rest, the input held."""
+    """Return p (N,) from rest, with a held input."""
     b, a, _ = scipy.signal.cont2discrete(([Ld], [1.0, -Lp]), dt)
     return np.asarray(scipy.signal.lfilter(np.ravel(b), a, d))

@@ -1,4 +1,4 @@
-"""A problem at its start values, as `check` has it."""
+"""A problem at its start values, as in `check`."""
 
 from heli_jax.identification.search import first_guess
 from heli_jax.identification.unknowns.layout import Solution

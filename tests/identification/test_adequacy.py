@@ -1,4 +1,4 @@
-"""Is a model adequate: white residuals are, drifts and wrong signs are not."""
+"""Adequacy of models: white residuals are adequate, drifts and wrong signs are not."""
 
 from types import SimpleNamespace
 
@@ -43,7 +43,7 @@ def judged(measured, simulated, *, against=None, ahead=None):
 
 
 class Judged:
-    """A fit, as far as adequacy is asked."""
+    """Return a fit with the fields that adequacy needs."""
 
     fitted, free = True, ("Lp",)
 
@@ -81,7 +81,7 @@ def test_a_good_fit_with_coloured_residuals_is_adequate():
     ("measured", "simulated"),
     [
         (P + 2.0 * P.std() * SLOW, P),  # drifts
-        (-P + 0.01 * WHITE, P),  # of the other sign
+        (-P + 0.01 * WHITE, P),  # opposite sign
         (-P + 0.01 * WHITE, 0.001 * P),  # and the fit has shrunk
         (np.concatenate([np.zeros(8), P[:-8]]) + 0.3 * SLOW, 0.4 * P),  # late
         (P + 0.01 * WHITE, P + 1e-2 * np.exp(0.03 * np.arange(N))),  # diverges
@@ -97,12 +97,12 @@ def test_with_a_disturbance_the_simulation_is_held_against_what_it_makes():
     assert denied(small)
     assert small.adequacy.judged[0].against_disturbance == 30.0
     assert not denied(as_expected)
-    # Innovations that are far from white: the filter does not predict what it says.
+    # Innovations are far from white: the filter's predictions are wrong.
     assert judged(P + 3.0 * P.std() * SLOW, P, against=1.2).adequacy.denied
 
 
 def test_filter_error_that_simulates_worse_than_the_mean_is_adequate_by_what_gusts_make():
-    # A simulation that has nothing of the measured output in it, with a difference that is white.
+    # A simulation without any of the measured output, with a white difference.
     other = np.random.default_rng(9).standard_normal(N)
     found = judged(WHITE, 0.9 * other, against=1.2)
     assert not denied(found)
@@ -137,16 +137,16 @@ def test_a_misfit_takes_away_the_intervals_that_it_moves_by_more_than_half():
     large = Finding("x.large", "note", "", shifts={"a": -1.97, "b": 0.1}, brief="why")
     assert distrusted([small], estimates) == {}
     assert distrusted([small, large], estimates) == {"a": Distrust("x.large", -1.97, "why")}
-    # It takes what it may move as far with it: one step is a size to first order.
+    # It moves correlated parameters too: one step is a size to first order.
     both = large._replace(shifts={"a": -1.97, "b": 1.0})
     assert distrusted([both], estimates)["b"] == Distrust("x.large", None, "why")
-    # By an amount that is not known.
+    # The amount is unknown.
     unsized = Finding("x.all", "doubt", "", distrusts=("b", "c"), brief="all")
     assert distrusted([unsized], estimates) == {"b": Distrust("x.all", None, "all")}
-    # A step of many times the estimate tells no size.
+    # A step of many times the estimate gives no size.
     absurd = large._replace(shifts={"a": -3e4})
     assert distrusted([absurd], estimates)["a"] == Distrust("x.large", None, "why")
-    # What takes none away is a note; what denies the model stays what it is.
+    # A finding without effect is a note; one that contradicts the model stays.
     denies = small._replace(denies=True)
     assert [f.severity for f in weighed([small, large, unsized, denies], estimates)] == [
         "note", "doubt", "doubt", "doubt",

@@ -1,5 +1,4 @@
-"""A mode past the Nyquist frequency: what moves it is not determined, and what does not is not
-blamed."""
+"""Modes above the Nyquist frequency: only the parameters that move them are not determined."""
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ from heli_jax import Flight, Free, Nuisance, Prior, Problem, fit
 from heli_jax.identification.validation.logging_rate import fast_modes
 from tests.identification.test_enough import DT, SWING, TRUTH, flight, steps
 
-# The mode of the truth, seen one turn of the sampling further on.
+# The true mode, shifted by the sampling frequency.
 FAST = 2.0 * np.pi / DT - np.sqrt(35.0)
 K = FAST**2 + 1.0
 ALIAS = {"k": K, "d": 2.0, "b": 20.0 * K / 36.0}
@@ -27,11 +26,11 @@ def test_only_what_moves_a_fast_mode_is_blamed_for_it():
     [mode] = fast_modes(problem(record, **every), ALIAS, SD)
     assert mode.frequency == pytest.approx(FAST)
     assert mode.undetermined == ("k",)
-    # A constant that is given, as a filter's, has no alias, whatever else is free.
+    # A fixed constant, such as a filter's, has no alias, whatever else is free.
     assert fast_modes(problem(record, b=every["b"]), ALIAS, SD) == []
     damping = fast_modes(problem(record, d=every["d"]), ALIAS, SD)
     assert [m.undetermined for m in damping] == [()]
-    # A prior tells the aliases apart, and a mode within the noise tells nothing.
+    # A prior separates the aliases, and a mode within the noise has no information.
     known = problem(record, k=Free(K, prior=Prior(K, 0.1 * K)), b=every["b"])
     assert fast_modes(known, ALIAS, SD)[0].undetermined == ()
     assert fast_modes(problem(record, **every), ALIAS, [{"phi": 1e3}])[0].undetermined == ()
@@ -60,7 +59,7 @@ def test_a_swing_far_past_the_samples_is_not_excused_for_being_over_within_one()
 
 
 def test_a_mode_near_nyquist_whose_alias_fits_as_well_is_not_determined():
-    # The truth swings at 1.15 times the Nyquist frequency; the samples show it at 0.85.
+    # The true mode is at 1.15 times the Nyquist frequency; samples show it at 0.85.
     k, seen = ((part * np.pi / DT) ** 2 + 1.0 for part in (1.15, 0.85))
     rng = np.random.default_rng(1)
     u = steps(rng, 1000)

@@ -1,4 +1,4 @@
-"""The paper's way on records that SciPy made: right without noise, and doubtful where it is."""
+"""The paper's method on SciPy's records: correct without noise, and doubtful with it."""
 
 import numpy as np
 import pytest
@@ -70,18 +70,18 @@ def test_with_noise_it_says_that_it_cannot_be_trusted():
         abs(found.combinations.get(n, np.nan) / truth - 1.0)
         for n, truth in (("a/Ixx", V["a"] / V["Ixx"]), ("a/If", V["a"] / V["If"]))
     ]
-    assert not np.all(np.array(wrong) < 0.05)  # and rightly so
+    assert not np.all(np.array(wrong) < 0.05)  # correctly
 
 
 def test_the_papers_rate_and_rotor_alias_and_it_says_so():
-    # 199 rad/s at 50 Hz: past Nyquist the flybar folds back, and k1, k2 with it.
+    # 199 rad/s at 50 Hz: above Nyquist the flybar's mode folds, and k1 and k2 with it.
     v = {**BENCH, "Omega": 199.0, "L4": 0.004}
     found = baseline(models.roll_on_stand, Helicopter(**v), record(v, 1e-3))
     assert not found.trusted
 
 
 def test_an_unstable_estimate_is_said():
-    # A free machine that drifts: y grows like an unstable pole.
+    # A drifting free vehicle: y grows like an unstable pole.
     n = 400
     rng = np.random.default_rng(3)
     u = rng.uniform(-1.0, 1.0, n)

@@ -1,4 +1,4 @@
-"""Intervals by the likelihood where the slopes at an optimum of chance say too much."""
+"""Likelihood intervals where slopes at a chance optimum overstate the information."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ DT = 0.02
 
 
 def simulated(u, Lb, tau_f, Blat, start=(0.0, 0.0)):
-    """Roll rate [rad/s] of flapping without a flybar, by matrix exponentials."""
+    """Return the roll rate [rad/s] of flapping without a flybar, by matrix exponentials."""
     A = np.array([[0.0, Lb, 0.0], [-1.0, -1.0 / tau_f, Blat / tau_f], [0.0, 0.0, 0.0]])
     E = scipy.linalg.expm(A * DT)
     x, p = np.array([*start, 0.0]), np.empty(len(u))
@@ -72,6 +72,6 @@ def test_a_wide_interval_ends_where_the_likelihood_of_all_together_has_fallen():
 
     sd = result.noise["flight 1/p"]
     best = misfit(at.value)
-    # 7.81: the 95 % point of chi-squared of the three that go together.
+    # 7.81: the 95 % point of chi-squared for the three joint parameters.
     for end in (at.lower95, at.upper95):
         assert 6.0 < misfit(end) - best < 10.5

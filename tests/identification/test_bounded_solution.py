@@ -1,4 +1,4 @@
-"""Machines that remember longer than a window, against NumPy."""
+"""Vehicles with memory longer than a window, against NumPy."""
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +38,7 @@ def test_every_run_of_a_machine_is_its_bounded_solution_and_what_the_ends_add():
 
 
 def test_a_state_that_no_output_shows_adds_nothing():
-    """Its effect is rounding; along that column something else would be taken off the errors."""
+    """Test a parameter whose effect is rounding: its column must remove nothing from the errors."""
     rng = np.random.default_rng(2)
     basis = rng.standard_normal((40, 3))
     basis[:, 1] = 1e-15 * rng.standard_normal(40)
@@ -50,7 +50,7 @@ def test_a_state_that_no_output_shows_adds_nothing():
 
 
 def test_slopes_of_the_bounded_solution_are_those_of_the_whole_expression():
-    """Though the inverse for each line has no derivative of its own."""
+    """Test derivatives, although the inverse for each line has none."""
     rng = np.random.default_rng(7)
     shapes = ((3, 3), (3, 2), (2, 3), (2, 2), (60, 2), (60, 2))
     here, along = ([jnp.asarray(rng.standard_normal(s)) for s in shapes] for _ in range(2))
@@ -82,5 +82,5 @@ def test_a_stick_is_no_instrument_of_itself():
         return Flight(dt=0.1, inputs={"lat": u}, outputs={"p": u}, instruments={"lat": by})
 
     assert own_instruments([flight(3.0 * u - 1.0)], ["lat"]) == ("lat",)
-    # A flight in open loop beside others is none.
+    # An open-loop flight beside others is not a loop.
     assert own_instruments([flight(u), flight(r)], ["lat"]) == ()

@@ -1,4 +1,4 @@
-"""The table of models prefers the one that made the record."""
+"""Model selection prefers the model that made the record."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ from tests.identification.test_noise_guesses import problem as swing
 
 @pytest.fixture(scope="module")
 def disturbed(bench30):
-    """A model, a vehicle and some record, which is not fitted."""
+    """Return a model, a vehicle and a record, without a fit."""
     model = with_disturbance(models.roll_on_stand, "roll")
     signal = steps(np.random.default_rng(0), 50, 0.02, 1e-6)
     flight = Flight(dt=0.02, inputs={"x_roll": signal}, outputs={"roll": signal})
@@ -59,12 +59,12 @@ def test_no_unknown_more_is_no_test():
 
 @pytest.mark.slow
 def test_a_model_never_ends_below_one_nested_in_it():
-    # A wrong frequency: the likelihood has an optimum at every beat.
+    # At a wrong frequency the likelihood has an optimum at every beat.
     wrong = swing(0, 3.0)
     record = wrong.flights[0]
     wrong = replace(wrong, flights=[replace(record, outputs={"x": record.outputs["x"]})])
     both = {"fixed": replace(wrong, free={"b": wrong.free["b"]}), "free": wrong}
-    # From one start: where little is explained others would be gone to.
+    # One start: more would be tried if little is explained.
     alone = fit(both["free"], starts=1)
     found = choose(both, [("fixed", "free")], starts=1)
     small, large = (next(c for c in found.candidates if c.name == n) for n in ("fixed", "free"))

@@ -1,4 +1,4 @@
-"""What follows the inputs where samples are missing, and rates of modes that do not swing."""
+"""Coherence with the inputs if samples are missing, and rates of modes without oscillation."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from tests.identification.test_enough import DT, TRUTH, flight, problem, respons
 
 
 def swept(n=4000, noise=0.02):
-    """A stick of noise below 2 Hz, and the response."""
+    """Return a stick of noise below 2 Hz, and the response."""
     rng = np.random.default_rng(0)
     sos = scipy.signal.butter(4, 2.0, fs=1 / DT, output="sos")
     u = scipy.signal.sosfilt(sos, rng.standard_normal(n))
@@ -55,7 +55,7 @@ def test_modes_that_do_not_swing_ask_for_a_rate_too():
         [found] = of_rates(asked, [{"phi": 1e-6}])
         assert found.severity == severity
         assert found.value == pytest.approx(2.0 * np.pi / 40.0 / (DT * every))
-        # Guessed noise as large as the motion hides no mode; a stated one does.
+        # A guessed noise as large as the motion hides no mode; a stated one does.
         [guessed] = of_rates(replace(asked, flights=(replace(slow, sd={}),)), [{"phi": 1.0}])
         assert guessed.severity == severity
         assert not list(of_rates(asked, [{"phi": 1.0}]))

@@ -1,4 +1,4 @@
-"""Deviations under coloured residuals: closed forms of AR(1) noise."""
+"""Standard deviations under autocorrelated residuals: closed forms of AR(1) noise."""
 
 from types import SimpleNamespace
 
@@ -12,8 +12,10 @@ N, DT = 20000, 0.01
 
 
 def case(r, J):
-    """The parts of a layout, its data and an evaluation that the correction looks at; NaN in r
-    where nothing is measured."""
+    """Return the parts of layout, data and evaluation that the correction uses.
+
+    r is NaN if nothing is measured.
+    """
     k, n = r.shape
     flight = SimpleNamespace(dt=DT, outputs={str(i): r[i] for i in range(k)})
     layout = SimpleNamespace(outputs=(tuple(str(i) for i in range(k)),))
@@ -38,9 +40,9 @@ def test_white_residuals_change_little():
 
 @pytest.mark.parametrize("rho", [0.5, 0.9])
 def test_a_mean_under_ar1_noise(rho):
-    """The mean of AR(1) noise has (1 + rho)/(1 - rho) times the white variance."""
+    """Test the mean of AR(1) noise: (1 + rho)/(1 - rho) times the white variance."""
     wanted = np.sqrt((1 + rho) / (1 - rho))
-    # One record tells the memory to a fifth or so; the mean over several is closer.
+    # One record determines the autocorrelation to about a fifth; the mean over several is closer.
     found = [
         inflation(*case(ar1(rho, seed)[None], np.ones((1, N, 1))))[0] ** 2 for seed in range(12)
     ]
@@ -73,14 +75,16 @@ def test_only_slow_effects_suffer_from_slow_noise():
     J = np.stack([np.ones((1, N)), rng.standard_normal((1, N))], axis=-1)
     layout, data, e = case(r, J)
     parts = inflation(layout, data, e)
-    # The first column is the mean, which suffers; the second is white and does not.
+    # The first column is the mean, which is affected; the second is white and is not.
     assert parts[0] > 4.0
     assert parts[1] == pytest.approx(1.0, abs=0.3)
 
 
 def test_deviations_and_intervals_hold_with_missing_samples():
-    """A line and slow waves fitted to AR(0.9) noise of 60 s: sd 0.9-1.1 of the real one, and 95 %
-    of the intervals cover."""
+    """Test a line and slow waves fitted to AR(0.9) noise of 60 s.
+
+    The sd is 0.9 to 1.1 of the real one, and 95 % of the intervals cover.
+    """
     n, runs, rho = 3000, 200, 0.9
     t = np.linspace(-1.0, 1.0, n)
     columns = [np.ones(n), t, *(f(w * t) for w in (40.0, 130.0) for f in (np.sin, np.cos))]
@@ -100,7 +104,7 @@ def test_deviations_and_intervals_hold_with_missing_samples():
         sds.append(found.inflation * np.sqrt(np.diag(np.linalg.inv(J.T @ J))))
         quantiles.append(found.quantile)
     errors, sds, quantiles = np.array(errors), np.array(sds), np.array(quantiles)
-    # Six columns: the mean over them, since one sd of 200 runs is known to 5 % only.
+    # The mean over six columns, since the sd of one over 200 runs is known to only 5 %.
     ratio = np.median(sds, axis=0) / np.sqrt(np.mean(errors**2, axis=0))
     assert 0.9 < np.exp(np.mean(np.log(ratio))) < 1.1
     assert 0.925 < np.mean(np.abs(errors) < quantiles * sds) < 0.975
@@ -115,7 +119,7 @@ def test_few_independent_parts_want_a_larger_quantile():
 
 
 def test_residuals_and_effects_of_any_size_have_the_same_intervals():
-    """No square overflows (warnings are errors), and a unit of either changes nothing else."""
+    """Test that no square overflows (warnings are errors) and that units change nothing else."""
     J = np.stack([np.ones(400), np.sin(0.01 * np.arange(400))], axis=1)[None]
     r = ar1(0.9, n=400)[None]
     plain = sandwich(*case(r, J))
@@ -141,7 +145,7 @@ def test_two_flights_are_independent():
 
 
 def test_curvature_of_the_residuals_widens():
-    """A Hessian of half of J'J takes the estimate twice as far for the same residuals."""
+    """Test a Hessian of half of J'J, which moves the estimate twice as far for equal residuals."""
     rng = np.random.default_rng(2)
     r = rng.standard_normal(N)
     J = np.ones((1, N, 1))
@@ -153,7 +157,7 @@ def test_curvature_of_the_residuals_widens():
 
 @pytest.mark.parametrize("missing", [False, True], ids=["whole", "half missing"])
 def test_noise_is_drawn_with_the_covariance_of_the_residuals(missing):
-    """Two outputs, of which the second is the first a sample later, and noise of its own."""
+    """Test two outputs: the second is the first one sample later, with separate noise."""
     rng = np.random.default_rng(8)
     slow = ar1(0.9, 4, N + 1)
     residual = np.stack([slow[1:], 2.0 * slow[:-1] + rng.standard_normal(N)])

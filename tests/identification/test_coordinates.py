@@ -1,4 +1,4 @@
-"""Bounded parameters as unbounded coordinates: there and back, inside, monotone."""
+"""Bounded parameters as unbounded coordinates: inverse, bounds, monotonicity."""
 
 import math
 
@@ -30,7 +30,7 @@ signs = st.sampled_from([-1.0, 1.0])
 
 @st.composite
 def cases(draw):
-    """(kind, sign, low, high, a value inside)"""
+    """Return (kind, sign, low, high, a value inside)."""
     how, sign = draw(st.sampled_from(KINDS)), draw(signs)
     size, width, share = draw(sizes), draw(widths), draw(shares)
     if how == "log":

@@ -1,4 +1,4 @@
-"""What a low-pass took away with the rate is no disturbance and no missing dynamics."""
+"""Low-passed and decimated noise is neither a disturbance nor missing dynamics."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from heli_jax.identification.validation.metrics import is_decimated, whiteness, 
 
 
 def at_half_the_rate(noise: np.ndarray) -> np.ndarray:
-    """By SciPy's design: passes to 0.4 of the new rate, stops at half of it."""
+    """Return a signal low-passed by SciPy: passes to 0.4 of the new rate, stops at half of it."""
     taps = scipy.signal.firwin(201, 0.225, window=("kaiser", 7.0), fs=1.0)
     return scipy.signal.lfilter(taps, 1.0, noise)[201::2]
 
@@ -24,7 +24,7 @@ def test_noise_that_was_white_is_white_but_for_its_low_pass(memory):
         noise[rng.integers(0, noise.size, 40)] = np.nan
         plain += whiteness(noise).white
         in_band += whiteness_in_band(noise, 1).white
-    # At 1 % one of a hundred white records fails; what has a memory is told as before.
+    # At 1 % one of a hundred white records fails; autocorrelation is still found.
     assert plain == 0
     assert in_band >= 19 if not memory else in_band == 0
 

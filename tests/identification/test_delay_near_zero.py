@@ -1,4 +1,4 @@
-"""A free delay: none, whose bound is the record's, and one far from where the search begins."""
+"""A free delay: zero, with the record's bound, or far from its start value."""
 
 from dataclasses import replace
 from typing import Annotated, NamedTuple
@@ -28,15 +28,15 @@ STICK = random_steps(N, DT, np.random.default_rng(0), (0.2, 0.6)) * 0.1
 
 
 def late(L: float, B: float, steps: int) -> np.ndarray:
-    """SciPy's response (N,) to the stick, late by so many twentieths of a sample."""
+    """Return SciPy's response (N,) to the stick, late by a number of twentieths of a sample."""
     u = np.repeat(STICK, FINE)
     u = np.concatenate([np.full(max(steps, 0), STICK[0]), u])[: u.size]
-    # The same start for all, so that the delay alone differs.
+    # All have the same start, so that only the delay differs.
     return response(L, B, u, DT / FINE)[::FINE]
 
 
 def sd_of_delay() -> float:
-    """Cramér-Rao's by differences of SciPy's responses."""
+    """Return the Cramér-Rao bound by differences of SciPy's responses."""
     base, rise = late(-4.0, 25.0, 0), 1e-4
     columns = [
         (late(-4.0 + rise, 25.0, 0) - base) / rise,
@@ -82,7 +82,7 @@ def test_filter_error_finds_a_stick_that_is_late_by_ten_samples():
     flight = Flight(dt=dt, inputs={"lat": logged}, outputs={"p": measured})
     loaded = linear_model("roll-flybarless")
     params = loaded.vehicle().params
-    # From there a whole step of Gauss and Newton leads up in most of the delays that are tried.
+    # From there a full Gauss-Newton step increases the cost for most of the tried delays.
     free = {"Lb": Free(166.1), "Blat": Free(0.1398), "tau_f": Free(0.04631)}
     model = with_disturbance(loaded.model, "p")
     vehicle = model.Params(**params._asdict(), sigma_w=3.0, tau_w=1.0)

@@ -1,4 +1,4 @@
-"""Several disturbances at once, each with a size and a time constant of its own."""
+"""Several disturbances at once, each with its own size and time constant."""
 
 import dataclasses
 from typing import Annotated, Any, NamedTuple
@@ -51,7 +51,7 @@ FREE = {"Lp": Free(-3.0), "Mq": Free(-3.0), "Mp": Free(0.5)}
 
 
 def discrete(sigma=SIGMA):
-    """Phi, Gamma, Q of (p, q, w_p, w_q) over a sample, by matrix exponentials."""
+    """Return Phi, Gamma, Q of (p, q, w_p, w_q) over a sample, by matrix exponentials."""
     A = np.block([[MACHINE, np.eye(2)], [np.zeros((2, 2)), -np.diag(1 / TAU)]])
     B = np.vstack([np.diag([6.0, 3.0]), np.zeros((2, 2))])
     held = scipy.linalg.expm(np.block([[A, B], [np.zeros((2, 6))]]) * DT)
@@ -138,7 +138,8 @@ def test_one_that_is_not_there_freezes_no_other():
     assert absent == [("q",)]
     for name, true in {"sigma_w_p": 2.0, "tau_w_p": 0.4}.items():
         assert abs(found.nuisance[name].value - true) < 3.5 * found.nuisance[name].sd
-    # Without its size and its time nothing more was estimated than three, one each, and noise.
+    # The unknowns are the free parameters, size and time constant of one disturbance, and two
+    # noises.
     assert found.unknowns == len(FREE) + 2 + 2
 
 

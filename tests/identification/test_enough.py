@@ -1,4 +1,4 @@
-"""Is this log enough: each defect is found where it is, and not where it is not."""
+"""Sufficiency of logs: each defect is found, and only where it is."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -56,7 +56,7 @@ FREE = {"k": Free(36.0), "d": Free(2.0), "b": Free(20.0)}
 
 
 def response(u, v):
-    """phi and p by SciPy, from rest, for held inputs."""
+    """Return phi and p by SciPy, from rest, for held inputs."""
     both = []
     for numerator in ([20.0], [20.0, 0.0]):
         b, a, _ = scipy.signal.cont2discrete((numerator, [1.0, 2.0, 36.0]), DT)
@@ -93,7 +93,7 @@ def problem(*flights, **more):
 
 
 def found_of(diagnostic, *flights, sd=1.0):
-    """The findings of a diagnostic of records alone, before a fit."""
+    """Return the findings of one diagnostic of records, before a fit."""
     named = [(f"flight {i}", f) for i, f in enumerate(flights)]
     noise = {f"{label}/{n}": sd for label, f in named for n in f.outputs}
     found = excitation_of(problem(*flights))
@@ -118,7 +118,7 @@ def test_rails_are_what_piles_up_at_both_ends():
     assert (low, high) == (np.mean(y <= -0.9), np.mean(y >= 0.8))
     throttle = np.clip(steps(np.random.default_rng(1), 6000), -0.1, 0.12)
     assert rails(throttle)[1] == pytest.approx(np.mean(throttle == 0.12))
-    # A sine in steps, steps between levels, rest at an end, noise: no rails.
+    # A sine in steps, steps between levels, rest at an end, and noise have no limits.
     for x in (
         np.round(np.sin(0.7 * t), 1),
         np.round(np.sin(0.7 * t), 3),
@@ -150,7 +150,7 @@ def test_sticks_that_move_together_are_named_with_their_coherence():
     other = scipy.signal.welch(mixed, 1 / DT, nperseg=400)[1]
     weights = np.minimum(power / power.sum(), other / other.sum())
     assert found.value == pytest.approx(np.average(c, weights=weights), abs=0.05)
-    # A second flight in which one moves alone tells them apart.
+    # A second flight in which one input moves alone separates them.
     alone = replace(f, inputs={"u": steps(rng, n), "v": np.zeros(n)})
     (pair,) = excitation_of(problem(replace(f, inputs={"u": u, "v": u}), alone)).pairs
     assert pair.coherence < 0.8
@@ -173,7 +173,7 @@ def test_the_band_that_a_stick_excites():
     assert (found.code, found.severity) == ("excitation.excited-band", "ok")
     assert excitation_of(problem(f)).powers["u"] == pytest.approx((0.5, 2.0), rel=0.2)
     noise = replace(f, outputs={"phi": 0.1 * rng.standard_normal(n)})
-    # There is no tick beside the doubt.
+    # A doubt has no tick beside it.
     assert not found_of(excitation.excited_bands, noise)
     assert excitation_of(problem(noise)).outputs["phi"].explained < 0.05
 
@@ -216,7 +216,7 @@ def test_the_rate_of_an_input_is_that_of_its_own_clock(tmp_path, rate):
         rate=100.0,
     )
     assert input_rate(f, "u", f.inputs["u"]) == pytest.approx(rate, rel=0.01)
-    # Interpolated onto the grid before it came here, only slow straight lines show.
+    # If the log was interpolated to the grid before, only slow straight lines show it.
     if rate < 40:
         alone = replace(f, source=None)
         assert input_rate(alone, "u", f.inputs["u"]) == pytest.approx(rate, rel=0.01)
@@ -226,7 +226,7 @@ def test_the_rate_of_an_input_is_that_of_its_own_clock(tmp_path, rate):
 
 
 def on_the_ground(seed, n=2000):
-    """A machine that spools up: noise, and a rate loop whose stick follows the gyro."""
+    """Return a vehicle with a rotor run-up: noise, and a rate loop whose stick follows the gyro."""
     rng = np.random.default_rng(seed)
     p = scipy.signal.lfilter([0.1], [1.0, -0.9], rng.standard_normal(n))
     p = 0.05 * (p + 3.0 * rng.standard_normal(n))
@@ -236,7 +236,7 @@ def on_the_ground(seed, n=2000):
 
 
 def in_gusts(seed, n=2000, vaf=0.2):
-    """A machine that answers its stick, in gusts that move it more."""
+    """Return a vehicle that responds to its stick, in gusts that move it more."""
     rng = np.random.default_rng(seed)
     u = steps(rng, n)
     phi, _ = response(u, np.zeros(n))
@@ -254,7 +254,7 @@ def test_where_no_output_follows_any_input_nothing_is_determined(made, refused):
 
 
 def test_a_stick_that_stays_for_equal_times_is_a_slow_channel_unless_its_hold_is_stated():
-    # 1.2 values in a period of the swing at 0.95 Hz: a slow channel, or steps with a clock.
+    # 1.2 values in a period of the mode at 0.95 Hz: a slow channel, or steps with a clock.
     u = np.repeat(np.random.default_rng(0).standard_normal(60), 40)
     slow = Flight(
         dt=DT,
@@ -272,7 +272,7 @@ def test_a_stick_that_stays_for_equal_times_is_a_slow_channel_unless_its_hold_is
 
 @pytest.mark.slow
 def test_what_to_fly_next_does_what_is_promised():
-    # Steps of two seconds and more say little of the damping.
+    # Steps of two seconds or more have little information about the damping.
     f = flight(0, 500)
     slow = problem(
         replace(f, inputs={"u": steps(np.random.default_rng(5), 500, 100, 200), "v": np.zeros(500)})
@@ -288,7 +288,7 @@ def test_what_to_fly_next_does_what_is_promised():
     phi, _ = response(u, np.zeros(u.size))
     flown = replace(slow.training[0], inputs={"u": u, "v": np.zeros(u.size)}, outputs={"phi": phi})
     after = expected(check(problem(slow.training[0], flown)).verdict)
-    # But for the weak priors' sizes, which the second record makes anew.
+    # Except for the sizes of weak priors, which the second record recomputes.
     assert plan.after == pytest.approx(after[int(np.argmax(now))], rel=1e-2)
 
 

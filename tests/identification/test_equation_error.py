@@ -1,5 +1,7 @@
-"""Starts by equation error: against least squares by hand and known truth, with gaps, hidden
-states, and in sentences where nothing can be done."""
+"""Starts by equation error, against least squares by hand and known truth.
+
+Also with gaps and hidden states, and with messages where it is impossible.
+"""
 
 import math
 from dataclasses import replace
@@ -49,7 +51,7 @@ FREE = {"Lp": UNKNOWN, "Lda": UNKNOWN, "Lphi": UNKNOWN}
 
 
 def record(seed=0, n=1500, gust=0.0, noise=0.0):
-    """p' = -4 p + 25 da + gust with a held input, by its exact recursion; phi by Simpson."""
+    """Return p' = -4 p + 25 da + gust with a held input, by its exact recursion; phi by Simpson."""
     rng = np.random.default_rng(seed)
     da = np.repeat(rng.uniform(-0.1, 0.1, n // 10), 10)
     a = math.exp(-4.0 * DT)
@@ -76,7 +78,7 @@ def test_smoothing_keeps_polynomials_and_a_held_equation(half):
     np.testing.assert_allclose(second, -6.0, rtol=1e-9)
     inner = t[half + 2 : -half - 2]
     np.testing.assert_allclose(first, 2.0 - 6.0 * inner, atol=1e-9)
-    # The mean of s^2 under the kernel moves a parabola by a constant, its shape stays.
+    # The mean of s^2 under the kernel shifts a parabola by a constant and keeps its shape.
     assert np.ptp(y - (1.0 + 2.0 * inner - 3.0 * inner**2)) < 1e-9
     flight = record(n=600)
     p = smoothed(flight.outputs["p"], DT, half)
@@ -127,7 +129,7 @@ def test_an_angle_alone_shows_its_rate_and_gaps_do_no_harm():
 
 
 def test_products_with_a_state_that_is_not_measured():
-    """The rotor's flapping: Lb and Blat act as a product, and Lb by itself."""
+    """Test the rotor's flapping: Lb and Blat act as a product, and Lb alone."""
     file = linear_model("roll-flybarless")
     p = file.vehicle().params
     truth = {n: float(getattr(p, n)) for n in ("Lb", "Blat", "tau_f")}
@@ -149,7 +151,7 @@ def test_products_with_a_state_that_is_not_measured():
     assert found["Blat"].value == pytest.approx(truth["Blat"], rel=0.05)
     assert (found["tau_f"].value, found["tau_f"].origin) == (truth["tau_f"], "vehicle")
     assert start.hidden == ("b",)
-    # A time constant of what is not measured needs a value from somewhere.
+    # A time constant of an unmeasured state needs a given value.
     without = p._replace(tau_f=math.nan)
     with pytest.raises(ValueError, match=r"free\.tau_f\.start"):
         equation_error_start(file.model, without, [flight], dict.fromkeys(truth, UNKNOWN))
@@ -192,7 +194,7 @@ def test_a_parameter_that_something_is_divided_by(tmp_path, vehicle):
     only = replace(flight, outputs={"p": flight.outputs["p"]})
     free = {"tau": UNKNOWN, "K": UNKNOWN}
     found = values(equation_error_start(model, params, [only], free))
-    # 1 / 4 and 25 / 4, as the two terms of the same record regressed by themselves have it.
+    # 1 / 4 and 25 / 4, as from regressions on the two terms of the same record.
     known = Params(math.nan, math.nan, 0.0)
     two = {"Lp": UNKNOWN, "Lda": UNKNOWN}
     terms = values(equation_error_start(ROLL, known, [only], two))
@@ -245,7 +247,7 @@ def config(tmp_path):
 @pytest.mark.parametrize(
     ("place", "override"),
     [
-        # Its own file's value, which a bound of the fit leaves out.
+        # The model file's value, which a bound of the fit excludes.
         (r"free\.Lda\.start", {"fit.start": "given"}),
         (r"fit\.free", {"fit.free": {"Lpp": {}}}),
         (r"fit\.start", {"fit.start": "guess"}),

@@ -1,4 +1,4 @@
-"""Whether an output follows the inputs, where it ends far from where it began."""
+"""Coherence of an output with the inputs if its ends differ greatly."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from heli_jax.identification.validation.excitation import excitation_of
 
 
 def heave(seed: int, Zcol: float) -> Problem:
-    """60 s of a heave mode of 30 s in light gusts, with steps of the collective."""
+    """Return 60 s of a heave mode of 30 s in light gusts, with steps of the collective."""
     rng, dt, n = np.random.default_rng(seed), 0.02, 3000
     col = np.repeat(rng.uniform(-0.1, 0.1, 60), 50)
     gust = scipy.signal.lfilter([0.3 * np.sqrt(2 * dt)], [1, dt - 1], rng.normal(size=n))
@@ -22,7 +22,7 @@ def heave(seed: int, Zcol: float) -> Problem:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_an_output_that_the_inputs_carried_away_follows_them(seed: int) -> None:
-    # Its leap from end to end hid that: "these data say nothing of the model", Zcol known to 3 %.
+    # Its jump from end to end hid this: a finding denied any information, with Zcol known to 3 %.
     assert excitation_of(heave(seed, -14.0)).outputs["w"].p_value < 1e-6
 
 

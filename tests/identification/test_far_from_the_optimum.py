@@ -1,5 +1,8 @@
-"""What slopes at one point do not tell: sums that look like products, parameters that may be
-exchanged, bounds, and swings that the samples hardly show."""
+"""Facts that slopes at one point do not show.
+
+Sums that look like products, exchangeable parameters, bounds, and modes hardly visible in the
+samples.
+"""
 
 from typing import Annotated, NamedTuple
 
@@ -59,7 +62,7 @@ TRUTH = Params(-1.5, -1.5, 0.3, 0.06, 10.0, 1.0)
 
 
 def lagged(A, B, C):
-    """The output for the held stick, from rest, by SciPy."""
+    """Return the output for the held stick, from rest, by SciPy."""
     F, G, *_ = scipy.signal.cont2discrete((A, B, C, [[0.0]]), DT)
     x, y = np.zeros(len(A)), np.empty(N)
     for k, u in enumerate(U):
@@ -93,11 +96,11 @@ def test_of_a_sum_nothing_but_the_sum_is_determined():
     [c] = found.verdict.combinations
     assert (c.name, c.kind, c.exponents) == ("La + Lb", "sum", {"La": 1.0, "Lb": 1.0})
     assert c.lower95 < -3.0 < c.upper95
-    # The oracle: one of the two known, the other is as sure as the sum.
+    # The reference: with one of the two known, the other is as certain as the sum.
     alone = fitted(SUM, FIRST, La=Free(-1.0), K=Free(3.0)).estimates["La"]
     assert c.value == pytest.approx(alone.value + TRUTH.Lb, rel=1e-4)
     assert c.sd == pytest.approx(alone.sd, rel=0.02)
-    # Along an exact valley rounding decides nothing: without damping it led to +240 and -243.
+    # Along an exact valley rounding must decide nothing: without damping it led to +240 and -243.
     near = fitted(SUM, FIRST, La=Free(-1.0 + 1e-6), Lb=Free(-1.0), K=Free(3.0)).estimates
     assert near["La"].value == pytest.approx(near["Lb"].value, rel=1e-3)
 
@@ -126,7 +129,7 @@ def test_a_parameter_at_its_bound_is_not_determined_and_no_failure():
     bound = found.findings[0]
     assert (bound.code, bound.subjects) == ("fit.at-bound", ("La",))
     assert bound.value == pytest.approx(-0.5)
-    # What the others are is that of a bound which the data do not bear out.
+    # The others depend on a bound that the data do not support.
     assert "K" in found.untrusted
     assert found.exit_code == 3
     estimate = found.estimates["La"]
@@ -135,7 +138,7 @@ def test_a_parameter_at_its_bound_is_not_determined_and_no_failure():
 
 
 def test_no_interval_of_a_time_shift_is_wider_than_its_search():
-    # The likelihood and the slopes are taken on past the last value that a shift can have.
+    # Likelihood and slopes are continued beyond the last possible value of a shift.
     problem = Problem(
         SUM, TRUTH, [FIRST], {"La": Free(-1.0)}, Nuisance(bias=False, time_shift=True)
     )
@@ -155,10 +158,10 @@ def test_a_fast_swing_is_no_white_noise():
     white = rng.standard_normal(4000)
     assert white_part(white) == pytest.approx(1.0, rel=0.1)
     swing = scipy.signal.lfilter([1.0], [1.0, 1.8, 0.9], white)
-    # Its spectrum at zero is (1 / 3.7)^2, all of which may be white.
+    # Its spectrum at zero is (1 / 3.7)^2, which may all be white.
     assert white_part(swing) == pytest.approx(1.0 / 3.7, rel=0.3)
     assert noise_guess(swing) > 3.0
-    # What is slow is no noise either, and was none before.
+    # Slow motion is not noise either, and was not before.
     slow = scipy.signal.lfilter([1.0], [1.0, -1.8, 0.9], white)
     assert white_part(slow) == noise_guess(slow)
 

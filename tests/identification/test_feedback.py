@@ -1,4 +1,4 @@
-"""Feedback: found where a pilot holds the bank angle, not found where nobody does."""
+"""Feedback: found if a pilot holds the bank angle, and only then."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -21,7 +21,7 @@ DT, LATE = 0.02, 5
 
 
 def record(seed, gain, kind="steps", n=1000, gust=1.0):
-    """A roll machine in gusts, whose stick follows the bank angle of 0.1 s ago."""
+    """Return a roll in gusts, whose stick follows the bank angle of 0.1 s ago."""
     rng = np.random.default_rng(seed)
     steps = 0.1 * np.repeat(rng.uniform(-1.0, 1.0, n // 20), 20)
     smooth = 0.1 * scipy.signal.lfilter(*scipy.signal.butter(2, 0.1), rng.standard_normal(n))
@@ -34,7 +34,7 @@ def record(seed, gain, kind="steps", n=1000, gust=1.0):
             p[k + 1] = p[k] + DT * (-4.0 * p[k] + 25.0 * da[k] + w)
             phi[k + 1] = phi[k] + DT * p[k]
         w += -DT / 0.5 * w + gust * np.sqrt(2 * DT / 0.5) * rng.standard_normal()
-    # As a potentiometer reads it.
+    # As read by a potentiometer.
     da = da + 2e-4 * rng.standard_normal(n)
     outputs = {"p": p + 0.01 * rng.standard_normal(n), "phi": phi + 0.005 * rng.standard_normal(n)}
     return Flight(dt=DT, inputs={"da": da}, outputs=outputs)
@@ -50,16 +50,16 @@ def test_a_pilot_who_holds_the_bank_angle_is_found():
     found = [feedback(record(s, 0.3)) for s in range(5)]
     assert sum(any(f.present for f in one) for one in found) >= 4
     (one,) = found[0]
-    # He takes the stick against the motion, no sooner than he sees it.
+    # He moves the stick against the motion, but not before he sees it.
     assert one.correlation < 0
     assert one.lag[1] >= LATE * DT
     assert one.input == "da"
 
 
 def seen(seed, gain, noise, frequency, machine, rate=100.0):
-    """A machine in gusts whose stick follows the response of 0.25 s ago as somebody sees it that
-    the log's sensor knows nothing of; a minute at 500 Hz, then logged.
+    """Return a vehicle in gusts whose stick follows the response of 0.25 s ago.
 
+    The pilot's view is independent of the log's sensor. It is a minute at 500 Hz, then logged.
     `machine`: damping [1/s], effect of the stick, and its lag [s].
     """
     rng, h, n, (damping, effect, lag) = np.random.default_rng(seed), 2e-3, 30_000, machine
@@ -83,13 +83,13 @@ def test_slow_feedback_shows_through_a_noisy_sensor():
 
 
 def test_a_quick_stick_before_a_quiet_sensor_is_no_feedback():
-    # What the stick does within a sample moves the machine, and the stick goes on from there.
+    # The stick moves the vehicle within a sample, and continues from there.
     records = [seen(s, 0.0, 1e-4, 8.0, (5.0, 5.0, 0.02), 50.0) for s in range(4)]
     assert sum(feedback(record)[0].present for record in records) <= 1
 
 
 def logged_late(seed, samples, n=2000):
-    """A stick that nobody moves by the response, logged late."""
+    """Return a stick that is independent of the response, logged late."""
     flight = record(seed, 0.0, n=n, gust=0.1)
     poles, u = np.exp(-20.0 * DT), np.random.default_rng(seed).standard_normal(n + 200)
     for _ in range(4):
@@ -97,7 +97,7 @@ def logged_late(seed, samples, n=2000):
     u = 0.05 * u[200:] / u[200:].std()
     p = scipy.signal.lfilter([0.0, 25.0 * DT], [1.0, 4.0 * DT - 1.0], u)
     phi = scipy.signal.lfilter([0.0, DT], [1.0, -1.0], p)
-    # The motion that the other stick made goes out with it; the gusts and the noise stay.
+    # The other stick's motion is removed with it; gusts and noise remain.
     other = scipy.signal.lfilter([0.0, 25.0 * DT], [1.0, 4.0 * DT - 1.0], flight.inputs["da"])
     turned = scipy.signal.lfilter([0.0, DT], [1.0, -1.0], other)
     outputs = {
@@ -110,9 +110,9 @@ def logged_late(seed, samples, n=2000):
 
 def test_a_stick_that_is_logged_late_is_taken_when_it_acted():
     late = [logged_late(s, 3) for s in range(2)]
-    # As logged it follows what it caused itself.
+    # As logged it follows its own effect.
     assert sum(any(f.present for f in feedback(flight)) for flight in late) == 2
-    # 0.06 s, and a little more than it was: as the interval of an estimate has it.
+    # 0.06 s plus a margin, as for the interval of an estimate.
     for earlier in (0.06, 0.063):
         found = [feedback(flight, 1, {"da": earlier}) for flight in late]
         assert not any(f.present for one in found for f in one)
@@ -147,7 +147,7 @@ def test_the_delay_that_a_fit_found_is_used(tmp_path):
     (after,) = feedback_of(problem, {"tau": (-0.0605, 0.001), "time_shift": (0.0, None)})
     assert (after.present, after.delay_known) == (False, True)
     assert [f.severity for f in told(problem, [after], fitted=False)] == ["ok"]
-    # The delay of all inputs is added; one that may be zero moves nothing.
+    # The delay of all inputs is added; a delay that may be zero changes nothing.
     (both,) = feedback_of(problem, {"tau": (-0.02, 0.001), "time_shift": (-0.0405, 0.001)})
     assert both.earlier == pytest.approx(0.08)
     (none,) = feedback_of(problem, {"tau": (-0.02, 0.02)})
@@ -166,8 +166,8 @@ def test_steps_without_any_other_motion_are_no_feedback():
 
 
 def test_programmed_doublets_that_a_filter_rounded_are_no_feedback():
-    # A command as autopilots shape it: no corner of it is a single jump, and it comes to rest by
-    # and by. Nothing follows anything, and nothing is measured with noise.
+    # A command shaped as by autopilots: it has no jumps and settles slowly. There is no feedback
+    # and no measurement noise.
     pattern = np.repeat([0.0, 0.3, -0.3, 0.0], [100, 40, 40, 170])
     keep = np.exp(-DT / 0.08)
     u = scipy.signal.lfilter([1.0 - keep], [1.0, -keep], np.tile(pattern, 12))
@@ -205,7 +205,7 @@ def test_what_it_does_is_said_unless_the_noise_model_is_right():
     assert (said.severity, said.distrusts) == ("note", ())
     opened = tuple(f._replace(p_value=0.5) for f in found)
     assert [f.severity for f in told(problem, opened, white=True)] == ["ok"]
-    # Filter error asks for nothing but whiteness.
+    # Filter error only needs whiteness.
     axes = replace(ROLL, axes=(Axis("roll", rate="p", angle="phi", stick="da"),))
     model = with_disturbance(axes, "roll")
     params = model.Params(**asdict(Params(-4.0, 25.0, 0.0)))
@@ -216,7 +216,7 @@ def test_what_it_does_is_said_unless_the_noise_model_is_right():
 
 
 def told(problem, found, *, white=False, fitted=True):
-    """What a fit that arrived says of inputs that follow the response."""
+    """Return a converged fit's findings on inputs that follow the response."""
     return list(
         inputs_follow_response(
             SimpleNamespace(
@@ -240,8 +240,10 @@ def test_a_record_of_less_than_a_block_tells_nothing():
 
 
 def shared_line(loop, shared):
-    """Roll by a chirp, with a rotor's line at 24 Hz in the rate, or in the stick too, or with a
-    pilot."""
+    """Return a roll by a chirp, with a rotor's line at 24 Hz in the rate.
+
+    Optionally the line is also in the stick, or there is a pilot.
+    """
     rng, dt, n = np.random.default_rng(4), 0.01, 4000
     t = np.arange(n) * dt
     wander = scipy.signal.lfilter([0.02], [1, -0.98], rng.standard_normal(n))

@@ -1,4 +1,4 @@
-"""Filter error on disturbed records, and where there is nothing to filter."""
+"""Filter error on disturbed records, and on records without a disturbance."""
 
 import dataclasses
 from typing import Annotated, NamedTuple
@@ -45,14 +45,14 @@ def made(bench30, seed, *, sigma_w=1.04, poles=1, amplitude=3e-6):
 
 @pytest.fixture(scope="module")
 def disturbed(bench30):
-    """A record, its problem and the fit that other fits are compared with."""
+    """Return a record, its problem and its fit, the reference for other fits."""
     model, params, start, flight = made(bench30, 1)
     problem = Problem(model, start, [flight], FREE, method="filter-error")
     return params, problem, fit(problem)
 
 
 def test_inputs_that_explain_nothing_determine_nothing(bench30, disturbed):
-    # A record of gusts alone: what follows of it for the machine stands and falls with the noise.
+    # A record of gusts alone: conclusions about the vehicle depend on the noise.
     _, problem, first = disturbed
     gusts = dataclasses.replace(problem, flights=[made(bench30, 1, amplitude=1e-10)[3]])
     at = first.reached._replace(data=data_of(gusts, gusts.training))
@@ -60,7 +60,7 @@ def test_inputs_that_explain_nothing_determine_nothing(bench30, disturbed):
     said = inputs_explain_nothing(at, e, first.verdict)
     assert not said.identifiable
     assert said.undetermined == ("Ixx", "If", "kappa")
-    # With the stick as it was the verdict stands, and where none moves, as in a free decay.
+    # With the original stick the verdict stays, as without any motion of the stick in a free decay.
     assert gain_of_inputs(*point(first)) > 100.0
     assert first.verdict.identifiable
     at, e = point(first)
@@ -139,7 +139,7 @@ def test_noise_that_cannot_be_is_told(disturbed):
     assert too_small.untrusted == tuple(too_small.estimates)
     no_digits = run(1e-13, 5)
     assert no_digits.status == "not-converged"
-    # Of rounding nothing is known: no interval, and no word of where the optimiser stopped.
+    # Rounding has no information: there is no interval, and no note on the optimiser's end.
     assert all(e.sd is None and e.lower95 is None for e in no_digits.estimates.values())
     codes = {f.code for f in no_digits.findings}
     assert "search.stopped" not in codes
@@ -166,7 +166,7 @@ def test_a_flight_held_out_is_predicted_and_not_fitted(bench30, disturbed):
 
 @pytest.mark.slow
 def test_swapped_columns_are_told(bench30):
-    """Where stick and angle are exchanged, an unstable model that the filter holds fits best."""
+    """Test exchanged stick and angle: an unstable model held by the filter fits best."""
     model, _, start, flight = made(bench30, 3)
     stick, angle = flight.inputs["x_roll"], flight.outputs["roll"]
     swapped = Flight(
@@ -179,7 +179,7 @@ def test_swapped_columns_are_told(bench30):
 
 @pytest.mark.slow
 def test_records_of_the_bootstrap_begin_with_a_stationary_disturbance(bench30):
-    """Two poles: the states of the first sample have sd sigma_w and the correlation 1/sqrt(2)."""
+    """Test two poles: the first sample's states have sd sigma_w and the correlation 1/sqrt(2)."""
     model, _, start, flight = made(bench30, 0, poles=2)
     shown = dataclasses.replace(
         model, output=lambda p, s, u: model.Outputs(roll=s.w1_roll, roll_rate=s.w2_roll)
@@ -224,7 +224,7 @@ def swinging(q, s, u):
 
 
 def swung(truth, sigma, tau, rng, n=1500, substeps=10):
-    """A record of a pendulum in gusts by RK4, phi and p with noise."""
+    """Return a record of a pendulum in gusts by RK4, phi and p with noise."""
     u, h = np.repeat(rng.uniform(-1.0, 1.0, n // 15), 15), DT / substeps
     s, w, states = np.zeros(2), sigma * rng.standard_normal(), np.zeros((n, 2))
     for k in range(n):
@@ -259,7 +259,7 @@ def test_a_pendulum_that_gusts_carry_over_the_top_is_adequate():
     for name, value in truth.items():
         one = found.estimates[name]
         assert abs(one.value - value) < 4.0 * one.sd
-    # Over the whole record the simulated phi leaves the measured one; 2 s ahead it does not.
+    # Over the whole record the simulated phi departs from the measured one; over 2 s it does not.
     assert found.metrics["phi"].vaf < 0.1
     assert found.adequacy.ahead == 2.0
     assert found.exit_code == 0

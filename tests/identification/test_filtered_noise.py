@@ -1,4 +1,4 @@
-"""Noise of a sensor that came through an on-board low-pass, by filter error."""
+"""Sensor noise that passed an on-board low-pass, by filter error."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def roll(tmp_path_factory):
 
 
 def record(seed: int, hz: float, behind: float) -> Flight:
-    """30 s in gusts, white noise of the gyro at 1 kHz before a pt1, logged at 100 Hz."""
+    """Return 30 s in gusts, with the gyro's white noise at 1 kHz before a pt1, logged at 100 Hz."""
     rng = np.random.default_rng(seed)
     n = 30_000
     lat = np.repeat(rng.choice([-0.5, 0.0, 0.5], 60), 500)
@@ -90,7 +90,7 @@ def test_white_noise_before_the_filters_has_its_sd_behind_them(roll, filters, ze
 
 @pytest.mark.slow
 def test_noise_before_a_slow_filter_is_no_gust_and_no_faster_rotor(roll):
-    # Taken for white behind the filter: Lb 129, tau_f 0.045, sd 0.005.
+    # Taken as white after the filter, it gave Lb 129, tau_f 0.045, sd 0.005.
     found = fit(problem(roll, record(2, 10.0, 5e-4), 10.0))
     assert found.adequate is True
     for name, true in (("Lb", 120.0), ("tau_f", 0.06), ("Blat", 0.14)):
@@ -99,15 +99,15 @@ def test_noise_before_a_slow_filter_is_no_gust_and_no_faster_rotor(roll):
     noise = found.nuisance["sigma_n_p"]
     c = 1 - np.exp(-2 * np.pi * 10 * FINE)
     true = 0.15 * np.sqrt(c / (2 - c))
-    # In its own unit it is known, though the noise behind the filter is next to nothing.
+    # In its own unit it is known, although the noise after the filter is almost zero.
     assert noise.sd < 0.03 * true
     assert abs(noise.value - true) < 3 * noise.sd
 
 
 def test_it_is_unknown_only_where_the_samples_bear_it_out(roll):
     assert problem(roll, record(2, 10.0, 5e-4), 10.0).filtered_noise
-    # As much white noise over it, which is all that the fastest differences see.
+    # White noise of the same size is added, which dominates the fastest differences.
     assert problem(roll, record(2, 10.0, 0.027), 10.0).filtered_noise
-    # White behind the filter, at a rate near its cut-off, or with the noise given.
+    # White after the filter, at a rate near its cut-off, or with the noise given.
     assert not problem(roll, record(2, 10.0, 0.3), 10.0).filtered_noise
     assert not problem(roll, record(2, 40.0, 5e-4), 40.0).filtered_noise

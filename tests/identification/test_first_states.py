@@ -1,4 +1,4 @@
-"""Where the states begin that no output shows, against a program of its own."""
+"""Initial values of states that no output shows, against an independent program."""
 
 import dataclasses
 
@@ -16,7 +16,7 @@ VEHICLE = Helicopter(**oracle.FULL)
 
 
 def left(state):
-    """The largest acceleration of the independent program there, with the sticks that suit best."""
+    """Return the independent program's largest acceleration there, with the best sticks."""
     sticks = ("x_roll", "x_pitch", "x_yaw", "x_collective")
     size = np.array([1e-4, 1e-4, 1.0, 1.0])
 

@@ -1,4 +1,4 @@
-"""J'J of filter error against Fisher's information of the dense Gaussian, written with NumPy."""
+"""J'J of filter error against the Fisher information of a dense Gaussian, with NumPy."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +19,7 @@ N, DT, SD, SIGMA, TAU = 150, 0.02, 0.02, 1.04, 1.0
 
 
 def gaussian(u, log_inertia, log_sigma):
-    """Mean (N,) and covariance (N, N) of the measured roll rate, from rest."""
+    """Return mean (N,) and covariance (N, N) of the measured roll rate, from rest."""
     A, B = np.zeros((5, 5)), np.zeros((5, 1))
     A[:4, :4], B[:4] = matrices({**BENCH, "Ixx": np.exp(log_inertia)}, True)
     A[1, 4], A[4, 4] = 1.0, -1.0 / TAU
@@ -45,7 +45,9 @@ def gaussian(u, log_inertia, log_sigma):
 
 
 def information(u, z):
-    """Of (log Ixx, log sigma_w): m_i' S^-1 m_j + 1/2 tr(S^-1 S_i S^-1 S_j)."""
+    """Return the information m_i' S^-1 m_j + 1/2 tr(S^-1 S_i S^-1 S_j) of (log Ixx, log
+    sigma_w).
+    """
     h = 1e-4
     solve = np.linalg.inv(gaussian(u, *z)[1])
     slopes = []
@@ -95,7 +97,7 @@ def test_the_rows_hold_fishers_information(bench30):
     wanted = information(u, truth)
     error = np.std(found, axis=0, ddof=1) / np.sqrt(len(found))
     np.testing.assert_array_less(np.abs(np.mean(found, axis=0) - wanted), 4.0 * error)
-    # The error must be small enough to show a part that is counted twice.
+    # The error must be small enough to reveal a part that is counted twice.
     assert error[1, 1] < 0.05 * wanted[1, 1]
     assert np.mean(found, axis=0)[1, 1] == pytest.approx(wanted[1, 1], rel=0.1)
 
@@ -103,9 +105,9 @@ def test_the_rows_hold_fishers_information(bench30):
 def test_what_has_no_effect_is_not_known():
     rng = np.random.default_rng(0)
     J = rng.standard_normal((50, 4))
-    # The oracle: the inverse of the normal equations.
+    # The reference: the inverse of the normal equations.
     np.testing.assert_allclose(deviations(J), np.sqrt(np.diag(np.linalg.inv(J.T @ J))), rtol=1e-12)
-    # The third is a copy of the second, the last does nothing: only the first is known.
+    # The third is a copy of the second, the last has no effect: only the first is known.
     J[:, 2] = -3.0 * J[:, 1]
     J[:, 3] = 0.0
     sds = deviations(J)

@@ -1,4 +1,4 @@
-"""Fits of records that an independent program made, started away from the truth."""
+"""Fits of records from an independent program, started away from the truth."""
 
 import dataclasses
 
@@ -21,7 +21,7 @@ A = Free(5.0)
 THREE = {"Ixx": IXX, "If": IF, "a": A}
 RESTING = THREE | {"a": Free(4.0, prior=Prior(5.1, 0.3))}
 N = 1000
-"""samples, as many as in other modules: what is compiled for one serves all"""
+"""Samples; equal to other modules, which then share compiled programs."""
 
 
 def started(v, factor_ixx=2.0, factor_if=0.4):
@@ -80,8 +80,8 @@ def test_prior_on_a_makes_it_well_posed(resting):
     assert found.status == "converged"
     a = found.estimates["a"]
     assert a.prior_share > 0.95
-    # Ixx and If have no prior, and are known by that of a: their variances are its, but for those
-    # of a/Ixx and a/If.
+    # Ixx and If are determined by the prior of a: their variances are its, apart from those of
+    # a/Ixx and a/If.
     for name in ("Ixx", "If"):
         relative = found.estimates[name].sd / found.estimates[name].value
         wanted = a.prior_share * (a.sd / a.value / relative) ** 2
@@ -99,13 +99,13 @@ def test_ratios_that_the_data_alone_determine_have_their_own_intervals(resting, 
     assert set(found.verdict.resting) == {"Ixx", "If", "a"}
     ratios = {c.name: c for c in found.verdict.combinations}
     assert set(ratios) == {"a/Ixx", "a/If"}
-    # The oracle: with a known there is no prior, and Ixx and If are as sure as the ratios.
+    # The reference: with a known and without a prior, Ixx and If are as certain as the ratios.
     for name in started(BENCH):
         ratio, one = ratios[f"a/{name}"], alone.estimates[name]
         assert ratio.value == pytest.approx(BENCH["a"] / one.value, rel=1e-4)
         assert ratio.sd / ratio.value == pytest.approx(one.sd / one.value, rel=0.05)
         assert ratio.lower95 < BENCH["a"] / BENCH[name] < ratio.upper95
-        # Far better known than either of its parts, which rest on the prior.
+        # Far better known than either factor, which depends on the prior.
         assert ratio.sd / ratio.value < 0.1 * found.estimates[name].sd / found.estimates[name].value
 
 

@@ -1,4 +1,4 @@
-"""A machine that is released, or at rest under a constant input: the oldest of experiments."""
+"""A vehicle that is released, or at rest under a constant input."""
 
 from pathlib import Path
 
@@ -42,7 +42,7 @@ LOGGED = "{V: {signal: V, unit: V}}"
 
 
 def motion(angle: float, voltage: float, n: int = 1400) -> np.ndarray:
-    """The angle (n,) by the matrix exponential, with noise of 2 mrad."""
+    """Return the angle (n,) by the matrix exponential, with noise of 2 mrad."""
     M = np.zeros((3, 3))
     M[0, 1], M[1] = 1.0, (-STIFFNESS, -DAMPING, MOTOR)
     F, x, y = scipy.linalg.expm(M * STEP), np.array([angle, 0.0, voltage]), []
@@ -102,7 +102,7 @@ def test_releases_one_after_another_become_flights(tmp_path: Path) -> None:
         load_config(configured(tmp_path, np.concatenate([one, other]), gaps="split"))
     )
     assert [f.n_samples for f in both] == [1400, 1400]
-    # On the ground before a flight in which the stick moves nothing is learnt.
+    # Before a flight, on the ground, the stick has no effect and gives no information.
     other[700:, 1] = 1.0
     both = read_flights(
         load_config(configured(tmp_path, np.concatenate([one, other]), gaps="split"))

@@ -1,4 +1,4 @@
-"""What the ends of a record leave at all frequencies, of states and of slow gusts."""
+"""Effects of a record's ends at all frequencies, from states and slow gusts."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ ZW, ZCOL = -0.6, -14.0
 
 
 def record(seed: int, push: np.ndarray) -> Flight:
-    """Heave by a collective in steps and a push (N,) [m/s^2] that stays over each sample."""
+    """Return heave by collective steps and a push (N,) [m/s^2] held over each sample."""
     rng = np.random.default_rng(seed)
     col = np.repeat(rng.uniform(-0.05, 0.05, N // 15), 15)
     decay = np.exp(ZW * DT)

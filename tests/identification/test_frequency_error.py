@@ -1,4 +1,4 @@
-"""Frequency error: the identity it rests on, estimates and intervals, and what it refuses."""
+"""Frequency error: its basic identity, estimates, intervals and refusals."""
 
 import dataclasses
 
@@ -68,7 +68,7 @@ def test_the_states_at_the_lines_of_a_record_are_those_of_numpy():
 
 @pytest.fixture(scope="module")
 def by(by_lines, fitted_by_lines):
-    """The same record by two methods."""
+    """Test the same record by two methods."""
     plain = fit(dataclasses.replace(by_lines, method="output-error"))
     return {"output-error": plain, "frequency-error": fitted_by_lines}
 
@@ -80,13 +80,13 @@ def test_estimates_are_those_of_output_error_in_white_noise(by):
         assert one.lower95 < BENCH[name] < one.upper95
         assert one.sd == pytest.approx(other.sd, rel=0.2)
         assert abs(one.value - other.value) < 1.5 * other.sd
-    # The simulation in time has initial state and bias of its own, though no line knows them.
+    # The simulation in time has an initial state and bias, which no line determines.
     assert by["frequency-error"].metrics["roll"].vaf > 0.999
     assert by["frequency-error"].noise["flight 1/roll"] == pytest.approx(2e-3, rel=0.05)
 
 
 def test_the_noise_to_check_by_is_what_the_inputs_leave():
-    """Gusts a tenth as large as the answer to a chirp; what is wrong with the start is no noise."""
+    """Test gusts a tenth of the response to a chirp; a start's error is not noise."""
     roll, t = linear_model("roll-flybarless"), np.arange(0.0, 80.0, DT)
     lat = 0.1 * np.sin(2 * np.pi * (0.1 * t + 0.024 * t**2))
     params = roll.vehicle().params
@@ -108,13 +108,13 @@ def test_the_noise_to_check_by_is_what_the_inputs_leave():
     for low, high in ((0.1, 0.5), (0.5, 2.0), (2.0, 4.0), (5.0, 20.0)):
         ratio = (found / true)[(hz > low) & (hz < high)]
         assert 0.75 < np.mean(ratio) < 1.3, (low, ratio)
-    # As if all of it were noise a fit begins.
+    # A fit begins as if everything were noise.
     swept = (hz > 0.5) & (hz < 2.0)
     assert np.mean(1.0 / np.abs(begun.whitening[0][swept, 0, 0]) ** 2 / true[swept]) > 5.0
 
 
 def test_the_noise_spectrum_of_two_outputs_is_found():
-    """A matrix over the outputs: correlated noise, white in one and slow in the other."""
+    """Test a matrix over the outputs: correlated noise, white in one and slow in the other."""
     rng = np.random.default_rng(1)
     n = 8001
     common = rng.standard_normal(n)
@@ -130,7 +130,7 @@ def test_the_noise_spectrum_of_two_outputs_is_found():
 
 
 def test_a_flight_is_cut_at_its_missing_samples():
-    """Of SciPy's noiseless record the model's error is nothing but rounding in each part."""
+    """Test SciPy's noiseless record: the model's error is rounding in each part."""
     whole = record(BENCH, seed=3, n=1500, noise=0.0)
     roll = whole.outputs["roll"].copy()
     for hole in (slice(700, 701), slice(1200, 1260), slice(1290, 1500)):
@@ -165,7 +165,7 @@ def test_methods_are_laid_side_by_side(by):
     assert compared.difference(results[1], "If") == pytest.approx(apart, rel=1e-12)
     content = written(MethodsCompared, compared)["results"]
     assert content["frequency-error"]["difference_joint_sd"]["If"] == pytest.approx(apart)
-    # A delay that was free beside them is compared too.
+    # A free delay beside them is compared too.
     late = [
         r._replace(fit=dataclasses.replace(r.fit, nuisance={**r.fit.nuisance, "time_shift": delay}))
         for r, delay in zip(
@@ -189,13 +189,13 @@ HARD = dataclasses.replace(
 
 
 def deflected(kappa: float, moment: float) -> float:
-    """The angle at which a spring kappa (phi + CUBIC phi^3) holds a moment."""
+    """Return the angle at which a spring kappa (phi + CUBIC phi^3) holds a moment."""
     roots = np.roots([kappa * CUBIC, 0.0, kappa, -moment])
     return float(roots[np.abs(roots.imag) < 1e-9].real[0])
 
 
 def stuck_out(seed: int) -> Problem:
-    """A record about the deflection that the mean of the stick makes."""
+    """Return a record about the deflection at the stick's mean."""
     rng = np.random.default_rng(seed)
     stick = 0.8e-6 + steps(rng, 1500, DT, 0.1e-6)
     begin = HARD.State(phi=deflected(4.0, held(stick)), dphi=0.0, beta_roll=0.0, dbeta_roll=0.0)
@@ -203,14 +203,14 @@ def stuck_out(seed: int) -> Problem:
     run = simulate(HARD, vehicle(BENCH), inputs, dt=DT, initial_state=begin)
     roll = np.asarray(run.outputs.roll) + 1e-3 * rng.standard_normal(1500)
     flight = Flight(dt=DT, inputs={"x_roll": stick}, outputs={"roll": roll})
-    # An offset of the stick would move the point, and with it the stiffness: no line tells the two.
+    # An offset of the stick would change the point and its stiffness, which no line separates.
     known = Nuisance(input_offset=False)
     free = {"Ixx": Free(0.03), "kappa": Free(5.0)}
     return Problem(HARD, vehicle(BENCH), [flight], free, known, method="frequency-error")
 
 
 def held(stick: np.ndarray) -> float:
-    """The moment over the inertia that the mean of the stick makes at rest."""
+    """Return the moment over the inertia from the stick's mean at rest."""
     return denominators(BENCH, True)[0][2] / BENCH["Omega"] ** 2 * float(stick.mean())
 
 
@@ -243,7 +243,7 @@ def test_a_model_that_is_not_linear_is_linearised_where_it_flies():
 
 
 def test_errors_that_overflow_have_no_spectrum(tmp_path):
-    """Where they do the relaxation ends, with a level that is no number, and warns of nothing."""
+    """Test that the relaxation then ends with NaN and without a warning."""
     path = tmp_path / "falling.yaml"
     path.write_text(FALLING)
     model, rng = linear_model(path), np.random.default_rng(0)

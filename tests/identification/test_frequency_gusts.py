@@ -1,4 +1,4 @@
-"""The spectrum of gusts that come through a machine, and which parameters feedback leaves alone."""
+"""Spectra of gusts through a vehicle's dynamics, and parameters unaffected by feedback."""
 
 from types import SimpleNamespace
 
@@ -38,7 +38,7 @@ def gust(rng: np.random.Generator, size: float) -> np.ndarray:
 
 
 def test_errors_of_gusts_through_an_integration_and_a_mode_are_whitened():
-    """Against the spectrum that they were drawn from, where a mean over lines is far from it."""
+    """Test against the true spectrum, which a mean over lines misses by far."""
     Ad, _ = discrete([[-0.3, -9.0, 0], [1, 0, 0], [1, 0, 0]], [[0], [0], [0]])
     f = np.arange(1, (N - 1) // 2 + 1) / N
     z = np.exp(2j * np.pi * f)
@@ -51,22 +51,25 @@ def test_errors_of_gusts_through_an_integration_and_a_mode_are_whitened():
     errors = [np.einsum("kij,kj->ki", np.linalg.cholesky(S), v) for v in white]
 
     def sizes(W: np.ndarray) -> np.ndarray:
-        """Of the whitened errors' true covariance, over the lowest 10 Hz; ones are right."""
+        """Return the whitened errors' true covariance over the lowest 10 Hz; it should be one."""
         covariance = (W @ S @ np.conj(np.swapaxes(W, 1, 2)))[: round(10.0 * N * DT)]
         return np.linalg.eigvalsh(covariance)
 
     by = sizes(whitening_by(machine(Ad, np.eye(3)), errors)[0])
     plain = sizes(inverse_roots(smoothed(errors)[0]))
     assert np.mean(by) == pytest.approx(1.0, abs=0.1)
-    # What an integration shows twice is known far better than a mean over lines has it.
+    # A rate and its integral determine it far better than a mean over lines.
     assert np.quantile(by, [0.0, 0.01, 0.99, 1.0]) == pytest.approx([0.4, 0.7, 1.2, 1.2], abs=0.2)
     assert np.quantile(plain, 0.01) < 0.02
     assert np.max(plain) > 2.0
 
 
 def test_a_state_that_no_output_shows_takes_no_part_in_the_spectrum():
-    """What rounding leaves of such a state passed for the way of a huge gust: the whitening then
-    changed by a tenth with the last digit of the parameters."""
+    """Test a state that is rounding only.
+
+    Taken for a huge gust, it changed the whitening by a tenth with the last digit of the
+    parameters.
+    """
     Ad, _ = discrete([[-2.0, 0, 0.3], [1, 0, 0], [0.7, 0.1, -1.0]], [[0], [0], [0]])
     Ad[:2, 2] = 0.0
     rng = np.random.default_rng(0)
@@ -94,7 +97,7 @@ def test_a_closed_loop_is_said_only_of_inputs_without_an_instrument():
     assert found.distrusts == ("Mm", "Ll", "Lp")
     [found] = trust({"Lp": 0.003}, loops)
     assert (found.severity, found.value, found.distrusts) == ("note", 0.003, ())
-    # However coherent the residual is with the response: no loop was found.
+    # However coherent residual and response are, there was no loop.
     open_loop = [one._replace(p_value=0.5) for one in loops]
     assert trust(moved, open_loop) == []
     [found] = trust(moved, open_loop, held=True)

@@ -1,4 +1,4 @@
-"""Frequency error by instrument: its equations, closed loops, and what is said of them."""
+"""Frequency error by instrument: equations, closed loops and findings."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -43,7 +43,7 @@ TRUTH = {"Lphi": 0.4, "Lp": -2.0, "Llat": 10.0}
 
 
 def flown(seed: int, n: int = 3000) -> Flight:
-    """An unstable machine that a pilot holds upright in gusts, with random steps added."""
+    """Return an unstable vehicle held upright by a pilot in gusts, with random steps added."""
     rng = np.random.default_rng(seed)
     M = np.zeros((4, 4))
     M[0], M[1, 0] = [TRUTH["Lp"], TRUTH["Lphi"], TRUTH["Llat"], 1.0], 1.0
@@ -83,13 +83,13 @@ def test_the_rows_solve_the_equations_and_have_their_covariance():
         return [np.asarray(v) for v in _weighed(projected(products(*columns), jnp.eye(4)))]
 
     r, M = weighed(Z)
-    # The same with the ends projected out of everything by hand.
+    # The same with the ends' effects projected out by hand.
     e, J, F = (v - v @ Q @ Q.T for v in (e, J, Z))
     np.testing.assert_allclose(np.linalg.solve(M, r), np.linalg.solve(F @ J.T, F @ e), rtol=1e-8)
     inverse = np.linalg.inv(F @ J.T)
     covariance = inverse @ (F @ F.T) @ inverse.T
     np.testing.assert_allclose(np.linalg.inv(M.T @ M), covariance, rtol=1e-8)
-    # An instrument that says what another says already makes no row, and not one of rounding.
+    # An instrument that depends on others gives no row, not a row of rounding.
     r, M = weighed(np.stack([Z[0], Z[1], 2.0 * Z[0]]))
     assert np.linalg.matrix_rank(M) == 2
     assert np.count_nonzero(r) == 2
@@ -127,8 +127,10 @@ def test_what_follows_an_excitation_is_found():
 
 
 def moved_if_gone_on_with(found: Fit) -> float:
-    """Joint standard deviations by which estimates move where noise and search are repeated, each
-    search to its end."""
+    """Return the joint standard deviations by which estimates move in repeated relaxations.
+
+    Each search runs to its end.
+    """
     layout, data, noise, z = found.reached
     q = len(layout.of_interest)
     J = np.asarray(residual_and_jacobian(layout, data, noise, z).J)[:, :q]
@@ -153,7 +155,7 @@ def test_by_instrument_feedback_moves_no_estimate_and_directly_it_is_said(leanin
     assert by.status == "converged"
     assert by.method_label == "frequency error by instrument (lat)"
     assert np.isnan(by.log_likelihood)
-    # The last steps of a search were not looked at, and the noise stayed nearly as it was.
+    # Another round of the relaxation hardly moves the estimates.
     assert moved_if_gone_on_with(by) < 0.03
     for name, one in by.estimates.items():
         assert abs(one.value - TRUTH[name]) < 3.5 * one.sd
@@ -180,7 +182,7 @@ def test_a_response_far_larger_than_the_measured_one_explains_nothing():
     rng = np.random.default_rng(5)
     X, noise = (rng.standard_normal((300, 1)) + 1j * rng.standard_normal((300, 1)) for _ in "ab")
     y = (X + 0.1 * noise)[:, 0]
-    # Of a response that is k X the residual's part of the measured power is (1 - k)^2.
+    # For a response k X the residual's share of the measured power is (1 - k)^2.
     for k in (0.0, 0.9, 6.0):
         bands = _in_bands(np.stack([y - k * X[:, 0], y], axis=1)[:, None], X)
         [(statistic, freedom)] = bands.test()
@@ -196,7 +198,7 @@ def test_outputs_follow_the_instruments_and_nothing_that_is_fed_back(leaning):
     calm = np.convolve(answer, [0.0, 0.4, 0.4, 0.2])[:1500]
     gusts = rng.standard_normal(1500) * 0.5
     outputs = {"p": calm - gusts, "phi": 2.0 * calm + gusts}
-    # Samples are missing: a straight line stands for them.
+    # A straight line replaces missing samples.
     outputs["phi"][1000:1003] = np.nan
     drive = {"inputs": {"lat": answer + gusts}, "instruments": {"lat": r}}
     given = problem(leaning, [Flight(dt=DT, outputs=outputs, **drive)])

@@ -1,4 +1,4 @@
-"""Fit of frequency responses: estimates, an unstable machine in a loop, and what is refused."""
+"""Fits of frequency responses: estimates, an unstable vehicle in a loop, and refusals."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -35,21 +35,21 @@ def test_a_flight_with_missing_samples_is_fitted_through_its_windows():
     for name, one in found.estimates.items():
         assert one.lower95 < BENCH[name] < one.upper95
         assert one.sd < 0.01 * BENCH[name]
-    # Of 27 windows three hold the gap, and transforms of white noise in windows that overlap by
-    # two thirds and by one are correlated by 0.471 and 0.0288.
+    # Three of 27 windows contain the gap. White noise in windows that overlap by two thirds and by
+    # one third is correlated by 0.471 and 0.0288.
     expected = 24 / (1.0 + 2.0 * (0.47117**2 + 0.02883**2))
     assert dict(found.responses.averages)["roll"] == pytest.approx(expected, rel=1e-4)
     assert found.responses.lower95 < found.responses.chi_squared < found.responses.upper95
     assert found.adequate
     [pair] = found.responses.pairs
     assert pair.J < 100.0
-    # The simulation in time has an initial state and a bias of its own.
+    # The simulation in time has an initial state and a bias.
     assert found.metrics["roll"].vaf > 0.999
 
 
 @pytest.mark.slow
 def test_rows_of_flights_of_several_lengths_and_their_slopes():
-    """What differs in numbers alone is evaluated together, with slopes of its own."""
+    """Test joint evaluation of models that differ only in numbers, each with its slopes."""
     flights = [record(BENCH, seed=3, n=n) for n in (1500, 1300, 1500)]
     problem = Problem(
         models.roll_on_stand, vehicle(BENCH), flights, FREE, Nuisance(bias=False),
@@ -62,7 +62,7 @@ def test_rows_of_flights_of_several_lengths_and_their_slopes():
     for i in range(3):
         step = 1e-5 * np.eye(z.size)[i]
         up, down = (rows(at.layout, at.data, at.noise, jnp.asarray(z + s * step)) for s in (1, -1))
-        # What the projection of the ends' effects moves is orthogonal to the rows (Kaufman).
+        # Changes of the projection of the ends' effects are orthogonal to the rows (Kaufman).
         slope = float(up @ up - down @ down) / 4e-5
         assert float(made.J[:, i] @ made.r) == pytest.approx(slope, rel=1e-3)
     # Initial states are numbers here.

@@ -1,4 +1,4 @@
-"""Flights held out, judged in frequency: other machines and signs, and what cannot be judged."""
+"""Held-out flights in frequency: other vehicles and signs, and flights that cannot be judged."""
 
 import dataclasses
 
@@ -77,7 +77,7 @@ def test_another_machine_is_told_with_the_estimate_that_it_asks_for(found):
     [said] = [f for f in found[0].findings if f.subjects == ("heavy",)]
     assert said.code == "held-out.other-estimates"
     assert said.shifts == {"Ixx": one.furthest.own - one.furthest.fitted}
-    # A tenth of Ixx is many of its sds: whichever flight is right, the interval does not hold both.
+    # A tenth of Ixx is many sds: whichever flight is right, the interval excludes one of them.
     assert said.severity == "doubt"
     assert found[0].distrusts["Ixx"].code == said.code
 
@@ -107,7 +107,7 @@ def test_it_stands_in_fit_json(found):
 
 
 def test_the_card_asks_of_them_what_no_simulation_tells(found):
-    """Beside exit code 4 stood a card of which all gates were passed."""
+    """Test the acceptance card at exit code 4, of which all gates had passed."""
     lines = card(found[0])
     own = {g.of: g for g in lines if g.what == "its own estimates, p-value"}
     assert own["same, held out"].passed
@@ -119,7 +119,7 @@ def test_the_card_asks_of_them_what_no_simulation_tells(found):
 
 @pytest.mark.slow
 def test_by_responses_a_flight_without_the_instrument_of_the_fit_is_not_judged():
-    """Its responses are those of feedback, and passed for another machine (p below 1e-6)."""
+    """Test responses of feedback, which were taken for another vehicle (p below 1e-6)."""
     roll, dt, n = linear_model("roll-flybarless"), 0.02, 3000
     params, rng = roll.vehicle().params, np.random.default_rng(3)
     matrices = linearize(roll.model, params).matrices

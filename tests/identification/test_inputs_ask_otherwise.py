@@ -1,4 +1,4 @@
-"""Fits in gusts whose answer to the inputs asks for other values; records by SciPy alone."""
+"""Fits in gusts whose response to the inputs implies other values; records by SciPy alone."""
 
 from pathlib import Path
 
@@ -31,12 +31,12 @@ DT = 0.02
 
 
 def _record(gust: float, seed: int = 4) -> Flight:
-    """15 s of a chirp on the pedal; gusts as an acceleration with a memory of a second."""
+    """Return 15 s of a pedal chirp, with gusts as an acceleration with 1 s correlation time."""
     rng = np.random.default_rng(seed)
     t = np.arange(750) * DT
     growth = np.log(40.0) / 15.0
     ped = 0.1 * np.sin(2 * np.pi * 0.1 / growth * np.expm1(growth * t))
-    # States r, rfb, psi and the gust; the drive is white noise.
+    # States are r, rfb, psi and the gust; white noise drives it.
     A = np.array(
         [
             [TRUTH["Nr"], -20.0, 0.0, 1.0],
@@ -88,7 +88,7 @@ B: {b: {lat: Blat/tau_f}}
 
 
 def _turned_by_gusts(seed: int) -> Flight:
-    """A minute of doublets; gusts as strong as the answer turn the machine."""
+    """Return a minute of doublets, with gusts as strong as the response to them."""
     rng, n = np.random.default_rng(seed), 3000
     lat, k = np.zeros(n), 25
     while k < n:
@@ -99,7 +99,7 @@ def _turned_by_gusts(seed: int) -> Flight:
     B = np.array([[0.0], [ROTOR["Blat"] / ROTOR["tau_f"]]])
     system = (A, B, np.array([[1.0, 0.0]]), np.zeros((1, 1)))
     answer = scipy.signal.lsim(system, lat, np.arange(n) * DT, interp=False)[1]
-    # In ten steps a sample, so that the gust is as good as continuous.
+    # Ten steps per sample make the gust nearly continuous.
     forget = np.exp(-0.1 * DT / 0.7)
     drive = np.sqrt(1.0 - forget**2) * rng.standard_normal(10 * n)
     gust = scipy.signal.lfilter([1.0], [1.0, -forget], drive)
@@ -112,7 +112,7 @@ def _turned_by_gusts(seed: int) -> Flight:
 
 @pytest.mark.slow
 def test_a_disturbance_in_the_wrong_place_is_told_by_the_inputs(tmp_path):
-    # Taken for a push on the rotor they go through another lag, which the parameters make up for.
+    # Taken for a force on the rotor they pass another lag, which the parameters compensate.
     (tmp_path / "roll.yaml").write_text(ROLL)
     roll = linear_model(tmp_path / "roll.yaml")
     free = {n: Free(1.2 * v) for n, v in ROTOR.items()}
@@ -137,17 +137,17 @@ def test_what_the_inputs_ask_for_is_told_in_any_colour():
         noise = scipy.signal.lfilter([1.0], [1.0, -1.9, 0.95], rng.standard_normal(n))
         lines = lines_of(noise, answers, np.zeros((n, 0)))
         chances.append(pulled_away([lines], 2))
-    # Uniform where the values are those that the inputs ask for.
+    # Uniform if the values agree with the inputs.
     assert scipy.stats.kstest(chances, "uniform").pvalue > 0.01
     off = lines_of(noise + 2.0 * answers[:, 0], answers, np.zeros((n, 0)))
     aside = lines_of(noise + 2.0 * answers[:, 2], answers, np.zeros((n, 0)))
     assert pulled_away([off], 2) < 1e-4
-    # What the nuisances take up is no doubt of the parameters.
+    # Effects that the nuisances absorb do not affect the parameters.
     assert pulled_away([aside], 2) > 1e-3
 
 
 def test_what_goes_along_with_an_open_parameter_has_the_interval_of_both(tmp_path):
-    # An optimum of chance beside Kr = 0, where the lag Krfb has no effect: slopes there bound both.
+    # A chance optimum near Kr = 0, where the lag Krfb has no effect: slopes there bound both.
     found = fit(_problem(tmp_path, 1.5, "frequency-error", seed=3))
     assert {"Kr", "Krfb"} <= {n for n, e in found.estimates.items() if e.sd is None}
     assert found.estimates["Nped"].sd is not None

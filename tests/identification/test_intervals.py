@@ -1,4 +1,4 @@
-"""Profile, bootstrap and NUTS against the Gaussian interval, and where they part from it."""
+"""Profile, bootstrap and NUTS against the Gaussian interval, and their differences."""
 
 import importlib.util
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""The filter against a dense Gaussian likelihood built with scipy, which knows no filter."""
+"""The Kalman filter against a dense Gaussian likelihood, built with scipy without a filter."""
 
 import dataclasses
 
@@ -36,7 +36,7 @@ def case(bench30, poles, **values):
 
 
 def dense(model, params, u, y, x0):
-    """log p(all measurements): mean and covariance by brute force."""
+    """Return log p(all measurements) from the full mean and covariance."""
     A, B, C, D = (np.asarray(m) for m in jacobians(model, params))
     n = A.shape[0]
     held = scipy.linalg.expm(np.block([[A, B], [np.zeros((1, n + 1))]]) * DT)
@@ -52,7 +52,7 @@ def dense(model, params, u, y, x0):
     )
     random = np.ix_(*2 * [[i for i, k in enumerate(names(model.State)) if k.startswith("w")]])
     P = np.zeros_like(A)
-    # Stationary: the disturbance did not begin with the record.
+    # Stationary: the disturbance began before the record.
     P[random] = scipy.linalg.solve_continuous_lyapunov(A[random], -(G @ G)[random])
     x, means, S = np.array(x0), [], [[None] * N for _ in range(N)]
     covariances = []
@@ -161,7 +161,7 @@ def test_explicit_steps_follow_the_moments_of_the_kinematics(hold):
     t = np.arange(count) * dt
     rates = np.array([1.5 * np.cos(5 * t), 1.2 * np.sin(7 * t), 0.8 * np.cos(3 * t)])
     begin = np.array([0.4, -0.5, 1.0])
-    # Measured at the end alone: before it nothing is corrected.
+    # Measured at the end only: nothing is corrected before it.
     measured = np.full(count, np.nan)
     measured[-1] = 0.0
     found = innovations(
@@ -198,7 +198,7 @@ def test_explicit_steps_follow_the_moments_of_the_kinematics(hold):
     x, P = moments[:3], moments[3:].reshape(3, 3)
     assert np.asarray(found.error["phi"])[-1] == pytest.approx(-x[0], abs=1e-7)
     assert np.asarray(found.variance["phi"])[-1] == pytest.approx(P[0, 0], rel=1e-6)
-    # The roll angle, without noise to speak of, is known now, and pitch as far as it goes with it.
+    # The roll angle is now known almost exactly, and pitch as far as it is correlated.
     assert np.asarray(found.variance["theta"])[-1] - 1.0 == pytest.approx(
         P[1, 1] - P[0, 1] ** 2 / P[0, 0], rel=1e-6
     )
@@ -226,7 +226,7 @@ def unstable_yaw(tmp_path, Nr):
 
 
 def joint_filter(y, u, Nr, Nped, sigma, tau, sd):
-    """-log-likelihood but for a constant: both outputs corrected together, P made symmetric."""
+    """Return -log-likelihood up to a constant: both outputs corrected together, P symmetrised."""
     A = np.array([[0, 1, 0], [0, Nr, 1], [0, 0, -1 / tau]])
     B, Q = np.array([[0.0], [Nped], [0.0]]), np.diag([0, 0, 2 * sigma**2 / tau])
     held = scipy.linalg.expm(np.block([[A, B], [np.zeros((1, 4))]]) * DT)
@@ -245,7 +245,7 @@ def joint_filter(y, u, Nr, Nped, sigma, tau, sd):
 
 @pytest.mark.parametrize("Nr", [-0.5, 2.0])
 def test_an_unstable_machine_over_a_long_record(tmp_path, Nr):
-    # exp(2.0 * 60 s) is 1e52: what rounding leaves that no correction sees grows by that.
+    # exp(2.0 * 60 s) is 1e52: rounding that no correction sees grows by this.
     model, params = unstable_yaw(tmp_path, Nr)
     rng = np.random.default_rng(3)
     u, y = rng.standard_normal(3000) * 0.1, rng.standard_normal((3000, 2)) * 0.02
@@ -269,7 +269,7 @@ def test_predictions_ahead_lie_between_one_step_and_a_simulation(tmp_path):
     asked = (model, params, inputs, {n: jnp.asarray(v) for n, v in measured.items()}, YAW_SD)
     one = errors_ahead(asked, SimulationOptions(dt=DT), 1)
     wanted = innovations(*asked, dt=DT)
-    # The first output of a sample is corrected first: of it both know the same.
+    # The first output of a sample is corrected first, with equal information in both.
     np.testing.assert_allclose(one.error["psi"], wanted.error["psi"], rtol=1e-9, atol=1e-15)
     np.testing.assert_allclose(one.variance["psi"], wanted.variance["psi"], rtol=1e-9)
     run = simulate(model, params, inputs, dt=DT).outputs

@@ -1,4 +1,4 @@
-"""Correlations with sums over past samples: against sums written out, and under no correlation."""
+"""Correlations with sums over past samples: against explicit sums, and without correlation."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def test_every_block_is_as_by_hand():
         past = np.array(
             [sum(w[t - k] for k in range(first, last + 1) if t >= k) for t in range(700)]
         )
-        # The sum begins with the first whole block of lags.
+        # The sum begins at the first whole block of lags.
         past[:last] = 0.0
         expected = v @ past / np.sqrt(v @ v * (past @ past))
         lags = 4 * (last - first + 1) + 20

@@ -1,4 +1,4 @@
-"""A stick whose steps stand at the stamp after them is said to be late, and by how much.
+"""Detection of a stick whose steps are logged at the next stamp, with the delay.
 
 Records are made by SciPy at 1 kHz and logged at 50 Hz.
 """
@@ -24,7 +24,7 @@ N = 40_000
 
 
 def problem(grid, *, shift=False, start=(-6.0, 20.0)):
-    """Steps at multiples of `grid` [ms], the stick read at the logger's samples."""
+    """Return steps at multiples of `grid` [ms]; the stick is read at the logger's samples."""
     rng = np.random.default_rng(5)
     u, k = np.zeros(N), 0
     while k < N:
@@ -51,9 +51,9 @@ def test_a_stick_that_is_late_takes_the_interval_that_it_moves():
     found = fit(problem(1))
     [late] = late_ones(found)
     assert late.subjects == ("d",)
-    # Half of the logger's 20 ms on average, of the derivative at the optimum.
+    # Half of the logger's 20 ms on average, from the derivative at the optimum.
     assert 0.005 < late.value < 0.014
-    # True is -12: the shift is towards it.
+    # The true shift is -12; the estimate moves towards it.
     lp = found.estimates["Lp"]
     assert lp.value + late.shifts["Lp"] == pytest.approx(-12.0, rel=0.1)
     assert abs(late.shifts["Lp"]) > 1.96 * lp.sd
@@ -90,7 +90,7 @@ ROLL = Model(
 
 
 def roll_and_angle(noise, *, late=0):
-    """Steps at 50 Hz by SciPy, from rest; the angle is logged late by so many samples."""
+    """Return steps at 50 Hz by SciPy, from rest; the angle is logged late by some samples."""
     rng = np.random.default_rng(8)
     stick = np.repeat(rng.uniform(-1.0, 1.0, 80), 20)
     exact = [[-4.0, 0.0], [1.0, 0.0]], [[30.0], [0.0]], np.eye(2), [[0.0], [0.0]]
@@ -127,16 +127,16 @@ def test_samples_that_move_out_of_the_record_are_no_gain(late, lost):
 
 
 def in_a_loop(*, late=0, delayed=0, seed=1):
-    """Filter error on a rate that gusts move, with a stick that takes some of it back.
+    """Fit by filter error a rate in gusts, with feedback to the stick.
 
     Args:
-        late: samples by which the stick stands too late in its log.
-        delayed: samples after which the machine answers.
+        late: delay of the logged stick [samples].
+        delayed: delay of the vehicle's response [samples].
         seed: of stick, gusts and noise.
     """
     rng, dt, n = np.random.default_rng(seed), LOGGED, 1000
     steps = np.repeat(rng.uniform(-0.15, 0.15, n // 25), 25)
-    # Exact for an input, and a gust, that are held over a sample.
+    # Exact for an input and a gust that are held over a sample.
     grow, tau, gust, rate = np.exp(-4.0 * dt), 0.5, 0.0, 0.0
     stick, p = np.zeros(n), np.zeros(n)
     for k in range(n):
@@ -163,7 +163,7 @@ def test_in_a_closed_loop_an_input_at_another_time_takes_the_intervals(late, del
     found = in_a_loop(late=late, delayed=delayed)
     [finding] = [f for f in found.findings if f.code == code]
     assert finding.value == pytest.approx(3 * LOGGED)
-    # True are -4 and 20.
+    # The true values are -4 and 20.
     assert abs(found.estimates["Ld"].value - 20.0) > 3.0
     assert finding.shifts["Ld"] > 0
     assert found.distrusts["Ld"].code == code

@@ -1,4 +1,4 @@
-"""When a search has converged, and how far it goes after a refused step: against NumPy."""
+"""Levenberg-Marquardt: convergence, and the step after a refusal, against NumPy."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ BEGUN = Region(1e-5, np.inf)
 
 
 def residual(gain, J=J, scale=1.0):
-    """Orthogonal to the columns, and along them so much that a full step takes off `gain`."""
+    """Return residuals with a part along the columns, so that a full step gains `gain`."""
     d = RNG.standard_normal(12)
     along = J @ np.linalg.lstsq(J, d, rcond=None)[0]
     return scale * (d - along) + along * np.sqrt(gain) / np.linalg.norm(along)
@@ -40,7 +40,7 @@ def test_what_is_no_number_has_not_converged():
 
 
 def judged(r, step, cost, region=BEGUN):
-    """The judgement of a step to where half the sum of squares is `cost`."""
+    """Judge a step to a point with half the sum of squares equal to `cost`."""
     reached = Point(Y + step, np.full(12, np.sqrt(cost / 6.0)), J)
     return judge_step(Point(Y, r, J), reached, region)
 
@@ -49,12 +49,12 @@ def test_the_step_after_a_refused_one_is_shorter():
     r = residual(1.0)
     step = -np.linalg.lstsq(J, r, rcond=None)[0]
     begin, slope, change = 0.5 * r @ r, r @ J @ step, np.linalg.norm(J @ step)
-    # The parabola through cost and slope here, and the cost there, has its lowest point at a third.
+    # The parabola through cost and slope here and the cost there has its minimum at a third.
     accept, region = judged(r, step, begin - 0.5 * slope)
     assert not accept
     assert region.damping > BEGUN.damping
     assert region.radius == pytest.approx(change / 3.0)
-    # Near the ends of what is sensible, and where there is no number at all.
+    # At the ends of the sensible range, and for NaN.
     assert judged(r, step, begin)[1].radius == pytest.approx(0.5 * change)
     for much in (1e6, np.inf, np.nan):
         assert judged(r, step, begin - much * slope)[1].radius == pytest.approx(0.1 * change)

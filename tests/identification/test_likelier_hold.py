@@ -1,4 +1,4 @@
-"""What an input does between samples, where its log leaves it open: the record tells."""
+"""Hold of an input that its log leaves open, decided by the record."""
 
 import dataclasses
 
@@ -27,7 +27,7 @@ OPEN = {"da": "moves at 100 % of the samples"}
 
 
 def _flight(*, held: bool) -> Flight:
-    """20 s of a chirp; p by SciPy with the input as it was held or on straight lines."""
+    """Return 20 s of a chirp; p by SciPy, with the input held or linear."""
     t = np.arange(SAMPLES) * DT
     da = 0.1 * np.sin(2.0 * np.pi * (0.2 + 0.1 * t) * t)
     M = np.array([[TRUTH["Lp"], TRUTH["Lda"], 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
@@ -54,7 +54,7 @@ def test_inputs_that_the_record_shows_to_be_held(tmp_path):
     [doubt] = [f for f in found.findings if f.code == "timing.likelier-hold"]
     assert found.exit_code == 3
     assert set(doubt.shifts) == set(found.untrusted) == set(TRUTH)
-    # The remedy is what the finding says: the hold, stated.
+    # The finding's remedy is to state the hold.
     stated = dataclasses.replace(_flight(held=True), hold={"da": "zero-order"}, hold_reason={})
     right = _fitted(tmp_path, stated)
     assert right.exit_code == 0
@@ -71,8 +71,10 @@ def test_inputs_on_straight_lines(tmp_path):
 
 
 def _on_a_test_card(stepped: bool, chirped: bool, seed: int) -> Flight:
-    """Doublets whose jumps are held and a chirp sampled on its way, p 60 ms late; by SciPy at ten
-    times the rate."""
+    """Return held doublets and a chirp sampled in motion, with p 60 ms late.
+
+    SciPy simulates it at ten times the rate.
+    """
     dt, fine, n = 0.02, 10, 2000
     t = np.arange(n * fine) * dt / fine
     steps = np.zeros(t.size)

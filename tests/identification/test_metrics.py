@@ -1,4 +1,4 @@
-"""Agreement and whiteness against their definitions."""
+"""Metrics of agreement and whiteness against their definitions."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ def test_missing_samples_are_left_out():
     noise[::7] = np.nan
     assert whiteness(noise).white
     assert not whiteness(np.cumsum(np.nan_to_num(noise))).white
-    # Judged beside others, each is given the benefit of its number.
+    # With several outputs, each threshold allows for their number.
     alone = 1.0 - whiteness(noise).p_value
     assert whiteness(noise, 50).p_value == pytest.approx(1.0 - alone**50)
     smooth = np.sin(0.01 * np.arange(5000)) + 0.01 * np.nan_to_num(noise)
@@ -51,8 +51,7 @@ def test_missing_samples_are_left_out():
     ("missing", "rho", "seen"), [("every second", 0.4, 120), ("a random half", 0.25, 150)]
 )
 def test_whiteness_is_judged_on_the_pairs_that_are_seen(missing, rho, seen):
-    """White noise fails two or three times in a hundred, as whole records do, and the memory of
-    AR(1) noise is found."""
+    """Test that white noise fails in 2 to 3 % of records, and AR(1) noise is found."""
     n, alarms, found = 2000, 0, 0
     for seed in range(200):
         rng = np.random.default_rng(seed)
@@ -70,7 +69,7 @@ def test_a_whole_record_is_judged_as_by_ljung_and_box():
     centred = noise - noise.mean()
     r = np.array([centred[k:] @ centred[:-k] for k in range(1, 101)]) / (centred @ centred)
     q = 400 * 402 * np.cumsum(r**2 / (400 - np.arange(1, 101)))
-    # Of 2 * lags the variance is (1 + 2.2 lags / 400) times as large.
+    # Its variance is (1 + 2.2 lags / 400) times 2 * lags.
     wide = {lags: 1.0 + 2.2 * lags / 400 for lags in (20, 100)}
     p = [scipy.stats.gamma.sf(q[k - 1], k / (2 * w), scale=2 * w) for k, w in wide.items()]
     found = whiteness(noise)
@@ -80,7 +79,7 @@ def test_a_whole_record_is_judged_as_by_ljung_and_box():
 
 
 def test_a_constant_signal_has_no_motion_to_explain():
-    # 0.1 has no exact binary form: its mean differs by rounding, which is no motion.
+    # 0.1 has no exact binary form: its mean differs by rounding, which is not motion.
     m = metrics(np.full(1000, 0.1), np.full(1000, 0.2))
     assert np.isnan(m.vaf)
     assert np.isnan(m.nrmse_fit_percent)
@@ -88,7 +87,7 @@ def test_a_constant_signal_has_no_motion_to_explain():
 
 
 def test_free_initial_states_of_short_windows_do_not_colour_residuals_of_a_right_model():
-    """Windows of 25 samples of an oscillator with two free states each, projected out by QR."""
+    """Test windows of 25 samples of an oscillator, with free states projected out by QR."""
     n, window, rng = 1500, 25, np.random.default_rng(6)
     t = 0.02 * np.arange(window)
     free = np.exp(-0.4 * t) * np.stack([np.cos(4.5 * t), np.sin(4.5 * t)])

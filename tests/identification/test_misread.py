@@ -1,4 +1,4 @@
-"""Numbers that are hardly what they are taken for, from the table to the first line of a fit."""
+"""Numbers that are probably misread, from the table to the first line of a fit."""
 
 import dataclasses
 from pathlib import Path
@@ -32,7 +32,7 @@ class Motor(NamedTuple):
 
 @pytest.fixture
 def load(tmp_path):
-    """load(p, u, unit=..., **p's keys) -> the flights of a table of them."""
+    """Return load(p, u, unit=..., **p's keys), the flights of a table with these columns."""
 
     def load(p, u=U, unit="", unit_of_p=None, **of_p):
         of_p |= {} if unit_of_p is None else {"unit": unit_of_p}
@@ -67,7 +67,7 @@ def record_doubts(c):
 
 
 def denied(c):
-    """(code, subjects) of what shows that no model explains these flights."""
+    """Return (code, subjects) of findings that no model can explain these flights."""
     return [(f.code, f.subjects) for f in record_doubts(c) if f.denies]
 
 
@@ -75,7 +75,7 @@ IN_DOUBT, AGAINST_FILE = ("units.in-doubt", ("p",)), ("units.against-file", ("p"
 
 
 def of(flights):
-    """What these diagnostics ask for."""
+    """Return the input of these diagnostics."""
     return SimpleNamespace(
         flights=[(str(i), f) for i, f in enumerate(flights)],
         problem=SimpleNamespace(model=linear_model("roll-flybarless").model),
@@ -98,7 +98,7 @@ def test_a_unit_against_that_of_the_file_is_doubted(load, size):
     found = of(load(np.degrees(size * P), unit="deg/s", unit_of_p="rad/s"))
     assert [(f.code, f.subjects) for f in record_doubts(found)] == [AGAINST_FILE, IN_DOUBT]
     assert denied(found) == [IN_DOUBT]
-    # What is small either way is doubted, and no reason by itself.
+    # A value that is small in either unit is a doubt, not a cause.
     small = of(load(0.1 * P, unit="deg/s", unit_of_p="rad/s"))
     [one] = record_doubts(small)
     assert (one.code, one.subjects, one.denies) == (*AGAINST_FILE, False)
@@ -177,10 +177,10 @@ def test_the_shaft_of_a_motor_may_turn(load):
         outputs={"speed": flight.outputs["p"]},
         source=dataclasses.replace(flight.source, outputs={"speed": flight.source.outputs["p"]}),
     )
-    # No attitude and no rate of a fuselage: of how fast it may turn nothing is known.
+    # It is neither an attitude nor a body rate, so its plausible speed is unknown.
     motor = dataclasses.replace(models.roll_on_stand, axes=(), Params=Motor)
     assert list(oversized(motor, renamed)) == []
-    # Nor is the angle of a pendulum that goes over the top an attitude, whatever it is called.
+    # The angle of a pendulum that goes over the top is not an attitude either, whatever its name.
     turning = {"phi": Signal("phi", "rad", "rad")}
     flight = Flight(
         dt=DT, inputs={"lat": U}, outputs={"phi": 6.0 * T}, source=Source("a", "", outputs=turning)

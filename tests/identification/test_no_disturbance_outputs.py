@@ -1,4 +1,4 @@
-"""Filter error on records of four outputs: each has a noise of its own, and none a disturbance."""
+"""Filter error on records of four outputs, each with its noise, and without a disturbance."""
 
 from dataclasses import replace
 from typing import Annotated, NamedTuple
@@ -16,7 +16,7 @@ from tests.identification.lag import LAG
 
 N, DT = 200, 0.04
 NOISE = {"p": 0.02, "gyro": 0.05, "arm": 0.1, "slow": 0.01}
-"""sd of each output's measurement noise"""
+"""Standard deviation of each output's measurement noise."""
 
 
 class Outputs(NamedTuple):
@@ -38,7 +38,7 @@ MODEL = with_disturbance(
 
 
 def fitted(seed: int, disturbance: float = 0.0):
-    """A fit to a record of SciPy's, its disturbance white noise through a lag of half a second."""
+    """Fit a record of SciPy's whose disturbance is white noise through a lag of 0.5 s."""
     rng = np.random.default_rng(seed)
     u = random_steps(N, DT, rng, (0.2, 1.0))
     held = scipy.signal.cont2discrete(([3.0], [1.0, 2.0]), DT)
@@ -52,7 +52,7 @@ def fitted(seed: int, disturbance: float = 0.0):
     params = MODEL.Params(Lp=-2.0, Ld=3.0, sigma_w=0.0, tau_w=1.0)
     flight = Flight(dt=DT, inputs={"d": u}, outputs=outputs)
     free = {"Lp": Free(-1.5), "Ld": Free(2.0)}
-    # From rest and without biases, as it was made: fewer unknowns compile sooner.
+    # From rest and without biases, as in the record: fewer unknowns compile faster.
     none = Nuisance(initial_state=False, bias=False, input_offset=False)
     return fit(Problem(MODEL, params, [flight], free, none, method="filter-error"))
 

@@ -1,4 +1,4 @@
-"""Several outputs: the optimum must not hang on the first guess of their noise.
+"""Several outputs: the optimum must not depend on the first guess of their noise.
 
 The records come from SciPy's transfer functions, not from our own simulation.
 """
@@ -35,8 +35,8 @@ class Seen(NamedTuple):
 
 
 def field(q: Any, s: Motion, u: Push) -> Motion:
-    # A swing hardly damped, whose likelihood has an optimum at every beat of w, and a lag that
-    # knows w without any.
+    # A lightly damped mode, whose likelihood has an optimum at every beat of w, and a lag that
+    # depends on w without any.
     return Motion(s.v, q.b * u.u - q.w**2 * s.x - 0.04 * q.w * s.v, u.u - 0.1 * q.w * s.lag)
 
 

@@ -1,4 +1,4 @@
-"""How long the relaxation of a noise that is a spectrum goes on."""
+"""Stopping of the relaxation of a noise spectrum."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -16,7 +16,7 @@ from heli_jax.identification.unknowns.layout import Noise
 
 
 class Slowly:
-    """A method with one unknown, whose optimum moves less from round to round."""
+    """A method with one unknown, whose optimum moves less in each round."""
 
     def __init__(self, moves: list[float]) -> None:
         self.moves = iter(moves)

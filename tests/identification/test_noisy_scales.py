@@ -1,4 +1,4 @@
-"""The scale error of a noisy sensor that is integrated, against a record made by sums."""
+"""Scale error of a noisy, integrated sensor, against a record made by sums."""
 
 import dataclasses
 from typing import Annotated, Any, NamedTuple
@@ -76,6 +76,6 @@ def test_noise_of_what_is_integrated_does_not_attenuate_its_scale(flight):
     for name, true in (("scale", SCALE), ("bias", BIAS)):
         value, sd = found[name]
         assert abs(value - true) < 2.5 * sd
-    # Without the correction a regression on noisy readings ends far off: the record shows it.
+    # Without the correction a regression on noisy readings is far off, as the record shows.
     value, sd = estimate(dataclasses.replace(MODEL, input_scales=()), flight)["scale"]
     assert value - SCALE > 4.0 * sd

@@ -1,4 +1,4 @@
-"""A fifth method is one class and one entry: Huber's loss, which a few wild samples do not pull."""
+"""A fifth method needs one class and one entry: Huber's loss, robust against outliers."""
 
 import math
 
@@ -16,14 +16,14 @@ from heli_jax.report.fit_page import Analysis, write_report
 from tests.identification.bench import BENCH, record, response, vehicle
 
 BEND = 1.345
-"""standard deviations from which on the loss grows like the error: 95 % efficient without any"""
+"""Bend of the loss [sd], above which it is linear: 95 % efficient without outliers."""
 
 
 class Huber(OutputError):
     """Output error by Huber's loss (1964): rho(e) = e^2 / 2 up to the bend, linear beyond."""
 
     def residuals(self, layout, data, noise, u):
-        """sign(e) sqrt(2 rho(e)), of which the optimiser sums the squares."""
+        """Return sign(e) sqrt(2 rho(e)), whose squares the optimiser sums."""
         plain = super().residuals(layout, data, noise, u)
         size = jnp.maximum(jnp.abs(plain.rows), BEND)
         beyond = jnp.sign(plain.rows) * jnp.sqrt(BEND * (2.0 * size - BEND))
@@ -31,11 +31,11 @@ class Huber(OutputError):
         return plain._replace(rows=jnp.where(wild, beyond, plain.rows))
 
     def scale(self, errors):
-        """The median of the errors' sizes, which wild ones leave alone."""
+        """Return the median of the errors' sizes, which outliers do not affect."""
         return float(np.median(np.abs(errors)) / 0.6745)
 
     def log_likelihood(self, layout, data, noise, e):
-        """Of the density exp(-rho(v / s)) / (c s)."""
+        """Return the log-likelihood of the density exp(-rho(v / s)) / (c s)."""
         normal = math.sqrt(2.0 * math.pi) * math.erf(BEND / math.sqrt(2.0))
         c, total = normal + 2.0 * math.exp(-(BEND**2) / 2.0) / BEND, 0.0
         for v in errors_of(layout, e):

@@ -1,4 +1,4 @@
-"""Sticks that are not centred: a constant offset of each input, in each flight."""
+"""Sticks that are not centred: a constant offset of each input in each flight."""
 
 from typing import Annotated, NamedTuple
 
@@ -17,7 +17,7 @@ DT, N = 0.02, 4000
 
 
 def flown(seed: int, share: float) -> tuple[Flight, float]:
-    """A free roll whose stick stands off by a share of its amplitude; the log does not show it."""
+    """Return a free roll whose stick is off by a share of its amplitude, not in the log."""
     amplitude = amplitude_for(BENCH, DT, False)
     rng = np.random.default_rng(seed)
     u = steps(rng, N, DT, amplitude)
@@ -75,8 +75,8 @@ def problem_of(free: dict[str, Free], outputs: tuple[str, ...], nuisance: Nuisan
     [
         (("Lp", "Ld"), ("phi",), ("d",)),
         (("Lp", "Ld"), ("p", "phi"), ("d",)),
-        (("Lp", "Ld"), ("p",), ()),  # the bias takes it up
-        (("Lp", "Ld", "L0"), ("phi",), ()),  # a parameter stands for it
+        (("Lp", "Ld"), ("p",), ()),  # the bias absorbs it
+        (("Lp", "Ld", "L0"), ("phi",), ()),  # a parameter represents it
     ],
 )
 def test_where_the_offset_is_estimated_unless_told(free, outputs, expected):

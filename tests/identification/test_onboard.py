@@ -1,4 +1,4 @@
-"""Servo and delays of a simulated record, estimated; and what a fit without the servo says."""
+"""Servo and delays of a simulated record, and findings of a fit without the servo."""
 
 import math
 
@@ -16,7 +16,7 @@ DELAY_LAT, DELAY_PHI = 0.034, 0.051
 
 
 def record(seed, n=300):
-    """Roll through an 8 Hz servo, by scipy at 1 kHz; delays are whole milliseconds there."""
+    """Return a roll through an 8 Hz servo, by scipy at 1 kHz, with delays of whole milliseconds."""
     rng = np.random.default_rng(seed)
     lat = np.repeat(rng.uniform(-0.3, 0.3, n), rng.integers(5, 25, n))[:n]
     den = np.polymul([1.0, 1.0 / TAU_F, LB], [1.0, 2.0 * ZETA * OMEGA, OMEGA**2])
@@ -26,7 +26,7 @@ def record(seed, n=300):
     )
 
     def response(system, delay):
-        # At rest before the record, and read as late as it is logged.
+        # At rest before the record, and read with the log's delay.
         lead = 200
         u = np.concatenate([np.zeros(lead), np.repeat(lat, FINE)])
         y = scipy.signal.lfilter(system[0].ravel(), system[1], u)
@@ -58,6 +58,6 @@ def test_a_servo_and_two_delays_are_recovered():
     for name, value in truth.items():
         estimate = found.estimates[name]
         assert estimate.lower95 < value < estimate.upper95, name
-    # Well enough to tell it from a servo twice as fast.
+    # Accurate enough to exclude a servo twice as fast.
     assert found.estimates["omega_servo"].sd < 0.15 * OMEGA
     assert not [f for f in found.findings if f.code.startswith("dynamics.")]

@@ -1,4 +1,4 @@
-"""A search that says how far it is ends where one that says nothing does."""
+"""A search with progress messages has the same result as one without."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from tests.identification.bench import BENCH, record, vehicle
 
 
 class Steps:
-    """Counts what the stages say of their steps."""
+    """Count the messages of the stages on their steps."""
 
     def __init__(self):
         self.stages = []
@@ -37,6 +37,6 @@ def test_numbers_are_the_same_to_the_last_bit(problem):
     assert told.trace == silent.trace
     assert told.estimates == silent.estimates
     [search] = [s for s in heard.stages if s.words.startswith("fitting")]
-    # All steps of all starts, and those of the rounds that relax the noise; not the first points.
+    # All steps of all starts and of the noise relaxation, without the first points.
     assert search.done >= sum(row.steps - 1 for row in silent.starts)
     assert search.detail.startswith("cost ")

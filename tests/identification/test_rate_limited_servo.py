@@ -1,5 +1,4 @@
-"""A servo limited in rate: simulated as SciPy does it from kink to kink, and one standard error of
-one optimum wherever the search came from."""
+"""A rate-limited servo: simulation against SciPy, and one optimum from different starts."""
 
 import itertools
 import math
@@ -17,7 +16,7 @@ DT = 0.01
 
 
 def stick(n):
-    """Doublets of random sizes at 1 kHz, whose edges lie between the n samples of the log."""
+    """Return random doublets at 1 kHz, with edges between the n samples of the log."""
     rng, u, at = np.random.default_rng(5), np.zeros(10 * n), 200
     while at < 10 * n - 900:
         size, length = rng.uniform(0.15, 0.5) * rng.choice([-1, 1]), int(rng.integers(150, 400))
@@ -27,7 +26,7 @@ def stick(n):
 
 
 def to_the_next_kink(x, t, end, command):
-    """The run of solve_ivp from x at t until the limit begins or ends, or until `end`."""
+    """Run solve_ivp from x at t until the limit begins or ends, or until `end`."""
     lb, tau, blat, _, most = TRUE.values()
 
     def asked(y):
@@ -35,7 +34,7 @@ def to_the_next_kink(x, t, end, command):
 
     now = asked(x)
     limited = abs(now) > most
-    if abs(abs(now) - most) < 1e-9:  # just there: on the way up or down
+    if abs(abs(now) - most) < 1e-9:  # at the limit: on the way up or down
         limited = now * x[4] < 0
 
     def rates(_, y):
@@ -52,8 +51,10 @@ def to_the_next_kink(x, t, end, command):
 
 
 def by_events(u, dt, times):
-    """phi and p at `times` [s] of the servo that asks for no more than its greatest speed, the
-    equations solved anew from every edge and every begin and end of the limit."""
+    """Return phi and p at `times` [s] of a servo that limits its commanded speed.
+
+    The equations are solved anew from every edge and every begin and end of the limit.
+    """
     late = TRUE["delay_servo"]
     edges = dt * (np.flatnonzero(np.diff(u)) + 1) + late
     edges = [0.0, *edges[edges < times[-1]], times[-1]]
@@ -81,6 +82,6 @@ def test_it_is_simulated_as_scipy_does_from_kink_to_kink():
     phi, p = by_events(logged, DT, times)
     assert np.max(np.abs(p)) > 1.0
     run = simulate(MODEL, params(**TRUE), MODEL.Inputs(lat=logged), dt=DT)
-    # A tenth of what gyros are read to, at the steps of a fit.
+    # A tenth of a gyro's resolution, at the steps of a fit.
     np.testing.assert_allclose(run.outputs.p, p, atol=2e-4)
     np.testing.assert_allclose(run.outputs.phi, phi, atol=2e-4)

@@ -1,4 +1,4 @@
-"""Windows of a record: the part that is excited is found, what is damaged is left out."""
+"""Windows of a record: the excited part is chosen, damaged parts are left out."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ from tests.identification.test_enough import DT, problem, response, steps
 
 
 def excited(first, last, n=2000, seed=0):
-    """Forty seconds, the stick still but for one part."""
+    """Return forty seconds, with the stick at rest except in one part."""
     rng = np.random.default_rng(seed)
     u = np.zeros(n)
     u[first:last] = steps(rng, last - first)
@@ -34,7 +34,7 @@ def ranked():
 
 def test_the_excited_part_is_found(ranked):
     assert ranked.parameters == ("k", "d", "b")
-    # What is left of the motion after 24 s says a little of the damping.
+    # The remaining motion after 24 s has some information about the damping.
     for choice in ranked.taken:
         assert choice.window.start < 25.0
         assert choice.window.end > 16.0
@@ -50,7 +50,7 @@ def test_the_excited_part_is_found(ranked):
 @pytest.mark.slow
 def test_the_expected_sd_is_that_of_a_check_of_the_window_alone(ranked):
     whole = excited(800, 1200)
-    # One that begins at rest, as `check` begins.
+    # A window that begins at rest, as in `check`.
     [window] = [w for w in ranked.windows if w.first == 800]
     alone = part(whole, window.first, window.last)
     sd = np.sqrt(np.diag(check(problem(alone)).verdict.covariance))
@@ -69,7 +69,7 @@ def test_no_part_says_more_than_the_whole(ranked):
     sd = np.sqrt(np.diag(check(whole).verdict.covariance))
     assert np.all(ranked.all_sd >= 0.999 * sd)
     assert all(np.all(w.sd >= 0.999 * sd) for w in ranked.windows)
-    # One window that is all of the record says what `check` says of it.
+    # A window of the whole record gives the result of `check`.
     [window] = windows(whole, 40.0).windows
     np.testing.assert_allclose(window.sd, sd, rtol=1e-3)
     assert ranked.guessed == ()

@@ -1,4 +1,4 @@
-"""Problems that cannot be posed: each is refused, with the place in the first words."""
+"""Invalid problems: each is refused, with the place at the start of the message."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""What is said of autocorrelated residuals goes by the intervals that are reported."""
+"""Findings on autocorrelated residuals use the reported intervals."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ N, DT = 600, 0.02
 
 @pytest.fixture(scope="module")
 def found():
-    """12 s of the bench with a slow oscillation that is larger than its response."""
+    """Return 12 s of the bench with a slow oscillation larger than its response."""
     rng = np.random.default_rng(0)
     u = steps(rng, N, DT, 3e-6)
     root = 0.995 * np.exp(0.04j)
@@ -63,7 +63,7 @@ def test_reported_intervals_enter_the_verdict():
 
 
 def test_the_residuals_part_of_the_hessian_is_that_of_finite_differences(found):
-    """Second differences of r'r/2, which never see J."""
+    """Return second differences of r'r/2, which do not use J."""
     at = found.reached
 
     def cost(i, j, a, b):
@@ -86,7 +86,7 @@ def test_the_residuals_part_of_the_hessian_is_that_of_finite_differences(found):
 
 @pytest.mark.parametrize(("sd", "determined"), [(0.1, True), (1.2, False), (400.0, False)])
 def test_a_product_from_nothing_to_anything_is_not_determined(sd, determined):
-    # Both may grow by the same factor; from 1.18 on 1.96 sd are more than the logarithm of ten.
+    # Both may grow by the same factor; above 1.18, 1.96 sd exceed the logarithm of ten.
     unknowns = tuple(Unknown(n, v, True, 1.0, 0.0) for n, v in (("Ixx", 0.05), ("a", 6.0)))
     null = np.array([1.0, 1.0]) / np.sqrt(2.0)
     across = np.array([1.0, -1.0])

@@ -1,4 +1,4 @@
-"""Every run of a search is a row of `Fit.starts`, with its reason; one rule chooses."""
+"""Every run of a search is a row of `Fit.starts` with its reason; one rule chooses."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -19,7 +19,7 @@ def test_names_are_codes_and_stand_once():
 
 
 def test_a_damping_of_the_wrong_sign_is_found_by_windows():
-    # Of a linear model equation error would do as well.
+    # For a linear model equation error would be enough.
     model = dataclasses.replace(ROLL, linear=False)
     flight = record(n=300, noise=2e-3)
     free = {"Lp": Free(4.0), "Lda": Free(9.0)}
@@ -62,5 +62,5 @@ def test_convergence_then_stability_then_the_posterior_decide(monkeypatch):
         for worse in ranked[i + 1 :]:
             assert search.is_better(over, better, worse)
             assert not search.is_better(over, worse, better)
-    # No difference: what was found first stays.
+    # Without a difference the first result stays.
     assert not search.is_better(over, optimum(True, False, 4.05), ranked[1])

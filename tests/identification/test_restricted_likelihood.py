@@ -1,5 +1,4 @@
-"""How large the noise of an integrated sensor is, against the restricted likelihood of a record
-whose covariance is written out as a matrix."""
+"""Noise size of an integrated sensor, against the restricted likelihood with a full covariance."""
 
 import numpy as np
 import pytest
@@ -25,7 +24,7 @@ def record(seed):
 
 
 def by_matrices(left, *, restricted):
-    """The walk's intensity of the greatest likelihood of a walk, a line and white noise."""
+    """Return the walk's intensity at the maximum likelihood of a walk, a line and white noise."""
     n = np.arange(N)
     walk = DT * np.minimum(n[:, None], n[None, :])
     X = np.stack([np.ones(N), n * DT], axis=1)
@@ -55,5 +54,5 @@ def test_what_a_bias_takes_up_of_the_noise_is_given_back():
     found = fit(problem, starts=1).estimates["walk"].value
     plain, restricted = (by_matrices(left, restricted=how) for how in (False, True))
     assert restricted > 1.05 * plain
-    # The initial state's weak prior, and derivatives by differences, are what is left.
+    # The difference comes from the initial state's weak prior and from finite differences.
     assert abs(np.log(found / restricted)) < 0.2 * np.log(restricted / plain)

@@ -1,4 +1,4 @@
-"""Recursive least squares against least squares all at once."""
+"""Recursive least squares against batch least squares."""
 
 import re
 
@@ -21,7 +21,7 @@ go = jax.jit(rls_regression)
 
 
 def batch(phi, y, forgetting, p0):
-    """argmin sum_k f^(N-1-k) (y - phi theta)^2 + f^N |theta|^2 / p0, by QR in float64."""
+    """Return argmin sum_k f^(N-1-k) (y - phi theta)^2 + f^N |theta|^2 / p0, by QR in float64."""
     n, q = phi.shape
     root = np.sqrt(forgetting) ** np.arange(n - 1, -1, -1)
     keep = root > 1e-30
@@ -83,7 +83,7 @@ def test_directions_without_news_never_become_nan(kind, dtype):
         assert leaf.dtype == dtype
         assert np.isfinite(np.asarray(leaf)).all()
     assert np.max(found.largest) <= 1.01 * bound / f**q
-    # What is excited is still learnt: the prediction fits while there is something to predict.
+    # Excited directions are still estimated: the prediction fits while there is motion.
     end = n // 4 if kind == "silent" else n
     error = np.asarray(found.error)[end - 1000 : end]
     assert np.abs(error).max() < (1e-7 if dtype == jnp.float64 else 2e-2)
@@ -100,7 +100,7 @@ def test_silence_leaves_the_estimate_alone():
 
 @pytest.mark.parametrize("forgetting", [1.0, 0.95])
 def test_equations_31_and_33_agree(forgetting):
-    """The gain with the old P over the denominator equals the new P times the regressor."""
+    """Test that the gain from the old P equals the new P times the regressor."""
     rng = np.random.default_rng(4)
     state, f = rls_init(5, 10.0), jnp.asarray(forgetting)
     step = jax.jit(rls_step)
@@ -121,7 +121,7 @@ def test_equations_31_and_33_agree(forgetting):
 
 
 def test_bound_is_a_pseudo_measurement_of_one_parameter():
-    """Beyond the bound P shrinks as by a measurement of e_i; Theta stays."""
+    """Test that beyond the bound P shrinks as by a measurement of e_i, with Theta unchanged."""
     rng = np.random.default_rng(5)
     S = jnp.asarray(rng.standard_normal((3, 3)) * [[1.0], [30.0], [2.0]])
     state = rls_init(3)._replace(S=S)

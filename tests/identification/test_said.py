@@ -1,4 +1,4 @@
-"""What a fit says agrees with what it gives: no word of an unknown that is not determined."""
+"""Sentences of a fit agree with its numbers: none on unknowns that are not determined."""
 
 from dataclasses import replace
 from typing import Annotated, NamedTuple
@@ -29,7 +29,7 @@ MODEL = replace(LAG, output=lambda p, s, u: Outputs(p=s.p, again=s.p), Outputs=O
 
 
 def record(seed: int, shared: float, own: float) -> Flight:
-    """Two sensors of one rate, with noise in common and noise of their own."""
+    """Return two sensors of one rate, with common noise and separate noise."""
     rng = np.random.default_rng(seed)
     u = random_steps(N, DT, rng, (0.2, 1.0))
     y = response(-2.0, 3.0, u, DT) + shared * rng.standard_normal(N)
@@ -74,7 +74,7 @@ def test_an_effect_that_ends_with_the_other_sign_is_told():
     [one] = of(found, "signs.turned-from-start")
     assert (one.severity, one.subjects) == ("doubt", ("Ld",))
     assert not of(fit(problem(flight, **free)), one.code)
-    # Next to zero a start says nothing of a sign.
+    # A start near zero does not determine a sign.
     free["Ld"] = Free(0.1, sign="any")
     assert not of(fit(problem(turned, **free)), one.code)
 
@@ -115,7 +115,7 @@ def test_parameters_that_are_correlated_as_a_group_are_pairs():
     # Any rotation of the rows has the same covariance.
     rotation = np.linalg.qr(rng.standard_normal((6, 6)))[0]
     verdict = analyse(rotation @ root, unknowns(*names))
-    # The oracle: c_i c_j / sqrt((c_i^2 + e)(c_j^2 + e)), e = 1e-3.
+    # The reference: c_i c_j / sqrt((c_i^2 + e)(c_j^2 + e)), e = 1e-3.
     c = dict(zip(names, together + other, strict=True))
     found = {frozenset((p.first, p.second)): p.correlation for p in verdict.pairs}
     wanted = [("a", "Ixx"), ("a", "Iyy"), ("Ixx", "Iyy"), ("Ir", "K")]
@@ -134,11 +134,11 @@ def test_what_is_determined_in_a_wide_interval_is_so_only_roughly():
     around = Around(reported=np.diag([0.64, 1e-4]))
     verdict = analyse(np.diag([2.5, 100.0]), unknowns("L", "B"), around=around)
     assert verdict.roughly == ("L",)
-    # Of either sign the interval is -0.57 to 2.57 times the value: no factor.
+    # With either sign the interval is -0.57 to 2.57 times the value: no factor.
     first, second = unknowns("L", "B")
     verdict = analyse(sensitivity, (first, second._replace(symmetric=True)))
     assert verdict.roughly == ("B",)
-    # So it is where the value is small beside the start, in whose units the coordinate is then.
+    # The same holds if the value is small relative to the start, the unit of its coordinate.
     near = second._replace(symmetric=True, logarithmic=False, reference=500.0)
     for sd, zero in ((0.0009, ()), (0.0011, ("B",))):
         verdict = analyse(np.diag([100.0, 1.0 / sd]), (first, near))
@@ -147,7 +147,7 @@ def test_what_is_determined_in_a_wide_interval_is_so_only_roughly():
 
 
 def test_of_a_time_shift_at_its_end_is_not_said_that_it_has_no_effect():
-    # Searched through a tanh, whose slope vanishes there: a record that wants it beyond.
+    # The search uses a tanh, whose slope vanishes there; the record prefers a value beyond.
     [parameter] = unknowns("L")
     shift = Unknown("time_shift", 0.5, False, 1.0, 0.0, is_parameter=False, at_bound=True)
     verdict = analyse(np.array([[100.0, 0.0]]), (parameter, shift))

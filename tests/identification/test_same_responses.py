@@ -1,4 +1,4 @@
-"""Values with the same responses, against the exchange of two modes written out by hand."""
+"""Values with equal responses, against the exchange of two modes by hand."""
 
 from typing import Annotated, Any, NamedTuple
 
@@ -59,7 +59,7 @@ FREE = {
 
 
 def exchanged(Zw, Kn, tn, Zc):
-    """By hand: both poles change places, zero and gain stay.
+    """Return by hand the values with both poles exchanged, zero and gain unchanged.
 
     az/col = Zc s (s + (1 + ZNU Kn / Zc)/tn) / ((s - Zw)(s + 1/tn))
     """
@@ -70,7 +70,7 @@ def exchanged(Zw, Kn, tn, Zc):
 
 @pytest.fixture(scope="module")
 def flight():
-    """By small steps of Euler's method: gusts of 0.35 m/s^2 with a correlation time of 0.4 s."""
+    """Return a record by small Euler steps: gusts of 0.35 m/s^2, correlation time 0.4 s."""
     rng, h, parts = np.random.default_rng(5), DT / 20, 20
     col = 0.1 * np.repeat(rng.choice([-1.0, 0.0, 1.0], N // 50), 50)
     w = nu = g = 0.0
@@ -104,5 +104,5 @@ def test_two_modes_that_change_places_answer_alike(flight):
 @pytest.mark.slow
 def test_none_answers_alike_outside_the_bounds_or_with_a_known_inflow(flight):
     assert asked(flight, {**FREE, "Zw": Free(-0.55, -3.0, -0.1)}) == []
-    # The modes cannot change places without another share of the inflow.
+    # The modes can only change places with another share of the inflow.
     assert asked(flight, {n: FREE[n] for n in ("Zw", "tn")}) == []

@@ -1,5 +1,7 @@
-"""Unknowns of very different size, without effect at the start, or without any: each moves where
-the data say where to, and else is said to be not identifiable."""
+"""Unknowns of very different size, or without effect, at the start or at all.
+
+Each moves to the data's value, or is marked as not identifiable.
+"""
 
 from typing import NamedTuple
 
@@ -37,8 +39,7 @@ class Outputs(NamedTuple):
     y: float
 
 
-# A lag whose time constant has no effect while the gain is zero, two inputs straight to the output,
-# and a parameter that nothing feels.
+# A lag whose time constant has no effect at zero gain, two direct inputs, and an unused parameter.
 model = Model(
     "scales",
     lambda p, s, u: State(x=(p.K * u.u - s.x) / p.tau + 0.0 * p.c),
@@ -62,7 +63,7 @@ def test_parameters_of_1e_minus_8_and_1e6_are_found_together(start):
     found = fitted(y, free, u=np.zeros(N), v=V, w=W)
     exact, *_ = np.linalg.lstsq(np.stack([V, 1e12 * W], axis=1), y, rcond=None)
     assert found.status == "converged"
-    # Cramér-Rao of each, by hand; a search ends within a hundredth of it.
+    # Cramér-Rao bound of each, by hand; a search ends within a hundredth of it.
     sd = np.std(y - V * exact[0] - 1e12 * W * exact[1])
     assert found.estimates["a"].value == pytest.approx(exact[0], abs=0.02 * found.estimates["a"].sd)
     b = 1e12 * exact[1]
@@ -78,7 +79,7 @@ def test_what_has_no_effect_at_the_start_alone_moves():
     for name, truth in (("K", 2.0), ("tau", 0.5)):
         e = found.estimates[name]
         assert abs(e.value - truth) < 4.0 * e.sd < 0.1
-    # What never has one stays where it began, and that is said.
+    # A parameter without effect stays at its start, and a finding states this.
     assert found.status == "not-identifiable"
     assert found.verdict.without_effect == ("c",)
     assert found.estimates["c"].value == 1.0

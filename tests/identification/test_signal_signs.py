@@ -1,4 +1,4 @@
-"""Signs, units and clocks of signals that do not go together, and those that do."""
+"""Consistency of signs, units and clocks of signals."""
 
 from types import SimpleNamespace
 
@@ -16,7 +16,7 @@ DEGREE = np.pi / 180.0
 
 
 def moved(seed=0):
-    """An angle of swings by SciPy, and its rate, with the noise of sensors."""
+    """Return an oscillating angle by SciPy, and its rate, with sensor noise."""
     rng = np.random.default_rng(seed)
     u = steps(rng, N)
     phi, p = response(u, np.zeros(N))
@@ -36,10 +36,10 @@ def test_an_angle_that_moves_as_its_rate_says_nothing():
     for seed in range(20):
         _, phi, p = moved(seed)
         assert said(phi, p) == []
-        # A bias, a gyro that is off by a hundredth, and one in five samples of the angle.
+        # A bias, a gyro scale off by 1 %, and one in five samples of the angle.
         assert said(phi + 1.0, 1.01 * p - 0.3) == []
         assert said(np.where(np.arange(N) % 5 == 0, phi, np.nan), p) == []
-        # Nothing can be told of signals that have nothing in common.
+        # Unrelated signals give no result.
         assert said(phi, moved(seed + 100)[2]) == []
 
 
@@ -55,7 +55,7 @@ def test_a_wrong_sign_or_unit_of_an_angle_or_its_rate_is_said(angle, rate, denie
     [found] = said(angle * phi, rate * p)
     assert (found.code, found.subjects) == ("signs.rate-against-angle", ("p", "phi"))
     assert found.value == pytest.approx(angle / rate, rel=0.05)
-    # No model follows what runs backward or is in other units; a scale it may take up.
+    # No model can follow reversed signs or other units, but it can absorb a scale.
     assert found.denies is denies
 
 
@@ -77,7 +77,7 @@ def test_an_output_that_moves_against_the_simulated_one_is_said():
     for sign in (1.0, -1.0):
         inputs = {"u": sign * u, "v": np.zeros(N)}
         flight = Flight(dt=DT, inputs=inputs, outputs={"phi": phi, "p": p})
-        # Start values that are off: a swing of 4 rad/s in place of 6, and half the effect.
+        # Wrong start values: a mode of 4 rad/s instead of 6, and half the effect.
         b, a, _ = scipy.signal.cont2discrete(([10.0], [1.0, 2.0, 16.0]), DT)
         guess = scipy.signal.lfilter(np.ravel(b), a, sign * u)
         run = {"phi": guess, "p": np.gradient(guess, DT)}
@@ -101,8 +101,10 @@ def test_a_turned_output_is_a_doubt_before_a_fit_and_after_one_that_explains_lit
 
 
 def swept_and_held(seed=0, held_by=0.3, swept=0.0, sign=1.0):
-    """A rate in gusts, held by a pilot late by 0.1 s and perhaps swept too; and what its stick
-    alone makes of a right model."""
+    """Return a rate in gusts, held by a pilot with a delay of 0.1 s.
+
+    It may also be swept. The second result is the response of a right model to the stick alone.
+    """
     rng = np.random.default_rng(seed)
     u, p, answer = np.zeros(N), np.zeros(N), np.zeros(N)
     gust = scipy.signal.lfilter([1.0], [1.0, -0.98], 0.1 * rng.standard_normal(N))
@@ -116,6 +118,6 @@ def swept_and_held(seed=0, held_by=0.3, swept=0.0, sign=1.0):
 
 def test_a_stick_that_holds_in_one_flight_and_sweeps_in_another_has_the_right_sign():
     held, swept = swept_and_held(), swept_and_held(1, swept=1.0)
-    # Alone it may be either, and that is said.
+    # Alone it may be either, as the finding states.
     assert against(*held)["p"] < -0.3
     assert against_start([held[0], swept[0]], [held[1], swept[1]]) == {}

@@ -1,4 +1,4 @@
-"""A parameter whose sign physics does not give ends at the truth, whatever sign it began with.
+"""Parameters of unknown sign converge to the truth from either sign.
 
 The records come from SciPy's exact discretisation, not from our own simulation.
 """
@@ -94,7 +94,7 @@ def test_a_start_of_the_wrong_sign_ends_at_the_truth(starts):
         one = found.estimates[name]
         assert abs(one.value - true) < 4 * one.sd
         assert one.sd < 0.1 * abs(true)
-        # Not a logarithm's interval: as far to one side as to the other.
+        # The interval is symmetric, not that of a logarithm.
         assert one.upper95 - one.value == pytest.approx(one.value - one.lower95, rel=1e-6)
 
 
@@ -125,7 +125,7 @@ def test_one_bound_beyond_zero_is_kept():
     found = fit(problem({"Ld": Free(1.0, upper=10.0), "Nd": Free(1.0, lower=-20.0)}))
     assert found.estimates["Ld"].at_bound
     assert found.estimates["Ld"].value == pytest.approx(10.0, rel=1e-3)
-    # What Ld may not be is asked of the others.
+    # Limits of Ld apply to the others.
     assert found.estimates["Nd"].value == pytest.approx(-3.0, abs=0.5)
 
 

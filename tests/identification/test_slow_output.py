@@ -1,4 +1,4 @@
-"""An angle at 5 Hz beside a rate at 50 Hz: as good as its own samples, and no better."""
+"""An angle at 5 Hz beside a rate at 50 Hz has the information of its own samples."""
 
 import dataclasses
 
@@ -16,13 +16,13 @@ from heli_jax.identification.validation.metrics import whiteness
 from .bench import BENCH, amplitude_for, denominators, steps, vehicle
 
 N, DT, FINE = 1500, 0.02, 20
-"""samples of the flight, their step [s], and steps of the truth in one of them"""
+"""Samples of the flight, their step [s], and steps of the true motion in one of them."""
 NOISE = {"roll": 2e-3, "roll_rate": 1e-2}
 FREE = {"Ixx": Free(0.03), "If": Free(2.5e-4)}
 
 
 def truth(seed):
-    """Stick (N,), and roll and its rate (N FINE,) by scipy: eq. 23, and the same times s."""
+    """Return stick (N,), roll and its rate (N FINE,) by scipy: eq. 23, and the same times s."""
     rng = np.random.default_rng(seed)
     u = steps(rng, N, DT, amplitude_for(BENCH, DT, True))
     num, den = denominators(BENCH, True)
@@ -35,7 +35,7 @@ def truth(seed):
 
 
 def record(seed, *, slow):
-    """A flight whose roll is measured every 0.2 s with jitter where `slow`."""
+    """Return a flight whose roll is measured every 0.2 s with jitter, if `slow`."""
     u, made = truth(seed)
     rng = np.random.default_rng(seed + 1000)
     rate = made["roll_rate"][::FINE] + NOISE["roll_rate"] * rng.standard_normal(N)
@@ -61,7 +61,7 @@ def test_the_estimates_are_those_of_the_full_rate(fits):
     assert slow.status == "converged"
     assert slow.n_samples == N + 148
     for name, one in slow.estimates.items():
-        # Less is known, so the two differ by about the slow one's sd.
+        # With less information the two differ by about the slow one's sd.
         assert one.value == pytest.approx(full.estimates[name].value, abs=1.5 * one.sd)
         assert abs(one.value - BENCH[name]) < 3.0 * one.sd
         assert full.estimates[name].sd < one.sd
@@ -74,7 +74,7 @@ def test_the_estimates_are_those_of_the_full_rate(fits):
 def test_slow_residuals_that_are_not_white_are_told(fits):
     residual = fits[True].signals[0].residual("roll")
     drifting = residual + 4e-3 * np.sin(0.8 * DT * np.arange(N))
-    # With jitter hardly a lag of the grid has many pairs: lags are counted in samples.
+    # With jitter few lags of the grid have many pairs, so lags count samples.
     assert not whiteness(drifting).white
     assert whiteness(residual).white
     assert whiteness(drifting).lag1 > 0.5
@@ -92,7 +92,7 @@ def test_an_equation_error_start_has_something_to_smooth():
     assert part.stop - part.start > 0.97 * N
     truth_there = truth(0)[1]["roll"][::FINE][part]
     assert np.std(bridged["roll"][part] - truth_there) < 0.1 * np.std(truth_there)
-    # A gap that is long for the slow sensor too ends a segment.
+    # A gap that is long even for the slow sensor ends a segment.
     roll = np.where(abs(np.arange(N) - 700) < 30, np.nan, flight.outputs["roll"])
     assert len(segments({"roll": roll})[0]) == 2
 

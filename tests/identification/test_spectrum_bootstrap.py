@@ -1,4 +1,4 @@
-"""The bootstrap of fits in frequency: what is drawn, and how estimates scatter."""
+"""Bootstrap of fits in frequency: the draws, and the scatter of estimates."""
 
 import jax
 import numpy as np
@@ -24,7 +24,8 @@ def test_a_record_that_is_drawn_differs_in_its_noise_alone(fitted_by_lines):
         other = next(drawn)
         [y], [before] = (list(d.flights[0].outputs.values()) for d in (other, at.data))
         y, before = np.asarray(y), np.asarray(before)
-        # Measured less residual is what stays: what is new has the residual's size at each line.
+        # The fixed part is measured less residual; the drawn part has the residual's size at each
+        # line.
         new = lines_of((y - before)[:, None]) + errors
         powers.append(np.abs(new[:, 0]) ** 2)
         assert other.flights[0].inputs is at.data.flights[0].inputs

@@ -1,4 +1,4 @@
-"""The filter with one covariance and a gain that freezes, against NumPy and the exact filter."""
+"""The filter with one covariance and a frozen gain, against NumPy and the exact filter."""
 
 import dataclasses
 from typing import Any
@@ -17,13 +17,13 @@ from heli_jax.identification.estimation.shared_covariance import Gaussian, Recor
 from heli_jax.identification.unknowns.layout import layout_of, unpack
 from heli_jax.naming import asdict
 
-# Two states, the second of them driven by noise; one input, two outputs, two records.
+# Two states, the second driven by noise; one input, two outputs, two records.
 N = 700
 FAST = {"decay": 0.9, "noise": 0.3}
 SLOW = {"decay": 0.998, "noise": 1e-3}
-"""known only after hundreds of samples"""
+"""A mode known only after hundreds of samples."""
 NEVER = {"decay": 1.0, "noise": 0.0}
-"""a constant: its variance falls as that of a mean does, and the gain never freezes"""
+"""A constant: its variance falls like that of a mean, and the gain never freezes."""
 CASES = {
     "fast": FAST,
     "slow mode": SLOW,
@@ -34,7 +34,7 @@ CASES = {
 
 
 def gaussian(decay, noise, seen=1.0, R: Any = 0.04):
-    """A system of which everything that may depend on an unknown does."""
+    """Return a system in which everything that may depend on an unknown does."""
     return Gaussian(
         Ad=jnp.asarray([[0.95, 0.1 * seen], [0.0, 1.0]]).at[1, 1].set(decay),
         B=jnp.asarray([[0.2], [0.0]]) * decay,
@@ -53,7 +53,7 @@ def records():
 
 
 def by_hand(system):
-    """Log-likelihood of the records by the textbook's filter in NumPy."""
+    """Return the log-likelihood of the records by a textbook filter in NumPy."""
     Ad, B, C, D, Q, R, P0 = (np.asarray(v) for v in system)
     U, acting, y, x0 = (np.asarray(v) for v in records())
     total = 0.0
@@ -76,7 +76,7 @@ def likelihood(system):
 
 
 def at(z):
-    """Logarithms of noise and R, and the decay itself, as unknowns."""
+    """Return the unknowns: logarithms of noise and R, and the decay."""
     return gaussian(z[0], jnp.exp(z[1]), 1.0, jnp.exp(z[2]))
 
 
@@ -118,7 +118,7 @@ def test_derivatives_are_those_of_finite_differences(case):
 
 
 def test_side_by_side_each_is_what_it_is_alone():
-    # One that freezes beside one that freezes later, and one that never does.
+    # One freezes early, one later, and one never.
     points = [point(**FAST), point(**SLOW), point(1.0, 1e-9)]
     together = BATCH(jnp.stack(points))
     for z, gradient in zip(points, together, strict=True):
@@ -150,7 +150,7 @@ def test_flights_together_have_the_innovations_of_the_exact_filter_and_their_der
     direction = jnp.asarray(np.random.default_rng(4).standard_normal(z.size))
 
     def along(layout, noise):
-        """The innovations, and their derivative along a direction in all unknowns."""
+        """Return the innovations, and their derivative along a direction in all unknowns."""
 
         def found(z):
             return filtered_flights(layout, data, noise, unpack(layout, data, z))
@@ -162,7 +162,7 @@ def test_flights_together_have_the_innovations_of_the_exact_filter_and_their_der
     found, expected = together(layout, noise), jax.jit(along, static_argnums=0)(apart, noise)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max())
-    # A noise that is not the same in all flights has no one covariance: no number is given.
+    # A noise that differs between flights has no single covariance: the result is NaN.
     noise.sd[1]["roll"] = 2.0 * noise.sd[1]["roll"]
     assert all(np.isnan(v).all() for v in jax.tree.leaves(together(layout, noise)[0]))
 

@@ -1,4 +1,4 @@
-"""A servo's lag before a rate's damping: the same response with the two modes exchanged."""
+"""A servo's lag before a rate's damping: equal responses with the modes exchanged."""
 
 from typing import Annotated, NamedTuple
 
@@ -40,7 +40,7 @@ NUISANCE = Nuisance(bias=False, initial_state=False)
 
 
 def flight(outputs=("p",), noise=0.05):
-    """The record by SciPy."""
+    """Return the record by SciPy."""
     M = np.array([[-6.0, 40.0, 0.0], [0.0, -20.0, 20.0], [0.0, 0.0, 0.0]])
     E = np.asarray(scipy.linalg.expm(DT * M))
     X = np.zeros((N, 2))
@@ -66,7 +66,7 @@ def problem(record, factor=1.0, ts=None, **options):
 
 
 def exchanged(values):
-    """By algebra: L / (ts (s - Lp) (s + 1/ts)) stays as it is."""
+    """Test by algebra: L / (ts (s - Lp) (s + 1/ts)) is unchanged."""
     ts = -1.0 / values["Lp"]
     return {"Lp": -1.0 / values["ts"], "L": values["L"] * ts / values["ts"], "ts": ts}
 
@@ -85,7 +85,7 @@ def test_both_solutions_are_told_from_either(factor):
 
 
 def test_what_tells_them_apart_leaves_one():
-    """A bound, and the servo measured."""
+    """Test a bound, and a measured servo."""
     bounded = fit(problem(flight(), ts=Free(0.05, lower=0.01, upper=0.1)))
     assert (bounded.status, bounded.verdict.second) == ("converged", ())
     measured = check(problem(flight(("p", "s"))))

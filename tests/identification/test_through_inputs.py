@@ -1,4 +1,4 @@
-"""What the colour of a disturbance tells is kept apart from what the inputs tell."""
+"""Information from the disturbance's spectrum, separate from that of the inputs."""
 
 import numpy as np
 import pytest
@@ -37,8 +37,10 @@ B:
 
 
 def problem(folder, seconds, free=tuple(TRUTH), memory=0.0, seed=0):
-    """A stand in gusts, by matrix exponentials of ten steps a sample, with measurement noise of an
-    autocorrelation at one sample."""
+    """Return a stand in gusts, by matrix exponentials of ten steps per sample.
+
+    The measurement noise has an autocorrelation at lag one.
+    """
     (folder / "stand.yaml").write_text(STAND)
     stand = linear_model(folder / "stand.yaml")
     rng, n, fine = np.random.default_rng(seed), round(seconds / DT), 10
@@ -74,12 +76,12 @@ def with_noise(stand):
 
 
 def verdicts(problem):
-    """At the truth: of all that the innovations tell, and of what inputs do."""
+    """Return the information at the truth: of the innovations, and of the inputs."""
     guess = first_guess(problem)
     at = Solution(*guess[:4])
     e = evaluate(at.layout, at.data, at.noise, at.z)
     inputs = through_inputs(at, e)
-    # Rounding of what no input tells would be scaled to the size of what they tell.
+    # Noise parameters need exact zeros, since scaling would enlarge rounding.
     assert not inputs.J[:, [at.layout.disturbance_at(n) for n in ("sigma_w", "tau_w")]].any()
     return verdict_of(problem, at.layout, e), verdict_of(problem, at.layout, inputs)
 
@@ -88,9 +90,9 @@ def test_no_input_tells_five_parameters_from_four_coefficients(tmp_path):
     everything, inputs = verdicts(problem(tmp_path, 60.0))
     assert not inputs.identifiable
     assert set(inputs.undetermined) == set(TRUTH)
-    # The zero of the response to gusts tells of tau by itself.
+    # The zero of the response to gusts alone determines tau.
     assert everything.singular_values[-1] > 10 * inputs.singular_values[-1]
-    # The other four directions are those of the inputs.
+    # The inputs determine the other four directions.
     np.testing.assert_allclose(everything.singular_values[:3], inputs.singular_values[:3], rtol=0.2)
 
 

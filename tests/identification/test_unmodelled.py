@@ -1,4 +1,4 @@
-"""What a model lacks is told from its residuals, and of a right model nothing is.
+"""Missing parts of a model, found in its residuals; a right model has none.
 
 Records are made by SciPy: its integrators, and the exact response of linear systems.
 """
@@ -29,7 +29,7 @@ N, DT = 1500, 0.02
 
 
 def steps(rng):
-    """Held for 0.2 to 0.8 s, of any size to 0.1."""
+    """Return a stick held for 0.2 to 0.8 s, of any size up to 0.1."""
     u = np.zeros(N)
     k = 0
     while k < N:
@@ -44,7 +44,7 @@ def right(u):
 
 
 def with_payload(u):
-    """p with a payload that hangs at 6 rad/s, damping 0.03."""
+    """Return p with a hanging payload at 6 rad/s, damping 0.03."""
     w, z, k = 6.0, 0.03, 12.0
     A = np.array([[-4.0, k, 0.0], [0.0, 0.0, 1.0], [4.0, -w * w - k, -2.0 * z * w]])
     system = (A, np.array([[20.0], [0.0], [-20.0]]), np.eye(3), np.zeros((3, 1)))
@@ -52,7 +52,7 @@ def with_payload(u):
 
 
 def saturated(u):
-    """p of a moment that ends at 1.2 rad/s^2, as hard as tanh."""
+    """Return p for a moment that saturates at 1.2 rad/s^2, as sharply as tanh."""
 
     def rate(t, p):
         return -4.0 * p + 1.2 * np.tanh(20.0 * u[min(int(t / DT + 1e-9), N - 1)] / 1.2)
@@ -64,7 +64,7 @@ def saturated(u):
 
 
 def through_play(u):
-    """p of a first-order machine behind a linkage whose play is an eighth of the stick's range."""
+    """Return p of a first-order vehicle after a linkage with play of an eighth of the range."""
     at, v = 0.0, np.zeros(N)
     for k, x in enumerate(u):
         at = min(max(at, x - 0.0125), x + 0.0125)
@@ -73,12 +73,12 @@ def through_play(u):
 
 
 def to_one_side(u):
-    """p of a stick that does a tenth more to one side than to the other: even powers see it."""
+    """Return p for a stick with 10 % more effect to one side, visible in even powers."""
     return right(u + 0.05 * np.abs(u))
 
 
 def with_dry_friction(u):
-    """p of a bearing that brakes as hard at any speed, by steps of 1 ms."""
+    """Return p with Coulomb friction, by steps of 1 ms."""
     p, out = 0.0, np.zeros(N)
     for k, x in enumerate(u):
         out[k] = p
@@ -88,7 +88,7 @@ def with_dry_friction(u):
 
 
 def with_drag(u):
-    """p that is braked by its square as well, by steps of 1 ms."""
+    """Return p with additional quadratic damping, by steps of 1 ms."""
     p, out = 0.0, np.zeros(N)
     for k, x in enumerate(u):
         out[k] = p
@@ -98,7 +98,7 @@ def with_drag(u):
 
 
 def slowing_down(u):
-    """p of a rotor that loses a fifth of its moment steadily."""
+    """Return p of a rotor that steadily loses a fifth of its moment."""
     return right(u * np.linspace(1.1, 0.9, N))
 
 
@@ -113,8 +113,11 @@ def fitted(made, method, *, seed=3, noise=0.1, coloured=0.0):
 
 
 def misfit(found, code):
-    """The one finding of this code; it takes an interval away exactly where it moves the estimate
-    by more than half of it, or by an amount that is not known."""
+    """Return the only finding of this code.
+
+    It removes an interval exactly if it moves the estimate by more than half of it, or by an
+    unknown amount.
+    """
     [one] = [f for f in found.findings if f.code == code]
     assert one.subjects[0] == "p"
     assert one.value < 0.01
@@ -135,11 +138,11 @@ CHANGES = "dynamics.changes-over-record"
 @pytest.mark.parametrize(
     ("made", "method", "noise", "code", "untrusted"),
     [
-        # Its residual is white, or nearly, and holds a few per cent of the output's power.
+        # Its residual is almost white, with a few per cent of the output's power.
         (with_payload, "output-error", 0.3, FOLLOWS, True),
         (with_payload, "frequency-error", 0.3, FOLLOWS, True),
         (saturated, "frequency-error", 0.02, AMPLITUDE, True),
-        # Powers of stick and response do not see play: the residual is whatever it came from.
+        # Powers of stick and response do not describe play, so the result is open.
         (through_play, "output-error", 0.02, AMPLITUDE, None),
         (to_one_side, "output-error", 0.02, AMPLITUDE, None),
         (with_dry_friction, "output-error", 0.02, AMPLITUDE, None),
@@ -216,13 +219,13 @@ STICK = [Drive(0, "input", ("d",), NARROW)]
 
 
 def drawn(rng, noise):
-    """Lines of a residual that knows nothing of its drive."""
+    """Return spectral lines of a residual independent of its drive."""
     u = steps(rng)
     return lines_of(noise(rng), np.stack([u, np.arange(N) / N], axis=1), u[:, None])
 
 
 def of_lines(rng):
-    """A turning rotor: two lines above white noise."""
+    """Return noise of a turning rotor: two lines above white noise."""
     t = np.arange(N) * DT
     return rng.standard_normal(N) + 3.0 * np.sin(31.0 * t) + 2.0 * np.sin(6.1 * t + 1.0)
 
@@ -235,7 +238,7 @@ def of_a_hump(rng):
 def test_chance_makes_no_answer_whatever_the_spectrum(noise):
     rng = np.random.default_rng(11)
     p = [strongest([drawn(rng, noise)], STICK).p_value for _ in range(60)]
-    # At 1 % six of sixty come in one case of a hundred thousand.
+    # At 1 %, six of sixty occur once in a hundred thousand.
     assert np.sum(np.array(p) < 0.01) < 6
 
 
@@ -262,17 +265,17 @@ def test_the_answer_through_a_filter_is_found_where_it_is():
     assert found.p_value < 0.01
     assert found.frequency / DT == pytest.approx(6.0, rel=0.1)
     assert found.damping == 0.1
-    # A fit of the filter that is known, by least squares in time: what twice the likelihood gains.
+    # The gain in twice the likelihood, by a least-squares fit of the known filter in time.
     columns = np.stack([u, np.ones(N), answer, np.roll(answer, 1)], axis=1)
     less = [np.sum((e - c @ np.linalg.lstsq(c, e)[0]) ** 2) for c in (columns[:, :2], columns)]
     assert found.statistic == pytest.approx(N * np.log(less[0] / less[1]), rel=0.25)
-    # Beside the same filter of the drive nothing of it is left to its cube.
+    # With the same filter of the drive, its cube explains nothing more.
     both = lines_of(e, u[:, None], np.stack([u, u**3], axis=1))
     assert strongest([both], [Drive(1, "amplitude", (), BROAD, (0,))]).p_value > 0.01
 
 
 def wandering(rng):
-    """What gusts leave of a simulation: slow, and far larger than what comes new with a sample."""
+    """Return a residual of gusts: slow, and far larger than each sample's innovation."""
     return scipy.signal.lfilter([1.0], [1.0, -1.99, 0.9905], rng.standard_normal(N))
 
 
@@ -284,13 +287,13 @@ def test_a_hole_in_the_record_makes_no_answer():
     rng = np.random.default_rng(5)
     p, joined = [], []
     for _ in range(20):
-        # Two slow things that know nothing of each other: both jump where samples are missing.
+        # Two independent slow signals: both jump where samples are missing.
         u, e = wandering(rng), wandering(rng)
         columns = [with_a_hole(v) for v in (e, np.arange(N)[:, None] / N, u[:, None])]
         p.append(strongest([lines_of(*columns, [700])], STICK).p_value)
         joined.append(strongest([lines_of(*columns)], STICK).p_value)
     assert np.sum(np.array(p) < 0.01) < 3
-    # As if no sample were missing, most of them are answers.
+    # Without the gap's position most are taken for responses.
     assert np.sum(np.array(joined) < 0.01) > 10
 
 
@@ -315,7 +318,7 @@ def test_where_samples_are_missing():
     np.testing.assert_allclose(fourth.of_input(np.arange(100.0)), np.arange(3, 100, 4) - 1.5)
     assert own_samples(np.random.default_rng(1).random(100) < 0.5) is None
     assert own_samples(np.ones(9, bool)).every == 1
-    # A sensor of 7 grid steps, whose clock drifts by one now and then, and one sample of it lost.
+    # A sensor with 7 grid steps and a drifting clock, and one lost sample.
     slow = np.zeros(2000, bool)
     slow[np.cumsum([0, *([7] * 100), 8, *([7] * 50), 14, *([7] * 50)])] = True
     assert own_samples(slow).holes == (152,)

@@ -1,4 +1,4 @@
-"""Flights held out of nonlinear models: their initial states are found, or it is said that not.
+"""Held-out flights of nonlinear models: initial states are found, or a note says not.
 
 The records come from SciPy's solve_ivp, not from our own simulation.
 """
@@ -73,7 +73,7 @@ def problem(flights, k=9.5, **how):
 
 
 def test_the_initial_state_of_a_flight_held_out_is_found(flights):
-    # Near the top of its swing, with a speed that no output shows.
+    # Near the top of its motion, with a speed that no output shows.
     found = fit(problem(flights, k=9.0))
     assert found.validation["x"].vaf > 0.999
     assert found.validation_free_run == {}

@@ -1,4 +1,4 @@
-"""Stuck sensors and dropouts, as they are told of a record at any rate."""
+"""Stuck sensors and dropouts in records of any rate."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -15,7 +15,7 @@ from heli_jax.identification.validation.adequacy import Evidence, OutputAdequacy
 RNG = np.random.default_rng(0)
 T = 0.005 * np.arange(6000)
 STICK = np.repeat(RNG.uniform(-0.3, 0.3, 80), 75)
-# A damped swing at 2 Hz, by SciPy.
+# A damped oscillation at 2 Hz, by SciPy.
 ANSWER = scipy.signal.lsim(([20.0, 0.0], [1.0, 8.0, 160.0]), STICK, T)[1]
 ANSWER = ANSWER / ANSWER.std()
 
@@ -43,7 +43,7 @@ def test_a_stuck_sensor_is_seen_in_steps_as_large_as_its_noise_and_dropouts_are_
     found = of(dropped).dropouts
     assert found.value == 0.0
     assert of(dropped).dropped == pytest.approx(0.3, abs=0.01)
-    # A noise-free machine that comes to rest by itself, again and again, is no sensor's failure.
+    # A noise-free vehicle that repeatedly comes to rest is not a sensor failure.
     u = np.repeat(np.tile([0.0, 1.0], 10), 300)
     rests = scipy.signal.lfilter([0.05], [1.0, -0.95], u)
     assert of(np.round(rests, 5)).dropouts is None
@@ -69,10 +69,10 @@ def test_dropouts_that_hold_the_last_value_are_told_by_what_they_take_together()
     [told] = stuck_outputs(SimpleNamespace(flights=[("one", replace(flight, source=source))]))
     assert (told.code, told.severity) == ("quality.stuck-output", "doubt")
     assert told.value == pytest.approx(9 * 0.295)
-    # A second of it, and a part that has one of them alone.
+    # A second of it, and a part with only one of them.
     assert len(found.within(1.0, 9.0).stretches) == 3
     assert found.within(3.0, 6.0).stuck is None
-    # Once or twice, or for less than a hundredth of a record, is a logger's hiccup.
+    # Once or twice, or below 1 % of a record, it is a logger's fault.
     assert of((300, 3000), 60).stretches == ()
     assert of(range(300, 5700, 2000), 22).stretches == ()
 

@@ -1,6 +1,6 @@
-"""What only the weak priors of initial states and biases hold up, the data do not determine.
+"""Directions determined only by weak priors of initial states and biases are not identifiable.
 
-The oracle is a recurrence in NumPy, differentiated by finite differences.
+The reference is a recurrence in NumPy, differentiated by finite differences.
 """
 
 from typing import NamedTuple
@@ -46,7 +46,7 @@ roll_rate = Model("own", field, lambda p, s, u: Outputs(p=s.p), Params, State, I
 
 
 def by_recurrence(values, d):
-    """p (N,) from rest in steps of DT, exact for a held input; then a bias."""
+    """Return p (N,) from rest in steps of DT, exact for a held input; then a bias."""
     Lp, Ld, L0, begin, bias = values
     decay, p = np.exp(Lp * DT), [begin]
     for one in d[:-1]:
@@ -71,7 +71,7 @@ BOUNDED = Free(0.1, -5.0, 5.0)
 
 
 def oracle(estimates, columns):
-    """Standard deviations of Lp, Ld, L0 with the unknowns at `columns` of the recurrence."""
+    """Return the sd of Lp, Ld, L0 with the unknowns at `columns` of the recurrence."""
     d = made(0).inputs["d"]
     at = np.array([*(estimates[n].value for n in TRUTH), 0.0, 0.0])
     J = np.stack(
@@ -120,7 +120,7 @@ def test_two_flights_have_a_bias_and_a_start_each():
 
 @pytest.mark.slow
 def test_what_no_output_shows_does_no_harm():
-    """The free roll of the paper: bias and initial angle are one; on the stand they are two."""
+    """Test the paper's free roll: bias and initial angle are one unknown, on the stand two."""
     for model, stand in ((models.roll, False), (models.roll_on_stand, True)):
         flight = record(BENCH, seed=3, n=1000 if stand else 4000, stand=stand)
         free = {"Ixx": Free(0.03), "If": Free(2e-4)}
@@ -133,14 +133,14 @@ def test_what_no_output_shows_does_no_harm():
 def test_dependent_nuisances_are_projected_out():
     rng = np.random.default_rng(0)
     N, S = rng.standard_normal((60, 3)), rng.standard_normal((60, 2))
-    # Of very different sizes, one twice, one combination of others, and one without effect.
+    # Columns of very different sizes: one twice, one combination of others, one without effect.
     sizes = np.diag([1e6, 1.0, 1e-3])
     nuisances = np.hstack([N @ sizes, N[:, :1], N[:, 1:2] - N[:, 2:], np.zeros((60, 1))])
     Q, _ = np.linalg.qr(N)
     wanted = np.linalg.svd(S - Q @ (Q.T @ S), compute_uv=False)
     found = np.linalg.svd(projected(S, nuisances), compute_uv=False)[:2]
     np.testing.assert_allclose(found, wanted, rtol=1e-4)
-    # What the nuisances can do is gone altogether.
+    # Effects of the nuisances are removed completely.
     within = N @ rng.standard_normal((3, 2))
     assert np.linalg.norm(projected(within, nuisances)) < 1e-8 * np.linalg.norm(within)
 
@@ -158,7 +158,7 @@ def test_a_signed_parameter_that_weak_priors_narrow_tenfold_is_not_determined():
 
 
 def test_the_prior_share_is_the_variance_that_all_priors_explain():
-    """By redrawing the priors' means and the data, of unknowns that only one prior tells apart."""
+    """Test redrawn prior means and data, for unknowns that one prior alone separates."""
     rng = np.random.default_rng(4)
     B = rng.standard_normal((40, 3)) @ np.array([[1, 0, -1], [0, 1, -1], [0.1, 0, 0.1]])
     B = np.column_stack([B, rng.standard_normal(40)])

@@ -1,4 +1,4 @@
-"""Multiple shooting: windows with initial states of their own."""
+"""Multiple shooting: windows with separate initial states."""
 
 import dataclasses
 
@@ -24,7 +24,7 @@ def problem(flights=1, **how):
 @pytest.mark.slow
 def test_the_jacobian_by_colours_is_the_jacobian():
     one = problem(2, window=1.0, nuisance=Nuisance(bias=False, input_gain=True))
-    # Two outputs, and not in the order of their names.
+    # Two outputs, not in the order of their names.
     flights = [
         dataclasses.replace(
             f, outputs={"roll_rate": np.gradient(f.outputs["roll"], f.dt), **f.outputs}
@@ -39,7 +39,7 @@ def test_the_jacobian_by_colours_is_the_jacobian():
     z = start_vector(layout, data, one)
     z = z + jnp.asarray(0.1 * rng.standard_normal(z.shape))
     e = residual_and_jacobian(layout, data, noise, z)
-    # By the program that is compiled; test_offsets holds it against rows_of.
+    # By the compiled program; test_offsets compares it with rows_of.
     h = 1e-4 * np.eye(z.size)
     high, low = (
         np.array([residual_and_jacobian(layout, data, noise, z + s * one).r for one in h])
@@ -60,7 +60,7 @@ def test_windows_that_hang_together_are_one_run():
         other = chained.estimates[name]
         assert other.value == pytest.approx(one.value, abs=0.02 * one.sd)
         assert other.sd == pytest.approx(one.sd, rel=0.02)
-        # States of their own in every window cost information, and no bias.
+        # Separate states in every window cost information, but no bias.
         loose = apart.estimates[name]
         assert loose.sd > one.sd
         assert abs(loose.value - BENCH[name]) < 4 * loose.sd

@@ -38,7 +38,7 @@ HEAVE = {
 
 @pytest.fixture
 def written(tmp_path):
-    """written(key=value, ...) -> the path of a configuration of heave with these keys."""
+    """Return written(key=value, ...), the path of a configuration of heave with these keys."""
 
     def written(**content):
         path = tmp_path / "heave.yaml"
@@ -107,12 +107,12 @@ def test_what_cannot_be_ends_in_a_sentence(written, content):
     path = written(**content)
     with pytest.raises(InputError) as e:
         configuration.load(path)
-    # The file and the key.
+    # The message has the file and the key.
     assert str(e.value).startswith(f"{path}: {next(iter(content))}") or content["model"] == "roll"
 
 
 def test_the_log_of_a_model_with_a_delay_holds_what_was_commanded(written, tmp_path):
-    """A log of delayed inputs would be fitted with no delay."""
+    """Test that a log has commanded inputs; with delayed ones a fit would find no delay."""
     content = yaml.safe_load((FILES / "heave.yaml").read_text())
     content["parameters"]["tau"] = {"value": 0.13, "unit": "s"}
     content["delays"] = {"col": "tau"}
@@ -124,5 +124,5 @@ def test_the_log_of_a_model_with_a_delay_holds_what_was_commanded(written, tmp_p
     time, stick, w = np.loadtxt(tmp_path / "heave.csv", delimiter=",", skiprows=1).T
     moved = np.argmax(stick != 0)
     np.testing.assert_allclose(time[moved], 2.0)
-    # The motion begins 0.13 s later: of 0.1 s samples the one after next is the first to have it.
+    # The motion starts 0.13 s later, first visible in the second sample after that of 0.1 s.
     assert abs(w[moved + 1]) < 0.3 < abs(w[moved + 3])

@@ -1,4 +1,4 @@
-"""The arithmetic of an entry, against Python's own numbers."""
+"""Arithmetic of entries, against Python's."""
 
 import operator
 
@@ -29,7 +29,7 @@ ADDS = {"+": operator.add, "-": operator.sub, " * ": operator.mul, "/": operator
 
 
 def larger(inner):
-    """(text, its value) of two such in parentheses, of a sign and of a power."""
+    """Combine two expressions (text, value) in parentheses; also a sign and a power."""
 
     def joined(a, sign, b):
         return f"({a[0]}){sign}({b[0]})", lambda: ADDS[sign](a[1](), b[1]())

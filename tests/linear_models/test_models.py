@@ -1,4 +1,4 @@
-"""The shipped linear models: what the R-50's report says, and SciPy's exponential."""
+"""Shipped linear models against the R-50's report and SciPy's exponential."""
 
 import dataclasses
 
@@ -42,7 +42,7 @@ def test_a_shipped_model_has_its_states_and_every_constant_a_source(name):
     assert {n for n in found.content.parameters if n.startswith("tau")} <= set(found.model.positive)
 
 
-# Of the report, to the digits of the issue's table; pairs once.
+# From the report, with its digits; pairs once.
 R50 = (
     0.3061 + 0.0937j, -0.4007 + 0.0860j, -0.6079, -1.6996 + 8.1918j, -2.6623 + 11.5781j,
     -6.1966 + 8.1990j, -20.1675 + 4.6965j,
@@ -51,7 +51,7 @@ R50 = (
 
 @pytest.mark.parametrize("name", ["r50-hover", "hybrid"])
 def test_the_r50_has_its_published_eigenvalues(name):
-    """In feet and in metres: units do not move an eigenvalue."""
+    """Test equal eigenvalues in feet and in metres."""
     found = linear_model(name)
     values = modes(found.model, found.vehicle().params)
     np.testing.assert_allclose(
@@ -68,7 +68,7 @@ def test_inflow_that_has_settled_leaves_the_heave_of_the_r50():
 
 
 def r50_by_hand():
-    """A and B of the R-50 as published, in feet, entered by hand."""
+    """Return A and B of the R-50 as published, in feet, entered by hand."""
     names = STATES["r50-hover"].split()
     A, B = np.zeros((13, 13)), np.zeros((13, 4))
     tau_f, tau_s = 0.04631, 0.3415
@@ -101,7 +101,7 @@ def r50_by_hand():
 
 
 def driven(A, B, U, dt):
-    """States (N, n) under held inputs (N, m), by SciPy's exponential of [[A, B], [0, 0]]."""
+    """Return states (N, n) for held inputs (N, m), by SciPy's exponential of [[A, B], [0, 0]]."""
     n, m = B.shape
     E = scipy.linalg.expm(np.block([[A, B], [np.zeros((m, n + m))]]) * dt)
     X = np.zeros((len(U), n))
@@ -111,7 +111,7 @@ def driven(A, B, U, dt):
 
 
 def test_the_r50_moves_as_scipys_exponential_says():
-    """Ten seconds, over which the slow mode grows twentyfold; the pedal's delay left out."""
+    """Test ten seconds, in which the slow mode grows twentyfold; without the pedal's delay."""
     rng = np.random.default_rng(50)
     dt, U = 0.02, np.repeat(0.1 * rng.uniform(-1.0, 1.0, (20, 4)), 25, axis=0)
     found = linear_model("r50-hover")
@@ -140,7 +140,7 @@ def roll_by_hand(Lb, tau_f, Bd, Blat, tau_s=0.3415, Dlat=0.2731):
 
 @pytest.mark.slow
 def test_a_fit_finds_the_derivatives_of_a_record_by_scipy():
-    """From starts a factor of two away, and Blat from the wrong sign."""
+    """Test starts off by a factor of two, and Blat from the wrong sign."""
     truth = {"Lb": 140.0, "tau_f": 0.06, "Bd": 0.6, "Blat": 0.12}
     rng = np.random.default_rng(17)
     dt, U = 0.02, np.repeat(0.2 * rng.uniform(-1.0, 1.0, (50, 1)), 20, axis=0)

@@ -1,4 +1,4 @@
-"""Files of linear models: what they become, units, and what is refused."""
+"""Files of linear models: the resulting models, units and refusals."""
 
 import copy
 import dataclasses
@@ -36,7 +36,7 @@ FT, DEG = 0.3048, np.pi / 180
 
 @pytest.fixture
 def read(tmp_path):
-    """read(change) -> the model of SMALL after change(content)."""
+    """Return read(change), the model of SMALL after change(content)."""
 
     def read(change=lambda content: None):
         content = copy.deepcopy(SMALL)
@@ -54,7 +54,7 @@ def matrices(found, vehicle=None):
 
 
 def test_everything_is_in_si(read):
-    """The matrices by hand: a number is in the file's units, a parameter in its own."""
+    """Test matrices by hand: a number has the file's units, a parameter its own."""
     A, B, C, D = matrices(read())
     np.testing.assert_allclose(A, [[-0.1, -32 * FT], [0.25 * DEG / FT, -2.0]], rtol=1e-14)
     np.testing.assert_allclose(B, [[0.0], [6.0]], rtol=1e-14)
@@ -99,7 +99,7 @@ def test_values_are_replaced_by_name(read):
 
 
 def test_masses_stand_on_the_left(read):
-    """E x' = A x + B u with E of units, against NumPy's solution."""
+    """Test E x' = A x + B u with units in E, against NumPy's solution."""
 
     def change(content):
         content["parameters"]["m"] = {"value": 2.0, "unit": "lb"}
@@ -117,7 +117,7 @@ def test_masses_stand_on_the_left(read):
 
 
 def test_a_delayed_input_acts_late(read):
-    """By a whole number of samples: the same run with the record shifted."""
+    """Test a delay of whole samples, which equals a shifted record."""
     found = read(lambda c: c.update(delays={"lon": "tau"}))
     assert found.model.delays == (("lon", "tau"),)
     stick = np.random.default_rng(0).standard_normal(40)
@@ -131,7 +131,7 @@ def test_a_delayed_input_acts_late(read):
 
 
 def test_a_negative_delay_acts_early_unless_it_is_positive(read):
-    """In the file and in a vehicle alike."""
+    """Test both the file and a vehicle."""
 
     def early(**quantity):
         def change(content):
@@ -164,7 +164,7 @@ def test_axes_go_by_the_names_of_states_or_are_stated(read):
 
 
 def put(*keys):
-    """A change that puts the last of `keys` under the others."""
+    """Return a change that puts the last of `keys` under the others."""
 
     def change(content):
         *above, last, value = keys
@@ -267,6 +267,6 @@ def test_the_example_of_the_page_reads(tmp_path):
 def test_the_modes_of_the_r50_have_the_fields_names():
     published = linear_model("r50-hover")
     found = {m.name: m.eigenvalue for m in eigenmodes(published.model, published.vehicle().params)}
-    # The hover oscillation, the regressing rotor and bar of CMU-RI-TR-00-03.
+    # The hover oscillation and the regressing modes of rotor and bar of CMU-RI-TR-00-03.
     assert found["phugoid with roll"] == pytest.approx(0.3061 + 0.0937j, abs=1e-4)
     assert {"roll flapping with flybar roll", "pitch flapping with flybar pitch"} <= set(found)

@@ -1,4 +1,4 @@
-"""A browser without a window, driven by its DevTools protocol over two pipes."""
+"""A headless browser, driven by its DevTools protocol over two pipes."""
 
 import base64
 import contextlib
@@ -19,8 +19,8 @@ _OPTIONS = (
     "--remote-debugging-pipe"
 )
 
-# The protocol is spoken over the descriptors 3 and 4. A process of its own puts the pipes there,
-# since a fork of this one, which holds JAX's threads, is warned of.
+# The protocol uses the descriptors 3 and 4. A separate process connects the pipes, since forking
+# this one with JAX's threads gives a warning.
 _PIPES = """
 import os, sys
 spare = [os.dup(int(fd)) for fd in sys.argv[1:3]]
@@ -32,7 +32,7 @@ os.execv(sys.argv[3], sys.argv[3:])
 
 
 class Browser:
-    """One page of a browser; `problems` holds what its console said that is no log."""
+    """One page of a browser; `problems` has its console messages except logs."""
 
     def __init__(self, to_browser: int, from_browser: int) -> None:
         self._to, self._from = to_browser, from_browser
@@ -125,7 +125,7 @@ class Browser:
 
 @contextlib.contextmanager
 def browser(profile: Path) -> Iterator[Browser]:
-    """A browser with an empty profile, until the end of the block."""
+    """Start a browser with an empty profile for the duration of the block."""
     assert CHROMIUM is not None
     theirs_in, ours_out = os.pipe()
     ours_in, theirs_out = os.pipe()

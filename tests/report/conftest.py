@@ -1,4 +1,4 @@
-"""Small fits of a short bench record, made once for all of the report's tests."""
+"""Small fits of a short bench record, shared by all tests of the report."""
 
 import pytest
 
@@ -22,11 +22,11 @@ def _fitted(free, **options):
 
 @pytest.fixture(scope="session")
 def sound():
-    """Fit, problem and baseline where the data determine both parameters."""
+    """Return fit, problem and baseline; the data determine both parameters."""
     return _fitted({"Ixx": IXX, "If": IF}, name=SCRIPT)
 
 
 @pytest.fixture(scope="session")
 def not_identifiable():
-    """The same where the data determine two ratios of three parameters."""
+    """Return the same; the data determine two ratios of three parameters."""
     return _fitted({"Ixx": IXX, "If": IF, "a": Free(5.0, 1.0, 20.0)})

@@ -1,4 +1,4 @@
-"""The acceptance card: every gate there, judged as its number says."""
+"""Acceptance card: every gate is present, with the result of its number."""
 
 import dataclasses
 import math
@@ -24,7 +24,7 @@ def test_a_sound_fit_passes(sound):
     for name, estimate in fit.estimates.items():
         assert estimate.sd is not None
         assert math.isclose(by["Cramér-Rao", name].value, 100 * estimate.sd / estimate.value)
-        # Known others can only help.
+        # Knowing the others can only help.
         assert by["insensitivity", name].value <= by["Cramér-Rao", name].value * (1 + 1e-9)
 
 
@@ -69,7 +69,7 @@ def test_a_simulation_of_a_disturbed_machine_is_not_judged(sound):
 
 def test_theils_bias_part_is_asked_for_only_where_no_bias_was_estimated(sound):
     fit, *_ = sound
-    # With a bias of its own every flight has the mean that was measured.
+    # Each flight has a bias, so its mean is the measured one.
     assert not [g for g in card(fit) if g.what == "Theil bias part"]
     layout = dataclasses.replace(fit.reached.layout, bias=False, offsets=())
     free = dataclasses.replace(fit, reached=fit.reached._replace(layout=layout))

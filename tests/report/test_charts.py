@@ -1,4 +1,4 @@
-"""Figures as plain data, and what a page embeds of them."""
+"""Figures as plain data, and the data that a page embeds."""
 
 from xml.etree import ElementTree
 
@@ -21,7 +21,7 @@ from tests.report.test_view import decoded
 
 
 def record(n, outputs=1, inputs=4):
-    """A flight of n samples at 100 Hz, all of it noise, which no image holds small."""
+    """Return n samples at 100 Hz, all noise, which images cannot compress."""
     rng = np.random.default_rng(0)
     t = 0.01 * np.arange(n)
     names = ("roll", "pitch", "yaw", "z", "dz")[:outputs]

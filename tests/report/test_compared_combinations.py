@@ -1,5 +1,4 @@
-"""Combinations side by side, by hand: of who determines them alone, of who determines their
-parts."""
+"""Comparison of combinations by hand: determined directly, or through their parts."""
 
 import csv
 import io

@@ -1,4 +1,4 @@
-"""Runs side by side: numbers by hand, text from files escaped, and the commands."""
+"""Comparison of runs: numbers by hand, escaped text, and the commands."""
 
 import csv
 import io
@@ -22,7 +22,7 @@ METRICS = dict.fromkeys(
 def write_run(
     folder: Path, estimates: dict[str, tuple[float, float | None]], **more: object
 ) -> Path:
-    """A run directory with what `load_fit` reads, its numbers made up."""
+    """Write a run directory for `load_fit`, with invented numbers."""
     folder.mkdir(parents=True)
     parameters = {}
     for name, (value, sd) in estimates.items():
@@ -130,7 +130,7 @@ def test_the_commands_list_and_compare(
     html = page.read_text()
     assert hostile not in html
     assert "&lt;script&gt;" in html
-    # Nothing but the page itself: what a browser loads has an address in src or href.
+    # The page loads nothing: a browser loads only addresses in src or href.
     assert not re.search(r"(src|href)=.?(http|\/\/)", html)
 
 

@@ -1,4 +1,4 @@
-"""Figures: nothing empty, no peak lost, bands where they belong, curves on one phase branch."""
+"""Figures: no empty panel, no lost peak, correct bands, continuous phase."""
 
 import matplotlib
 import matplotlib.image

@@ -1,4 +1,4 @@
-"""fit.json: no number for what the data do not determine, and what reads it copes."""
+"""fit.json: no numbers for parameters that are not determined, and readers accept this."""
 
 import csv
 import io
@@ -29,7 +29,7 @@ def test_what_is_not_determined_has_no_number_in_the_file(not_identifiable, tmp_
     assert "not determined" in repr(loaded)
     assert loaded.to_dataframe()[["value", "sd"]].isna().all(axis=None)
     compared = compare_runs([tmp_path / "one", tmp_path / "two"])
-    # Beside them the combinations that the data do determine.
+    # In addition, the combinations that the data determine.
     of_parameters = [row for row in compared.estimates.rows if row[0] in fit.estimates]
     assert {cell for row in of_parameters for cell in row[1:3]} == {"not determined"}
     for row in csv.DictReader(io.StringIO(compared.to_csv())):

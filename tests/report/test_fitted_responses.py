@@ -1,4 +1,4 @@
-"""A fitted model's responses over those of its flights: numbers, figure, page and fit.json."""
+"""Responses of a fitted model with those of its flights: numbers, figure, page and fit.json."""
 
 import dataclasses
 
@@ -44,7 +44,7 @@ def test_the_model_s_response_is_that_of_the_bode_figure_and_moves_with_its_para
     sd = np.array([fit.estimates[n].sd / fit.estimates[n].value for n in ("Ixx", "If")])
     covariance = np.outer(sd, sd) * fit.verdict.correlation
     by_hand = np.sqrt(np.einsum("ak,ab,bk->k", steps, covariance, steps))
-    # An interval of Student's t is a little wider than 1.96 standard deviations.
+    # An interval of Student's t is slightly wider than 1.96 standard deviations.
     np.testing.assert_allclose(pair.model.gain_sd, by_hand, rtol=0.01, atol=1e-9)
     # The data agree with the model within their errors, at the frequencies that count.
     good = np.isfinite(pair.H) & (pair.coherence > 0.9)

@@ -1,4 +1,4 @@
-"""How far the frequency axis of a Bode figure reaches."""
+"""Range of the frequency axis of Bode figures."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ OMEGA = 2.0 * np.pi * np.geomspace(0.1, 20.0, 120)
 
 
 def _pair() -> FittedPair:
-    """Excited to 4 Hz; above only chance, with one bin in six that has a small random error."""
+    """Return a response excited up to 4 Hz; above it one bin in six has a small error by chance."""
     hz = OMEGA / (2.0 * np.pi)
     H = 10.0 / (1j * OMEGA + 5.0)
     chance = hz > 4.0
@@ -26,7 +26,7 @@ def _pair() -> FittedPair:
 def test_bins_that_are_coherent_by_chance_do_not_widen_the_axis() -> None:
     pair = _pair()
     chart = match(pair, "dB re rad/s", "")
-    # Both in Hz, as bands are stated.
+    # Both in Hz, as the bands.
     assert chart.x_limits[1] < 6.0
     assert chart.x_limits[0] == pytest.approx(0.1)
     assert chart.x_label == "frequency [Hz]"

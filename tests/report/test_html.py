@@ -1,4 +1,4 @@
-"""The page: in one file, escaped, verdict first, and no number that the data do not bear."""
+"""The page: one file, escaped, verdict first, and no numbers that the data do not determine."""
 
 import dataclasses
 import html
@@ -22,7 +22,7 @@ CONSTANTS = {"Ixx": Constant(0.024, "kg m^2", "measured & <u>swung</u>")}
 
 
 class Links(HTMLParser):
-    """Everything a browser would load, and every tag."""
+    """Collect everything that a browser would load, and every tag."""
 
     def __init__(self, text):
         super().__init__()
@@ -67,7 +67,7 @@ def test_page_holds_everything_itself(sound_page):
     files = {f"figures/{name}.svg" for name in names}
     loaded = [v for v in links.addresses if not v.startswith("#") and v not in {*FILES, *files}]
     assert loaded == []
-    # Every figure is one that the page draws, as is the worst output of the first screen.
+    # The page draws every figure, also the worst output of the first screen.
     assert len(names) == 3
     assert text.count("<figure data-chart=") == 4
     assert links.tags.count("img") == 0
@@ -91,7 +91,7 @@ def test_the_first_screen_has_verdict_estimates_worst_output_and_three_findings(
     bars = re.findall(r'<rect x="([\d.]+)" y="3" width="([\d.]+)"', first)
     assert len(bars) == len(sound[0].estimates)
     for (x, width), e in zip(bars, sound[0].estimates.values(), strict=True):
-        # An interval holds its estimate, which is the middle of the axis.
+        # An interval contains its estimate, which is at the middle of the axis.
         assert 0.0 <= float(x) < 50.0 < float(x) + float(width) <= 100.0
         shares = e.upper95 / e.value - 1.0, 1.0 - e.lower95 / e.value
         assert (float(x) + float(width) - 50.0) / (50.0 - float(x)) == pytest.approx(
@@ -106,10 +106,10 @@ def test_text_from_logs_and_configurations_is_escaped(sound_page):
     text, names, _ = sound_page
     tags = Links(text).tags
     assert not {"b", "i", "u"} & set(tags)
-    # The page's own: its numbers, the library, what draws with it, what copies tables.
+    # The page's scripts: its numbers, the library, its drawing code, and the copying of tables.
     assert tags.count("script") == 4
     assert "<script>alert" not in text
-    # Text that would end a script, in the numbers of one.
+    # Text in the numbers that would end a script.
     [content] = re.findall(r'<script type="application/json" id="numbers">(.*?)</script>', text)
     assert SCRIPT in json.loads(content)["charts"][0]["title"]
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
@@ -151,13 +151,13 @@ def test_a_fit_without_baseline_and_not_converged(sound, tmp_path):
     names = write_report(tmp_path, Analysis(fit, problem), "bench", {})
     assert "rls" not in names
     assert [line.level for line in fit_page.lines(fit)] == ["bad", "none", "none"]
-    # Of numbers that are no result there are no intervals to speak of.
+    # Without results there are no intervals.
     row = next(row for row in tables.parameters(fit).rows if row[0] == "If")
     assert row[1:5] == ("−1.23·10⁻⁴ (no result)", "–", "–", "–")
 
 
 def test_what_sensors_say_of_each_other_comes_before_the_fit(sound, tmp_path):
-    """The fit behind it converges and is adequate in size, whatever its sensors say."""
+    """Test a page of a converged, adequate fit with doubts about its sensors."""
     head, errors = ("error", "estimate, 95 %", "shows"), (("lambda_p", "0.226 ± 0.061", "yes"),)
     found = SensorAgreement(False, "Not so.", (note("a.note", "much"),), head, errors)
     fit, problem, baseline = sound

@@ -1,4 +1,4 @@
-"""The pages in a real browser: console, zoom, hover, keyboard, narrow screens, printing."""
+"""Pages in a real browser: console, zoom, hover, keyboard, narrow screens, printing."""
 
 import csv
 import json
@@ -46,7 +46,7 @@ def view(tmp_path_factory, vehicles_folder):
 
 
 def over_time(window):
-    """The group of figures over the log's time, of one flight; axes say what they are of."""
+    """Return the figures over log time of one flight, after a check of their axes' titles."""
     groups = window.value("[...heliCharts.groups.keys()]")
     [group] = [g for g in groups if g.startswith("time in the log [s], ")]
     label = "heliCharts.groups.get({}).some(u => u.axes[0].label === 'time in the log [s]')"
@@ -61,7 +61,7 @@ def scales(window, group, k=0):
 
 
 def drag(window, plot, start, end):
-    """From one part of a plot's width to another."""
+    """Drag from one fraction of a plot's width to another."""
     window.value(f"{plot}.root.scrollIntoView({{block: 'center'}})")
     x, y, w, h = window.value(
         f"(r => [r.x, r.y, r.width, r.height])({plot}.over.getBoundingClientRect())"
@@ -87,7 +87,7 @@ def test_nothing_overlaps_and_nothing_fails(window, report, view, width, dark):
         paper = window.value("getComputedStyle(document.body).backgroundColor")
         assert (sum(map(int, re.findall(r"\d+", paper))) < 200) == dark
         assert window.value("document.querySelectorAll('figure.drawn canvas').length") >= 2
-    # Where a table is wider than the page, which scrolls it, the page says so until its end.
+    # A table wider than the page scrolls, with a hint until its end.
     window.open(report)
     table = "document.querySelector('[aria-label=Estimates]')"
     more = f"{table}.classList.contains('more')"
@@ -110,7 +110,7 @@ def test_zoom_and_hover_move_all_time_histories_together(window, report):
     assert zoomed == pytest.approx(quarter, abs=0.02 * (high - low))
     for k in range(window.value(f"heliCharts.groups.get({json.dumps(group)}).length")):
         assert scales(window, group, k) == pytest.approx(zoomed, abs=0.03 * (high - low))
-    # A hover says the measured value, in the table below the panel.
+    # A hover shows the measured value, in the table below the panel.
     x, y = window.value(
         f"(r => [r.x + r.width / 2, r.y + 20])({first}.over.getBoundingClientRect())"
     )
@@ -149,7 +149,7 @@ def test_tables_copy_as_latex_and_where_there_is_no_clipboard(window, report):
     tex = window.value("heliTables.tex(document.querySelector('.wide > table'))")
     assert r"\begin{tabular}{lrr" in tex
     assert r"$\cdot 10^{-4}$" in tex
-    # A page that was opened as a file may have none: then the text stands there, selected.
+    # A page opened as a file may have no clipboard: then the text is shown and selected.
     window.value("Object.defineProperty(navigator, 'clipboard', {value: undefined})")
     window.value("document.execCommand = () => false")
     window.value("document.querySelector('.copy button').click()")
@@ -186,7 +186,7 @@ def test_a_flight_plays_and_pauses_by_keys_and_shares_its_time(window, view):
     window.size(1200)
     window.open(view)
     window.value("document.querySelector('[data-role=speed]').value = '10'")
-    # Where nothing has the focus as well: the page says that space plays, and shall not scroll.
+    # Also without focus: the page says that space plays, so it must not scroll.
     window.value("document.activeElement.blur()")
     window.press(" ")
     window.until("heliFlights[0].time > 0 && heliFlights[0].playing")
@@ -217,7 +217,7 @@ def test_a_flight_plays_and_pauses_by_keys_and_shares_its_time(window, view):
     )
     window.mouse("Moved", x, y)
     assert window.value("heliFlights[0].time") == pytest.approx(0.5 * 29.98, abs=0.1)
-    # The machine moves on the canvas.
+    # The vehicle moves on the canvas.
     shown = [
         window.value(f"heliFlights[0].show({t}) || document.querySelector('canvas').toDataURL()")
         for t in (0, 20)
@@ -229,7 +229,7 @@ def test_a_flight_plays_and_pauses_by_keys_and_shares_its_time(window, view):
 def test_all_of_it_is_printed(window, report):
     window.size(1200)
     window.open(report)
-    # Ours runs after that of the page.
+    # This handler runs after the page's.
     count = "document.querySelectorAll('details:not([open])').length"
     assert window.value(count) > 0
     window.value(f"addEventListener('beforeprint', () => {{ window.folded = {count}; }})")

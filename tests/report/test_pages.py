@@ -1,4 +1,4 @@
-"""What all pages share: log time, numbers that can be read, one number for one thing."""
+"""Common parts of pages: log time, readable numbers, equal numbers for equal things."""
 
 import csv
 
@@ -16,7 +16,7 @@ from tests.report.test_compared_runs import write_run
 
 
 def part(name, start, n=300):
-    """A part of a log that begins `start` seconds into it."""
+    """Return a part of a log that begins `start` seconds into it."""
     rng = np.random.default_rng(0)
     t = 0.02 * np.arange(n)
     y = rng.standard_normal(n)
@@ -31,7 +31,7 @@ def test_the_time_of_the_log_is_kept_in_the_table_and_read_back(tmp_path):
     second = [row for row in rows if row["flight"] == "part 2"]
     assert (float(second[0]["time"]), float(second[0]["log_time"])) == (0.0, 42.0001)
     assert float(second[-1]["log_time"]) == pytest.approx(42.0001 + 299 * 0.02, abs=1e-12)
-    # A time is no input of the model.
+    # A time is not an input of the model.
     assert list(second[0])[:4] == ["flight", "time", "log_time", "x_roll"]
 
 
@@ -44,7 +44,7 @@ def test_a_saved_run_has_the_time_of_its_log(tmp_path):
     [signals] = load_fit(folder).signals
     assert signals.log_start == pytest.approx(42.0)
     assert list(signals.inputs) == ["x_roll"]
-    # Of an earlier version, whose tables had no such column.
+    # From an earlier version, whose tables had no such column.
     [older] = load_fit(write_run(tmp_path / "old", {"Ixx": (0.02, 0.001)})).signals
     assert older.log_start is None
 
@@ -66,7 +66,7 @@ def test_card_and_figure_give_one_number_where_samples_are_missing():
     test = whiteness(signals.measured["roll"])
     chart = figures.residual_correlation(signals, "roll", test=test)
     assert f"{percent(test.outside, 1)} of {test.lags} lags" in chart.note
-    # The stems that are drawn outside the band are those that the number counts.
+    # The number counts the stems drawn outside the band.
     inside, outside = (s.y.size for s in chart.panels[0].series[1:])
     assert outside / (inside + outside) == pytest.approx(test.outside)
 

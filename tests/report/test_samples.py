@@ -1,4 +1,4 @@
-"""Draws of NUTS and samples of the bootstrap: as files for others, and in the report."""
+"""Draws of NUTS and samples of the bootstrap, in files and in the report."""
 
 import dataclasses
 
@@ -26,7 +26,7 @@ MADE = Origin("heli-jax fit bench.yaml", "2026-11-23 16:00:00+00:00")
 
 
 def gaussian_draws(fit, size):
-    """As the fit's own Gaussian approximation has them: normal in the logarithms."""
+    """Return draws of the fit's Gaussian approximation: normal in the logarithms."""
     names = list(fit.estimates)
     at = [fit.verdict.names.index(n) for n in names]
     covariance = fit.verdict.covariance[np.ix_(at, at)]
@@ -37,7 +37,7 @@ def gaussian_draws(fit, size):
 
 @pytest.fixture(scope="module")
 def white(sound):
-    """A fit whose sd are those of white residuals, as its covariance has them."""
+    """Return a fit with the sd of white residuals, as in its covariance."""
     fit, problem, baseline = sound
     estimates = {n: e._replace(sd=e.sd_white) for n, e in fit.estimates.items()}
     return dataclasses.replace(fit, estimates=estimates), problem, baseline
@@ -67,7 +67,7 @@ def test_the_tree_has_the_groups_and_units_that_arviz_looks_for(white, sampled):
     assert Ixx.attrs == {"units": "kg m^2", "role": "parameter"}
     roles = {v.attrs["role"] for v in tree["posterior"].data_vars.values()}
     assert roles == {"parameter", "nuisance"}
-    # NetCDF takes a slash for a group; the fit's own name is kept beside.
+    # NetCDF takes a slash for a group; the fit's name is kept as an attribute.
     names = {v.attrs.get("long_name") for v in tree["posterior"].data_vars.values()}
     assert set(white[0].nuisance) <= names
     assert not any("/" in str(n) for n in tree["posterior"].data_vars)
@@ -109,7 +109,7 @@ def test_nothing_is_written_or_drawn_where_nothing_was_sampled(white, sampled, t
     assert list(tmp_path.iterdir()) == []
     drawn = drawings(Analysis(*white, SupplementaryAnalyses(intervals=none)))
     assert not {"pairs_posterior", "pairs_bootstrap"} & set(drawn)
-    # No record could be fitted: no file that would be empty.
+    # No record could be fitted, so there is no empty file.
     failed = dataclasses.replace(none, bootstrap=Bootstrap({"Ixx": np.array([])}, 5))
     assert sample_files(failed) == ()
     assert figures.bootstrap_pairs(failed.bootstrap, white[0]) is None

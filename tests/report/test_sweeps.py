@@ -1,4 +1,4 @@
-"""Figures of a sweep: medians are those of the data, what is not ok does not count but shows."""
+"""Figures of a sweep: medians of the data; elements that failed are shown but not counted."""
 
 import sys
 
@@ -15,7 +15,7 @@ UNITS = {"Ixx": "kg*m^2", "If": "kg*m^2", "initial.phi": "rad", "misfit": "rad",
 
 
 def dataset(axes, results, status=None):
-    """A sweep by hand."""
+    """Return a sweep by hand."""
 
     def variable(name, values):
         attributes = {"units": UNITS[name]} if name in UNITS else {}
@@ -32,7 +32,7 @@ def dataset(axes, results, status=None):
 
 
 def sweep(n=1000, seed=0):
-    """Three axes, one of them logarithmic and one with six values; some elements not ok."""
+    """Return three axes, one logarithmic and one with six values; some elements failed."""
     rng = np.random.default_rng(seed)
     axes = {
         "Ixx": np.exp(rng.uniform(np.log(0.01), 0.0, n)),
@@ -56,7 +56,7 @@ def maps(ds, result="misfit"):
 
 
 def counted(ds, *names):
-    """The values that should count."""
+    """Return the values that should count."""
     columns = [ds[n].to_numpy().astype(float) for n in names]
     use = (ds["status"].to_numpy() == 0) & np.all([np.isfinite(c) for c in columns], axis=0)
     return [c[use] for c in columns]
@@ -77,7 +77,7 @@ def marked(ax):
 
 
 def meshes(figure):
-    """(panel, edges of x, edges of y, values (x, y)) of each panel with a map."""
+    """Return (panel, edges of x, edges of y, values (x, y)) of each panel with a map."""
     found = []
     for ax in figure.axes:
         for mesh in ax.collections:
@@ -236,7 +236,7 @@ def test_a_large_sweep_is_drawn_by_lot(monkeypatch):
 
 
 def test_files(tmp_path):
-    """Also of names that no file has, of numbers that no picture can hold, of what is no result."""
+    """Test names impossible for files, numbers impossible in pictures, and missing results."""
     ds = sweep(3000).rename({"misfit": "a/b"})
     ds["a/b"][:3] = [1e300, -1e300, 5e-324]
     ds["A.B"] = -1.0 / ds["Ixx"]

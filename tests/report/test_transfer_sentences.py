@@ -1,4 +1,4 @@
-"""What is said beside a transfer function, in terminal, page and JSON alike."""
+"""Sentences about a transfer function in terminal, page and JSON."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def _fit(*denominator: float, chi_squared: float = 1.0, converged: bool = True) 
     ("fit", "sentences"),
     [
         (_fit(2.0), 0),
-        (_fit(2.0, -0.38), 2),  # a pole that a window does not forget, and that grows
+        (_fit(2.0, -0.38), 2),  # a growing pole, slower than the window
         (_fit(2.0, chi_squared=3.0), 1),
         (_fit(2.0, converged=False), 1),
     ],
@@ -31,7 +31,7 @@ def test_what_is_to_be_heeded_of_a_transfer_function(fit: TransferFit, sentences
 
 
 def test_poles_that_zeros_all_but_cancel_are_named() -> None:
-    """25 (s + 7.7) / ((s + 3) (s + 8)) is next to 25 / (s + 3)."""
+    """Test that 25 (s + 7.7) / ((s + 3) (s + 8)) is close to 25 / (s + 3)."""
     numerator = tuple(Coefficient(v, 0.1, v - 0.2, v + 0.2) for v in (25.0, 25.0 * 7.7))
     assert len(fit_sentences(_fit(11.0, 24.0)._replace(numerator=numerator), WINDOW)) == 1
     away = tuple(Coefficient(v, 0.1, v - 0.2, v + 0.2) for v in (25.0, 25.0 * 5.0))

@@ -1,4 +1,4 @@
-"""The page of a manoeuvre: whole in itself, escaped, and a machine that is turned the right way."""
+"""The page of a manoeuvre: self-contained, escaped, with the vehicle in the right attitude."""
 
 import base64
 import json
@@ -26,7 +26,7 @@ HELICOPTER = models.by_name("helicopter-consistent")
 
 
 def flown(n=300, dt=0.02, **states):
-    """A run of n samples with these states, zero elsewhere."""
+    """Return a run of n samples with these states, zero elsewhere."""
     zero = np.zeros(n)
     times = dt * np.arange(n)
     out = times > times[n // 2]
@@ -62,7 +62,7 @@ def test_the_shape_turns_as_the_machine_does(angle, part, expected):
 
 
 def test_the_mast_points_where_the_thrust_does(xcell):
-    """All three angles at once, against the model's own accelerations."""
+    """Test all three angles at once, against the model's accelerations."""
     at = {"phi": 0.4, "theta": -0.3, "psi": 1.1, "Omega": float(xcell.Omega)}
     x = HELICOPTER.State(**{f: at.get(f, 0.0) for f in HELICOPTER.State._fields})
     rates = HELICOPTER.vector_field(xcell, x, HelicopterInputs(0.0, 0.0, 0.0, 0.5))
@@ -74,7 +74,7 @@ def test_the_mast_points_where_the_thrust_does(xcell):
 
 
 def decoded(content, number):
-    """An array of a page, by hand."""
+    """Return an array of a page, decoded by hand."""
     a = content["arrays"][number]
     if "n" in a:
         return a["from"] + a["step"] * np.arange(a["n"])
@@ -93,7 +93,7 @@ def test_the_scene_follows_the_run(xcell):
     path = np.array([decoded(content, n) for n in made["path"]])
     np.testing.assert_allclose(path, [2.0 * t, -0.5 * t, 0.1 * t], atol=1e-3)
     turns = np.array([decoded(content, n) for n in made["turns"]]).T
-    # Interpolated between two: they must not change their sign on the way.
+    # Interpolated between two: their sign must not change.
     assert np.all(np.sum(turns[1:] * turns[:-1], axis=1) > 0.9)
     expected = Rotation.from_euler("ZYX", np.stack([0.6 * t, 0 * t, 0.2 * np.sin(t)], axis=1))
     assert np.max((Rotation.from_quat(turns) * expected.inv()).magnitude()) < 2e-4
@@ -171,7 +171,7 @@ def test_what_is_nearly_constant_is_not_blown_up_to_its_panel():
     run = flown(phi=1e-9 * np.sin(t), Omega=150 + 0.01 * np.sin(t), z=np.sin(t))
     attitude, _, position, _ = figures.motion(run, HELICOPTER).panels
     assert np.ptp(attitude.limits) == pytest.approx(1.1 * 0.005)
-    # What moves keeps 5 % beside its range.
+    # Axes of moving quantities have a margin of 5 %.
     assert np.ptp(position.limits) == pytest.approx(1.1 * np.ptp(np.sin(t)), rel=1e-2)
     rotor = figures.sticks(run, HELICOPTER).panels[-1]
     assert np.ptp(rotor.limits) == pytest.approx(1.1 * 0.05 * 150.01, rel=1e-3)

@@ -1,4 +1,4 @@
-"""Inputs that are late by times of their own, against an integration of the delayed equations."""
+"""Inputs with separate delays, against an integration of the delayed equations."""
 
 import itertools
 from typing import Annotated, NamedTuple
@@ -74,7 +74,7 @@ def sticks(seed=0):
 
 
 def read(u, t, hold):
-    """An input at a time, which may lie between samples and before the first."""
+    """Return an input at a time, which may be between samples or before the first."""
     place = np.clip(t / DT, 0.0, N - 1.0)
     if hold == "linear":
         return np.interp(place, np.arange(N), u)
@@ -82,7 +82,7 @@ def read(u, t, hold):
 
 
 def by_hand(u, delays, hold, linear, upto=N):
-    """theta and what is felt (N,), by an integration that stops at every corner of an input."""
+    """Return theta and felt acceleration (N,), integrated between corners of the inputs."""
     holds = [hold.get(n, "zero-order") if isinstance(hold, dict) else hold for n in Inputs._fields]
     late = (*delays, 0.0)
 
@@ -90,7 +90,7 @@ def by_hand(u, delays, hold, linear, upto=N):
         return [read(v, t - d, h) for v, d, h in zip(u, late, holds, strict=True)]
 
     def rates(t, x, middle):
-        # Within a part every input stays or follows one line: read from the part's inside.
+        # Within a part every input is constant or one line, and is read inside it.
         lo, hi = middle
         e, f, w = (
             (read(v, lo - d, h) + (read(v, hi - d, h) - read(v, lo - d, h)) * (t - lo) / (hi - lo))
@@ -103,7 +103,7 @@ def by_hand(u, delays, hold, linear, upto=N):
     x, out = np.zeros(2), []
     for k in range(upto):
         e, f, w = acting(k * DT + (0.0 if isinstance(hold, dict) or hold == "linear" else 1e-12))
-        # A held input that is late by whole samples and a part jumps within the interval.
+        # A held input late by a fractional number of samples jumps within the interval.
         out.append((x[0], x[1] + e - f + w))
         corners = sorted({0.0, *((d / DT) % 1.0 for d in late), 1.0})
         for lo, hi in itertools.pairwise(corners):
@@ -114,7 +114,7 @@ def by_hand(u, delays, hold, linear, upto=N):
 
 @pytest.fixture(scope="module")
 def run():
-    """theta and what is felt of a delayed model, compiled once a model and hold."""
+    """Return theta and felt acceleration of a delayed model, compiled once per model and hold."""
     compiled = {}
 
     def go(machine, u, delays, hold, **keywords):
@@ -181,7 +181,7 @@ def test_derivatives_by_each_delay(machine):
 
     def theta(d):
         p = Params(late=d[0], later=d[1])
-        # Mixed is held and linear at once.
+        # Mixed contains held and linear intervals.
         return simulate(machine, p, u, dt=DT, hold=HOLDS["mixed"]).outputs.theta
 
     d, h = jnp.asarray([0.031, 0.116]), 1e-5
@@ -195,7 +195,7 @@ def test_derivatives_by_each_delay(machine):
 
 @pytest.mark.parametrize("machine", [LINEAR, NONLINEAR], ids=["linear", "nonlinear"])
 def test_the_filter_without_noise_predicts_the_simulation(run, machine):
-    """With nothing random in it a filter corrects nothing: its innovations are y - simulation."""
+    """Test a filter without randomness: its innovations are y - simulation."""
     u, delays = sticks(5), (0.031, 0.116)
     disturbed = with_disturbance(machine, "pitch")
     assert disturbed.delays == machine.delays
@@ -215,7 +215,7 @@ def test_the_filter_without_noise_predicts_the_simulation(run, machine):
 
 
 def test_noise_is_drawn_beside_delays():
-    """The noise adds to a linear model's run what it adds without any input."""
+    """Test that noise adds the same to a linear model's run as without any input."""
     disturbed = with_disturbance(LINEAR, "pitch")
     p = disturbed.Params(
         late=jnp.asarray(0.031), later=jnp.asarray(0.116), sigma_w=jnp.asarray(0.3)
@@ -237,7 +237,7 @@ def test_noise_is_drawn_beside_delays():
 
 @pytest.mark.slow
 def test_delays_are_found_beside_the_parameters(run):
-    """In windows, whose inputs begin before them."""
+    """Test windows, whose inputs begin before them."""
     u = sticks(8)
     rng = np.random.default_rng(9)
     y = run(LINEAR, u, (0.031, 0.116), "linear")[0] + 1e-3 * rng.standard_normal(N)

@@ -1,4 +1,4 @@
-"""The matrix exponential and what is built on it, against SciPy and quadrature."""
+"""The matrix exponential and the discretisation, against SciPy and quadrature."""
 
 import jax
 import jax.numpy as jnp
@@ -33,14 +33,14 @@ def dense(seed, n=5):
 )
 def test_wild_scales_cost_no_digits(seed, size, powers):
     X = dense(seed) * 10.0**size / 5.0
-    d = 2.0 ** np.array(powers)  # exact: D e^X D^-1 = e^(D X D^-1) to the last bit
+    d = 2.0 ** np.array(powers)  # exact to the last bit: D e^X D^-1 = e^(D X D^-1)
     found = np.asarray(fast(jnp.asarray(X * d[:, None] / d[None, :])))
     found = found / d[:, None] * d[None, :]
     wanted = scipy.linalg.expm(X)
     assert np.abs(found - wanted).max() <= 1e-12 * max(1.0, np.linalg.norm(X)) * np.exp(
         np.linalg.norm(X, 2)
     )
-    # The growth that the norm allows is rarely there; the typical error is far smaller.
+    # The growth that the norm allows is rare; the typical error is far smaller.
     assert np.abs(found - wanted).max() <= 1e-10 * np.abs(wanted).max() + 1e-13
 
 
@@ -57,7 +57,7 @@ step = jax.jit(van_loan)
 
 @given(st.integers(0, 10**6), st.floats(-6.0, 2.0), st.lists(st.integers(-9, 9), min_size=5))
 def test_a_step_is_the_exponentials(seed, size, powers):
-    """Mean and covariance against exponentials of the augmented matrices, in wild units too."""
+    """Test mean and covariance against augmented exponentials, also in extreme units."""
     rng = np.random.default_rng(seed)
     d = 2.0 ** np.resize(powers, 5)
     A = (dense(seed) * d[:, None] / d[None, :]) * 10.0**size
@@ -160,7 +160,11 @@ def test_discretisation_with_a_late_input(stand_discrete, seed, late):
         return E[:4, :4], E[:4, 4:]
 
     whole, rest = held(dt), held((1.0 - late) * dt)
-    wanted = whole[0], rest[1], whole[1] - rest[1]  # what acted before is the rest of the interval
+    wanted = (
+        whole[0],
+        rest[1],
+        whole[1] - rest[1],
+    )  # the rest is u[k-1]'s
     assert found.Bn is None
     for one, other in zip(found[:3], wanted, strict=True):
         size = np.abs(other).max() + np.abs(whole[1]).max()

@@ -30,7 +30,7 @@ def hover(xcell):
 
 
 def sticks(found, n, *, roll=2e-4, pitch=-2e-4, yaw=0.05, throttle=0.01, seed=0):
-    """Small steps of all sticks about a trim, (N,)."""
+    """Return small steps of all sticks about a trim, (N,)."""
     rng = np.random.default_rng(seed)
     sizes = {"x_roll": roll, "x_pitch": pitch, "x_yaw": yaw, "x_throttle": throttle}
 
@@ -44,7 +44,7 @@ def sticks(found, n, *, roll=2e-4, pitch=-2e-4, yaw=0.05, throttle=0.01, seed=0)
 
 @pytest.fixture(scope="module")
 def fleet():
-    """Three machines in the same flight of 50 samples: one program for several tests."""
+    """Simulate three vehicles in the same flight of 50 samples, one program for several tests."""
     model = models.helicopter("consistent")
 
     @jax.jit
@@ -60,7 +60,7 @@ def fleet():
 
 @pytest.mark.slow
 def test_free_fall_is_a_parabola(xcell, fleet):
-    """Without a rotor that the air could turn, and without drag."""
+    """Test without a rotor in the air and without drag."""
     model = models.helicopter("consistent")
     p = naming.replace(xcell, **{n: jnp.zeros(()) for n in ("a", "Cd0", "Sx", "Sy", "Sz")})
     s = naming.replace(model.initial_state(p), Omega=0.0, dx=3.0, dy=-1.0, dz=5.0, phi=0.3, psi=1.0)
@@ -70,12 +70,12 @@ def test_free_fall_is_a_parabola(xcell, fleet):
     np.testing.assert_allclose(run.states.x, 3.0 * t, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(run.states.y, -1.0 * t, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(run.states.z, 5.0 * t - 0.5 * 9.80665 * t**2, rtol=1e-9, atol=1e-12)
-    assert STATUS[int(run.status)] == "outside the model's range"  # the rotor stands still
+    assert STATUS[int(run.status)] == "outside the model's range"  # the rotor is at rest
     assert set(np.flatnonzero(run.outside["slow rotor"])) == set(range(50))
 
 
 def test_a_second_is_scipys_and_one_bad_element_leaves_the_others_alone(xcell, hover, fleet):
-    """One flight against solve_ivp with the second program's derivatives."""
+    """Test one flight against solve_ivp with the second program's derivatives."""
     n = 50
     u = sticks(hover, n)
     run = fleet([xcell, naming.replace(xcell, Ixx=jnp.asarray(jnp.nan)), xcell], hover.state, u)
@@ -97,7 +97,7 @@ def test_a_second_is_scipys_and_one_bad_element_leaves_the_others_alone(xcell, h
 
 
 def pilot(hover, gain=1.0):
-    """Attitude feedback to hover, as a user would write it."""
+    """Return an attitude feedback to hover, as a user would write it."""
 
     def feedback(s, u):
         return u._replace(
@@ -117,7 +117,7 @@ def test_feedback_is_applied_once_a_sample(xcell, hover):
     law = pilot(hover)
     run = jax.jit(lambda s: simulate(model, xcell, u, dt=DT, initial_state=s, feedback=law))(start)
     two = jax.jit(lambda s, u: simulate(model, xcell, u, dt=DT, initial_state=s).states)
-    # By hand: a run of two samples, again and again.
+    # By hand: repeated runs of two samples.
     x = start
     for k in range(n - 1):
         now = law(x, jax.tree.map(lambda v, k=k: v[k], u))
@@ -158,7 +158,7 @@ STONE = Model("stone", falling, lambda g, s, u: s, Gravity, Stone, Nothing, Ston
 
 
 def test_the_ground_ends_a_run_at_its_moment():
-    """A stone is enough: what the event does has nothing of a helicopter."""
+    """Return a falling stone, since events do not depend on the helicopter."""
     p, u = Gravity(9.80665), Nothing(jnp.zeros(60))
     fall = Stone(x=0.0, z=2.0, dx=3.0, dz=0.0)
 
@@ -176,20 +176,20 @@ def test_the_ground_ends_a_run_at_its_moment():
         after = np.asarray(run.times) > moment
         np.testing.assert_allclose(np.asarray(run.states.z)[after], 0.3, atol=1e-9)
         np.testing.assert_allclose(np.asarray(run.states.x)[after], 3.0 * moment, rtol=1e-9)
-    assert float(fixed(0.2).ended) == 0.0  # it began below
+    assert float(fixed(0.2).ended) == 0.0  # it started below
     aloft = fixed(200.0)
     assert int(aloft.event) == -1
     assert float(aloft.ended) == np.inf
 
 
 def fallen(g, h):
-    """A free fall from the height h in samples, without an end."""
+    """Return a free fall from the height h over some samples, without an end."""
     t = DT * jnp.arange(60.0)
     return Stone(3.0 * t, h - 0.5 * g * t**2, 3.0 + 0.0 * t, -g * t)
 
 
 def landed(g_and_h, states=None):
-    """Moment and state of a stone that comes down to 0.3 m; the moment 0 if it stays up."""
+    """Return time and state of a stone that reaches 0.3 m; the time is 0 if it does not."""
     (g, h), events, u = g_and_h, {"ground": ground(0.3)}, Nothing(jnp.zeros(60))
     if states:
         at, (ended, event) = stopped(
@@ -215,12 +215,12 @@ def test_the_moment_of_an_event_has_the_derivatives_of_a_free_fall(mode, states)
     t = np.sqrt(2 * drop / g)
     by_g, by_h = -t / (2 * g), 1 / (g * t)
     slopes = jax.jit(mode(functools.partial(landed, states=states)))
-    # x = 3 t and dz = -g t there, and z stays.
+    # There x = 3 t and dz = -g t, and z is constant.
     wanted = [
         [by_g, by_h], [3 * by_g, 3 * by_h], [0.0, 0.0], [-t - g * by_g, -g * by_h]
     ]  # fmt: skip
     np.testing.assert_allclose(slopes(jnp.array([g, 0.3 + drop])), wanted, rtol=1e-9, atol=1e-9)
-    # Without an event, or where one has come already, nothing hangs on its moment.
+    # Without an event, or after one, nothing depends on its time.
     for h in (200.0, 0.2):
         found = np.asarray(slopes(jnp.array([g, h])))
         np.testing.assert_array_equal(found[0], 0.0)

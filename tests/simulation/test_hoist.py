@@ -1,4 +1,4 @@
-"""What is computed of the parameters alone leaves the loop, and nothing else changes."""
+"""Operations on parameters alone move out of the loop; nothing else changes."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from heli_jax.numerics.hoist import hoisted
 
 
 def operations(function, *arguments):
-    """How often each operation stands in a function, those within others too."""
+    """Return the number of each operation in a function, including nested ones."""
     found = {}
 
     def count(jaxpr):
@@ -80,7 +80,7 @@ def test_a_large_matrix_of_parameters_is_made_once():
     p, u = jnp.arange(4.0).reshape(2, 2), jnp.arange(100.0)
     values, rest = hoisted(function, p, u, jnp.asarray(0.0))
     left = str(jax.make_jaxpr(rest)(values, u, jnp.asarray(0.0)))
-    # What waits repeats its number, and so does what is added to a record: neither is kept.
+    # Arrays that repeat one number are not stored, only the number.
     assert "scatter" not in left
     assert "dot_general" not in left
     assert sorted(np.shape(v) for v in values) == [(), (9,)]

@@ -22,7 +22,7 @@ RNG = np.random.default_rng(3)
 DE, DR = RNG.standard_normal(N), np.repeat(RNG.standard_normal(N // 4 + 1), 4)[:N]
 STICK = np.r_[np.repeat([0.0, 1.0, -1.0, 0.4], 5), 0.4 + 0.3 * np.sin(0.2 * np.arange(N - 20))]
 STEPPED = np.arange(N) < 20
-"""the intervals of STICK that are held"""
+"""Held intervals of STICK."""
 X0 = np.array([0.3, -0.5])
 A = np.array([[-1.2, 20.0], [0.3, -3.7]])
 B = np.array([[-2.0, 0.4], [-9.0, 1.5]])
@@ -47,7 +47,7 @@ class Inputs(NamedTuple):
 class Outputs(NamedTuple):
     q: float
     az: float
-    """with direct feed-through"""
+    """Model with direct feed-through."""
 
 
 def field(p, s, u):
@@ -67,7 +67,7 @@ MIXED = {"de": "linear", "dr": "zero-order"}
 
 
 def acting(name, values, t, delay, hold):
-    """One input at the time t, by its hold; before the first sample the first, and so on."""
+    """Return an input at the time t by its hold; before the first sample the first."""
     at = int(np.clip(np.floor((t - delay) / DT + 1e-9), 0, N - 1))
     if hold == "linear" or (hold == "mixed" and not STEPPED[at]):
         return np.interp(t - delay, DT * np.arange(N), values)
@@ -75,7 +75,7 @@ def acting(name, values, t, delay, hold):
 
 
 def integrated(delay=0.0, holds=("linear", "zero-order"), drag=0.0, x0=X0, de=DE):
-    """States (N, 2) by solve_ivp, stopped wherever an input has a corner or a jump."""
+    """Return states (N, 2) by solve_ivp, stopped at every corner or jump of an input."""
     knots = np.unique(np.round([*(DT * np.arange(N)), *(DT * np.arange(-N, 2 * N) + delay)], 12))
     knots = knots[(knots >= 0) & (knots <= DT * (N - 1) + 1e-9)]
     x, states = np.asarray(x0, float), {0.0: np.asarray(x0, float)}
@@ -83,7 +83,7 @@ def integrated(delay=0.0, holds=("linear", "zero-order"), drag=0.0, x0=X0, de=DE
         middle = 0.5 * (a + b)
 
         def rates(t, x, middle=middle):
-            # A held input is that of the interval, a linear one that of the moment.
+            # A held input has the interval's value, a linear one that of the time.
             u = [
                 acting(n, v, middle if hold == "zero-order" else t, delay, hold)
                 if hold != "mixed" or not STEPPED[int((middle - delay) // DT)]
@@ -130,7 +130,7 @@ def close(found, expected, tolerance):
 
 
 def test_linear_inputs_are_scipys_first_order_hold():
-    """lsim interpolates; its states are those of x' = A x + B u with both inputs linear."""
+    """Test against lsim, which interpolates: x' = A x + B u with both inputs linear."""
     _, _, x = scipy.signal.lsim((A, B, np.eye(2), np.zeros((2, 2))), np.stack([DE, DR], 1),
                                 DT * np.arange(N), X0, interp=True)  # fmt: skip
     found = compiled(hold="linear")(inputs(), jnp.asarray(0.0))
@@ -195,7 +195,7 @@ def test_derivatives_by_delay_and_parameter(solver):
 
 
 def test_derivative_by_delay_on_the_samples_is_continuous():
-    """Linear inputs have no jump that a delay of a whole sample could meet."""
+    """Test linear inputs, which have no jumps at delays of whole samples."""
     go = compiled(delayed=True, hold="linear")
     slope = jax.jit(jax.jacfwd(lambda d: go(inputs(), d).states.q))
     for delay in (0.0, DT):
@@ -251,7 +251,7 @@ def test_accumulate_with_other_solvers():
 
 @pytest.mark.parametrize("model", [LINEAR, OTHER], ids=["linear", "other"])
 def test_filters_predict_with_mixed_and_linear_inputs(model):
-    """Without noise of the process the innovations are the simulation's error."""
+    """Test that without process noise the innovations are the simulation's error."""
     measured, delay = {"q": jnp.zeros(N), "az": jnp.zeros(N)}, jnp.asarray(0.083)
 
     @jax.jit
@@ -269,7 +269,7 @@ def test_filters_predict_with_mixed_and_linear_inputs(model):
 
 
 def test_an_event_is_found_where_the_moving_input_brings_it():
-    """u rises through 0.55 in the middle of a sample: a held one shows that later."""
+    """Test an event: u rises through 0.55 in mid-sample, which a held input shows later."""
     u = Inputs(jnp.arange(10.0) / 10, jnp.zeros(10))
     events = {"full": lambda p, s, u: 0.55 - u.de}
     found = jax.jit(lambda u: simulate(OTHER, Params(), u, dt=DT, hold="linear", events=events))(u)

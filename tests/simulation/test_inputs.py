@@ -1,4 +1,4 @@
-"""Stick inputs: their amplitude, their holds, their frequencies."""
+"""Stick inputs: amplitudes, holds and frequencies."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from heli_jax.simulation.inputs import chirp, multistep_3211, random_steps
 
 
 def lengths(u):
-    """How many samples each level is held."""
+    """Return the number of samples of each level."""
     ends = np.flatnonzero(np.diff(u)) + 1
     return np.diff([0, *ends, u.size])
 
@@ -39,5 +39,5 @@ def test_sweep_runs_from_low_to_high():
     assert np.abs(u).max() == pytest.approx(1.0, abs=1e-3)
     up = np.flatnonzero((u[:-1] < 0) & (u[1:] >= 0)) * dt
     assert 1.0 / (up[-1] - up[-2]) == pytest.approx(high, rel=0.03)
-    # Integral of an exponential frequency: (high - low) T / ln(high / low) turns in all.
+    # Integral of an exponential frequency: (high - low) T / ln(high / low) turns.
     assert len(up) == pytest.approx((high - low) * n * dt / np.log(high / low), abs=2)

@@ -1,4 +1,4 @@
-"""SimulationOptions: one record or its fields as keywords, which are the same."""
+"""SimulationOptions: as a record or as keywords, with equal results."""
 
 import jax
 import jax.numpy as jnp

@@ -31,7 +31,7 @@ U = stick()
 
 
 def recurrence(v, u, x0, dt=DT):
-    """States (N, 4) by SciPy's zero-order hold."""
+    """Return states (N, 4) by SciPy's zero-order hold."""
     A, B = matrices(v, True)
     Ad, Bd, *_ = scipy.signal.cont2discrete((A, B, np.eye(4), np.zeros((4, 1))), dt)
     x = [np.asarray(x0, float)]
@@ -41,7 +41,7 @@ def recurrence(v, u, x0, dt=DT):
 
 
 def switching(v, u, x0, delay, dt=DT):
-    """States (N, 4) by solve_ivp, stopped at every sample and at every change of a late input."""
+    """Return states (N, 4) by solve_ivp, stopped at every sample and change of a delayed input."""
     A, B = matrices(v, True)
     n = len(u)
     ends = np.unique(np.round([*(np.arange(n) * dt), *(np.arange(n) * dt + delay)], 12))
@@ -85,7 +85,7 @@ def table(trajectory):
 
 
 def close(found, wanted, rtol):
-    """Each column within rtol of its largest value."""
+    """Assert each column within rtol of its largest value."""
     size = np.abs(wanted).max(axis=0)
     np.testing.assert_allclose(np.asarray(found) / size, wanted / size, rtol=0, atol=rtol)
 
@@ -117,7 +117,7 @@ def test_rk4_converges_with_order_four():
 
 
 def test_the_input_is_held_to_the_end_of_its_interval():
-    # A method that read the next sample in its last stage would be wrong by first order: 1e-2.
+    # Reading the next sample in the last stage would be a first-order error: 1e-2.
     close(table(run(BENCH, solver="rk4", substeps=32)), recurrence(BENCH, U, X0), 1e-5)
     close(table(run(BENCH, solver="tsit5", substeps=32)), recurrence(BENCH, U, X0), 1e-7)
 
@@ -143,7 +143,7 @@ NAMES = ("Ixx", "If", "a", "kappa", "L3", "Omega")
 
 @pytest.fixture(scope="module")
 def slopes():
-    """(weights, logs, d cost / d logs by finite differences of SciPy's simulation)"""
+    """Return (weights, logs, d cost / d logs by finite differences of SciPy's simulation)."""
     weights = np.random.default_rng(5).standard_normal(N)
 
     def cost(logs):
@@ -183,7 +183,7 @@ def test_checkpointed_reverse_mode_through_rk4(slopes):
 
 @pytest.fixture(scope="module")
 def fleet():
-    """Six machines as one batch: four sound ones, one not a number, one that flies apart."""
+    """Test six vehicles in one batch: four sound, one NaN, one that diverges."""
     machines = [scattered(k) for k in range(4)]
     machines.insert(1, {**BENCH, "Ixx": np.nan, "Ixx_added": 0.0})
     machines.insert(3, {**BENCH, "Ixx": 1e-7, "Ixx_added": 0.0})
@@ -315,7 +315,7 @@ def test_wrong_arguments(bench30, model, inputs, how):
 
 @pytest.mark.slow
 def test_noise_of_a_nonlinear_model_is_that_of_its_linearisation(bench30):
-    """On a linear model it is the exact one, draw by draw."""
+    """Test that on a linear model it equals the exact one, draw by draw."""
     model = with_disturbance(STAND, "roll")
     p = model.Params(**naming.asdict(bench30), sigma_w=jnp.asarray(1.0), tau_w=jnp.asarray(0.5))
     key, inputs = jax.random.key(3), models.roll.Inputs(U)

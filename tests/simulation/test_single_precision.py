@@ -1,4 +1,4 @@
-"""A run in float32 reads the right sample of its input however long it is, and says what it is."""
+"""Runs in float32: the right input sample at any length, and the result's type."""
 
 from typing import Annotated, NamedTuple
 

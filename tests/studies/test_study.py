@@ -1,4 +1,4 @@
-"""Studies of fits: which there are, killed and resumed, failures, and the Dataset."""
+"""Studies of fits: combinations, kills and resuming, failures, and the Dataset."""
 
 import io
 import json
@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture(scope="module")
 def config(tmp_path_factory) -> Path:
-    """A bench whose record is made by hand: I phi'' = -k phi + stick, in small steps."""
+    """Write a bench with a record by hand: I phi'' = -k phi + stick, in small steps."""
     folder = tmp_path_factory.mktemp("study")
     t = 0.05 * np.arange(400)
     stick = 3e-6 * np.sign(np.sin(0.9 * t + 0.02 * t**2))
@@ -57,9 +57,9 @@ def config(tmp_path_factory) -> Path:
 
 
 def here(tasks, options):
-    """In this process: starting others takes seconds."""
+    """Run in this process, since starting others takes seconds."""
     for k, task in enumerate(tasks):
-        # As it reaches a worker: through JSON.
+        # A worker receives it through JSON.
         yield k, fit_point(type(task)(**json.loads(json.dumps(task._asdict()))))
 
 
@@ -84,7 +84,7 @@ def test_interrupted_and_resumed_it_is_the_same_dataset(config, tmp_path, monkey
 
     with pytest.raises(Killed):
         run_study(config, killed, over, overrides, progress=kill)
-    (killed / "fits" / ".2_log=short-0123abcd").mkdir()  # what was being written
+    (killed / "fits" / ".2_log=short-0123abcd").mkdir()  # unfinished output
     done = next((killed / "fits").glob("0_*/fit.json"))
     before = done.stat().st_ino
     found = run_study(config, killed, over, overrides, resume=True)
@@ -105,7 +105,7 @@ def test_interrupted_and_resumed_it_is_the_same_dataset(config, tmp_path, monkey
         assert (at["low"].item(), at["high"].item()) == (estimate.lower95, estimate.upper95)
     assert one["vaf"].item() == saved.metrics["roll"].vaf
     assert saved.content["starts"][0]["converged"]
-    # Two starts, one optimum: the truth of the vehicle's file, within what the noise allows.
+    # Two starts have one optimum: the vehicle file's truth, within the effect of noise.
     np.testing.assert_allclose(one["estimate"].sel(parameter="Ixx"), 0.024, rtol=0.02)
     lost = found.sel({"flights.0.log": "short.csv"})
     assert set(lost["status"].values.ravel()) == {"failed"}
@@ -143,7 +143,7 @@ def test_values_with_commas_stay_one_value(config):
         "fit.seed": 1, "flights.0.rate": 10, "fit.intervals.profile": ["Ixx"],
     }  # fmt: skip
     assert read_study(config, ["flights.0.window=[0, 10]"]) is None
-    # A value in place of the file's axis makes one fit of it; a pattern names all its files.
+    # A value in place of the file's axis gives one fit; a pattern lists all its files.
     in_file = {"flights.0.log": ["*.csv"]}
     assert read_study(config, in_file).axes == {"flights.0.log": ("a.csv", "short.csv")}
 
@@ -171,7 +171,7 @@ def test_what_is_wrong_ends_in_one_sentence(options, config, tmp_path, monkeypat
 
 
 def test_a_page_names_the_studys_command_and_its_point(config, tmp_path, monkeypatch):
-    """Not the worker's, which nobody typed."""
+    """Test that the command is the user's, not the worker's."""
     asked = "heli-jax fit bench.yaml --over fit.free.Ixx.start=0.02,0.03"
     monkeypatch.setattr("sys.argv", asked.split())
     study = read_study(config, (), ["fit.free.Ixx.start=0.02,0.03"])

@@ -1,4 +1,4 @@
-"""A record of the bench, and a small model of one's own."""
+"""A record of the bench, and a small user's model."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from heli_jax import Flight
 
 @pytest.fixture(scope="session")
 def record():
-    """400 samples at 50 Hz with something measured, some of it missing."""
+    """Return 400 samples at 50 Hz with a measured output, partly missing."""
     rng = np.random.default_rng(5)
     roll = 0.1 * rng.standard_normal(400)
     roll[[3, 77, 200]] = np.nan

@@ -1,4 +1,4 @@
-"""A grid comes back as a grid."""
+"""Results of a grid as a grid."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Sweeps on dask workers, some of which die; and on this process, which is killed."""
+"""Sweeps on dask workers, some killed; and in this process, which is killed."""
 
 import os
 import signal
@@ -22,7 +22,7 @@ def pids(client):
     return sorted(client.run(os.getpid).values())
 
 
-# dask closes a killed worker's pipes late, and Python's collector then warns.
+# dask closes a killed worker's pipes late, and Python's garbage collector then warns.
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.slow
@@ -36,7 +36,7 @@ def test_a_worker_that_dies_costs_nothing(bench30, record):
     options = {"chunk": 32, "lanes": 16}
     alone = sweep(ROLL, bench30, record, design, reduce, **options)
     with connected(workers=2) as client:
-        # Of the scheduler, each worker and each nanny one, all encrypted, and none of HTTP.
+        # The scheduler, each worker and each nanny have one, all encrypted; none is HTTP.
         of_all = [psutil.Process(), *psutil.Process().children(recursive=True)]
         listening = [c.laddr for p in of_all for c in p.net_connections() if c.status == "LISTEN"]
         assert len(listening) == 5
@@ -95,7 +95,7 @@ def test_a_scheduler_without_workers_is_not_waited_for_without_end(monkeypatch, 
         status = "finished"
 
     class Running:
-        """Tasks that wait for a worker."""
+        """Return tasks that wait for a worker."""
 
         def __init__(self, done):
             self.done = done
@@ -110,7 +110,7 @@ def test_a_scheduler_without_workers_is_not_waited_for_without_end(monkeypatch, 
             return Future(), self.done.pop()
 
     class Scheduler:
-        """Its workers by time; the last look finds none, or one that is short of memory."""
+        """A cluster with workers by time; finally none, or one short of memory."""
 
         def __init__(self, *looks):
             self.looks = list(looks)
@@ -140,7 +140,7 @@ def test_a_result_whose_worker_has_died_is_not_waited_for_without_end(monkeypatc
     with local, Client(local) as client:
         future = client.submit(int, 7)
         wait(future)
-        # Done there, and gone with the worker before it is fetched.
+        # Computed there, and lost with the worker before it is fetched.
         local.scale(0)
         while client.scheduler_info()["workers"]:
             pass

@@ -1,4 +1,4 @@
-"""heli-jax sweep: from a configuration to a directory, and what is refused in words."""
+"""heli-jax sweep: from a configuration to a directory, and refusals."""
 
 import json
 import re
@@ -58,16 +58,16 @@ def test_a_directory_with_all_that_is_promised(write, tmp_path, capsys):
     assert json.loads((out / "summary.json").read_text())["status"]["ok"] == 6
     page = (out / "report.html").read_text()
     assert page.count("data:image/png;base64,") == len(list((out / "figures").glob("*.png")))
-    assert "://" not in page  # nothing but the page itself
+    assert "://" not in page  # only the page itself
     found = opened(out)
     np.testing.assert_allclose(found["Ixx"], np.linspace(0.02, 0.05, 6))
     assert yaml.safe_load(found.attrs["configuration"])["sweep"]["design"] == "grid"
     assert found.attrs["seed"] == 0
-    # The resolved configuration makes the same sweep from anywhere.
+    # The resolved configuration makes the same sweep from any folder.
     again = tmp_path / "again"
     assert cli.main(["sweep", str(out / "config.yaml"), "--out", str(again)]) == 0
     assert found["rms"].values.tobytes() == opened(again)["rms"].values.tobytes()
-    # And it is the same sweep to go on with.
+    # It also resumes as the same sweep.
     assert cli.main(["sweep", str(out / "config.yaml"), "--out", str(out), "--resume"]) == 0
 
 
@@ -250,7 +250,7 @@ OWN = {
 
 @pytest.mark.parametrize("case", OWN)
 def test_a_function_that_cannot_be_computed_is_named(case, write, tmp_path, capsys):
-    # Folders stay on the path: one process knows one module of a name.
+    # Folders stay on the path, so a process has one module of a name.
     module = f"own_functions_{list(OWN).index(case)}"
     (tmp_path / f"{module}.py").write_text(
         f"import numpy as np\n\n\ndef of_mine(run):\n    return {OWN[case]}\n"
@@ -276,7 +276,7 @@ def test_numbers_that_the_summary_leaves_out_are_counted(write, tmp_path, capsys
         assert one.get("infinite", 0) == np.count_nonzero(np.isinf(values))
         assert one.get("nan", 0) == np.count_nonzero(np.isnan(values))
         assert one["n"] == np.count_nonzero(np.isfinite(values))
-    # Gone on with when it is finished, it still says what it took.
+    # Resumed after its end, it still states its time.
     before = found["timing"]
     assert cli.main(["sweep", str(path), "--out", str(out), "--no-figures", "--resume"]) == 0
     assert json.loads((out / "summary.json").read_text())["timing"] == before

@@ -1,4 +1,4 @@
-"""Designs: the values of the axes, against NumPy, SciPy and itertools."""
+"""Designs: values of the axes, against NumPy, SciPy and itertools."""
 
 import concurrent.futures
 import itertools

@@ -1,4 +1,4 @@
-"""Runs as one program against the same by XLA, sample by sample."""
+"""Fused runs against XLA, sample by sample."""
 
 import dataclasses
 import re
@@ -58,7 +58,7 @@ def test_single_precision(bench30, record):
 
 
 def test_what_became_of_an_element_is_the_same(bench30, record):
-    # A spring that pushes it out of range, a parameter that is no number, one that cannot be.
+    # A spring that pushes it out of range, a NaN parameter, an impossible parameter.
     design = paired({"kappa": [0.0, -1e5, 0.0, 0.0], "Ixx": [0.03, 0.03, np.nan, -0.03]})
     found = agree(1e-11, STAND, bench30, record, design, {"rms": Reduce("rms", "roll")})
     assert found["status"].to_numpy().tolist() == [0, 2, 1, 2]
@@ -118,7 +118,7 @@ def test_a_translation_that_fails_is_no_sweep_that_fails(bench30, record, monkey
     right = OPERATIONS["mul"]
 
     def wrong(code, *values, **others):
-        # An index into a record stays what it is.
+        # An index into a record stays unchanged.
         if values[0].dtype.kind != "f":
             return right(code, *values, **others)
         return code.made("fmul contract i32 %nowhere, 1", values[0].dtype, False)

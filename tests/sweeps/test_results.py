@@ -1,4 +1,4 @@
-"""What a sweep keeps of each run, against simulate, NumPy and hand-made numbers."""
+"""Results of runs in a sweep, against simulate, NumPy and numbers by hand."""
 
 from typing import Annotated, NamedTuple
 
@@ -33,7 +33,7 @@ AXES = {"Ixx": Range(0.02, 0.05, "log"), "If": Range(2e-4, 6e-4, "log")}
 
 
 def flown(model, record, **options):
-    """simulate, compiled once for all that fly this record."""
+    """Return simulate, compiled once for all that use this record."""
     return jax.jit(lambda params: simulate(model, params, record, **options))
 
 
@@ -76,7 +76,7 @@ def test_the_labels_say_what_stands_there(bench30, record):
     assert list(found) == ["peak", "fit"]
     assert found["Ixx"].attrs["scale"] == "log"
     assert "scale" not in found["Iyy"].attrs
-    # An axis that changes nothing says so.
+    # An axis without effect has a note.
     [said] = found.attrs["notes"]
     assert (said["code"], said["subjects"]) == ("sweep.axis-without-effect", ["Iyy"])
     assert found["peak"].attrs["units"] == "rad"
@@ -312,7 +312,7 @@ def xcell(vehicles_folder):
     return load_vehicle(vehicles_folder / "x-cell-60.yaml")
 
 
-# Of one length and one condition: the program that trims is compiled once.
+# With one length and one condition, the trim is compiled once.
 HELICOPTER = models.helicopter("consistent")
 STILL = Flight(
     dt=0.02, inputs={n: np.zeros(51) for n in naming.names(HELICOPTER.Inputs)}, outputs={},

@@ -1,4 +1,4 @@
-"""What lies on disk: labels, chunks, resuming, and what is refused."""
+"""The store on disk: labels, chunks, resuming, and refusals."""
 
 import errno
 import json
@@ -44,7 +44,7 @@ def run(bench30, short):
 
 @pytest.fixture(scope="module")
 def whole(run, tmp_path_factory):
-    """A finished sweep on disk."""
+    """Return a finished sweep on disk."""
     out = tmp_path_factory.mktemp("sweeps") / "whole"
     run(out)
     return out
@@ -68,7 +68,7 @@ def test_xarray_reads_the_store_by_itself(whole):
     assert json.loads(found.attrs["description"])["design"]["n"] == 300
     np.testing.assert_array_equal(found["a"], DESIGN.values(0, 300)["a"])
     assert not found["status"].any()
-    # By which an interrupt knows whether anything is kept.
+    # An interrupt uses this number to state if anything is stored.
     assert len(list(whole.glob(stores.FINISHED))) == 10
     assert np.isfinite(found["rms"]).all()
 
@@ -119,7 +119,7 @@ def test_chunks_and_devices_change_no_bit(run, whole, options):
 
 @pytest.mark.slow
 def test_several_devices_change_no_bit(tmp_path):
-    """In a process of its own, since the number of devices is fixed when JAX begins."""
+    """Test in a separate process, since JAX fixes the number of devices at its start."""
     import subprocess
     import sys
 
@@ -176,7 +176,7 @@ def test_what_is_finished_is_not_computed_again(run, whole, tmp_path, monkeypatc
 
 
 def test_a_chunk_without_status_is_computed_again(run, whole, tmp_path):
-    """A kill between the results and the status of a chunk."""
+    """Test a kill between results and status of a chunk."""
     out = tmp_path / "torn"
     shutil.copytree(whole, out)
     (out / "sweep.zarr" / "status" / "c" / "3").unlink()

@@ -1,4 +1,4 @@
-"""Delays of single inputs and outputs, each a parameter."""
+"""Pure delays of inputs and outputs, as model parameters."""
 
 import dataclasses
 import functools
@@ -15,36 +15,36 @@ from heli_jax.dynamics.onboard.device import Device, Parts, Quantity, require
 from heli_jax.naming import Record
 
 ORDER = 4
-"""states of a delay line: at 2/delay rad/s its error is 2e-4, at 4/delay 3 %"""
+"""Default number of states of a delay line: error 2e-4 at 2/delay rad/s, 3 % at 4/delay."""
 _HIGHEST = 8
 
 type Late = Sequence[str] | Mapping[str, str]
-"""names, each with the parameter delay_NAME; or names with the parameter that is their delay"""
+"""Names (the parameter is then `delay_NAME`), or a mapping of names to delay parameters."""
 
 
 def with_delays(
     model: Model, inputs: Late = (), outputs: Late = (), *, order: int = ORDER
 ) -> Model:
-    """The model with pure delays on inputs and outputs, each by a parameter [s].
+    """Return the model with pure delays on inputs and outputs, each with a parameter [s].
 
-    An input acts late exactly (`Model.delays`), and its delay may be negative: the stick was logged
-    late. An output is late by a delay line of `order` states, `OUTPUT_late0` and so on: the Pade
-    approximation [order - 1/order] of exp(-s delay) in coordinates of the output's own past, the
-    coefficients of Legendre polynomials over the delay (Voelker, Kajic and Eliasmith, 2019). It is
-    linear, so that matrices, modes, filters and windows have it too, and differentiable.
+    An input delay is exact (`Model.delays`). It may be negative, for a stick that is logged late.
+    An output delay is a delay line of `order` states, `OUTPUT_late0` and so on. The line is the
+    Pade approximation [order - 1/order] of exp(-s delay), with Legendre coefficients of the
+    output's past as states (Voelker, Kajic and Eliasmith, 2019). It is linear and differentiable,
+    so matrices, modes, filters and windows include it.
 
     Args:
-        inputs: those that act late: names, or by name the parameter (which several may share).
+        inputs: names, or a mapping to parameters. Several inputs may share a parameter.
         order: states of each output's delay line, 1 to 8.
 
     Raises:
-        ValueError: no such input or output, one that is late already, or a name that is taken.
+        ValueError: no such input or output, one that has a delay already, or a name that is taken.
     """
     check_model(model)
     if not (isinstance(order, int) and 1 <= order <= _HIGHEST):
         raise ValueError(f"order: expected 1 to {_HIGHEST} states, got {order!r:.20}")
-    # Two ways, and not one for both: an input is a record, which can be read at any other time,
-    # exactly. An output is computed, and its past is there only if states carry it.
+    # An input is a record, which can be read exactly at any other time. An output is computed, so
+    # its past must be kept in states.
     late_in, late_out = _by_name(inputs), _by_name(outputs)
     if not late_in and not late_out:
         raise ValueError("expected an input or an output to delay, got none")
@@ -64,10 +64,10 @@ def _by_name(late: Late) -> dict[str, str]:
 
 
 def with_input_delays(model: Model, parameters: Mapping[str, str]) -> Model:
-    """The model whose inputs are late by new parameters.
+    """Return the model with input delays that are new parameters.
 
     Raises:
-        ValueError: an input is late already, or the model has a parameter of that name.
+        ValueError: an input has a delay already, or the model has a parameter of that name.
     """
     return _with_input_delays(model, tuple(parameters.items()))
 
@@ -78,8 +78,7 @@ def _with_input_delays(model: Model, parameters: tuple[tuple[str, str], ...]) ->
     bare = model.without_stand
     new: dict[str, list[str]] = {}
     for name, parameter in parameters:
-        # Several inputs may name one parameter, as all sticks go through one radio: one unknown for
-        # all.
+        # Several inputs may share one parameter, for example all sticks that go through one radio.
         new.setdefault(parameter, []).append(name)
     fields = {}
     for parameter, names in new.items():
@@ -87,9 +86,8 @@ def _with_input_delays(model: Model, parameters: tuple[tuple[str, str], ...]) ->
             raise ValueError(
                 f"model {model.name} has a parameter {parameter!r} already, expected another name"
             )
-        # NaN and not zero: a delay that nobody gave is asked for, there is no hidden default. It
-        # may become negative, for a stick that is logged late, so it is not marked positive as
-        # those of outputs are.
+        # A delay has no default: NaN makes the user give one. It may be negative, for a stick that
+        # is logged late, so it is not marked positive as output delays are.
         quantity = Quantity("s", f"delay of {', '.join(names)}", math.nan)
         fields[parameter] = (quantity.annotation, math.nan)
     return dataclasses.replace(
@@ -97,16 +95,17 @@ def _with_input_delays(model: Model, parameters: tuple[tuple[str, str], ...]) ->
         name=f"{model.name}+delays",
         Params=naming.extended(model.Params, f"{model.Params.__name__}Late", fields),
         delays=(*model.delays, *parameters),
-        # The free-flight model has the delay too, so that margins of a model on the stand keep it.
+        # The free-flight model has the delay too, so that margins of a model on the stand include
+        # it.
         without_stand=None if bare is None else _with_input_delays(bare, parameters),
     )
 
 
 def on_time(model: Model, names: Iterable[str]) -> None:
-    """Refuse an input that is late already.
+    """Raise if an input has a delay already.
 
     Raises:
-        ValueError: naming it and its delay.
+        ValueError: with the input and its delay.
     """
     late = dict(model.delays)
     for name in names:
@@ -125,7 +124,7 @@ def _with_output_delays(model: Model, late: tuple[tuple[str, str], ...], order: 
             raise ValueError(
                 f"model {model.name} has a parameter {parameter!r} already, expected another name"
             )
-    # Delays are also kept by name in `delay_lines`: a fit with a free delay has several starts.
+    # Delays are also kept by name in `delay_lines`: a fit with a free delay uses several starts.
     device = _LateOutputs(model, dict(late), order)
     return device.made(
         "output-delays",
@@ -142,8 +141,8 @@ class _LateOutputs(Device):
             parameter: Quantity("s", f"delay of {name} in the log", math.nan, True)
             for name, parameter in late.items()
         }
-        # The states are the past of the output over the delay, so they have its unit, and a line's
-        # delay has to be positive: it remembers, and cannot look ahead as a reader of a log can.
+        # The states are the output's past, so they have its unit. A line's delay must be positive:
+        # it stores the past and cannot look ahead.
         units = {n: naming.unit(model.Outputs, n) for n in late}
         states = {
             state: Quantity(units[n], f"past of {n}, Legendre coefficient {i}")
@@ -154,7 +153,7 @@ class _LateOutputs(Device):
         self.late, self.order = late, order
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """The derivatives of the lines' states, per second."""
+        """Return the time derivatives of the delay lines' states."""
         measured = self.measured(p, s, u)
         rates = {}
         for n, parameter in self.late.items():
@@ -165,7 +164,7 @@ class _LateOutputs(Device):
         return rates
 
     def shown(self, p: Record, s: Record, u: Record, y: Record) -> Record:
-        """The outputs, those that are late read from their lines."""
+        """Return the outputs, with delayed ones read from their delay lines."""
         return naming.replace(
             y,
             **{
@@ -179,9 +178,8 @@ class _LateOutputs(Device):
         )
 
     def first(self, p: Record) -> dict[str, Any]:
-        # As if the vehicle had always been where it starts: the first coefficient is the mean.
-        # At rest at zero instead, the line would show a step from zero to the first output, one
-        # delay long, which no flight has.
+        # Fill the line as if the output had always had its first value: coefficient 0 is the mean.
+        # Zero states would show a step from zero to the first output, which no flight has.
         at_first = self.model.output(p, self.model.initial_state(p), zeros(self.model.Inputs))
         first = super().first(p)
         return first | {line_states(n, 1)[0]: getattr(at_first, n) for n in self.late}
@@ -189,25 +187,25 @@ class _LateOutputs(Device):
 
 @functools.cache
 def with_delay_line(model: Model, name: str, order: int = ORDER) -> Model:
-    """The model with the delay of one input as a delay line among its states: within a feedback
-    loop the input is no record that could be read further back.
+    """Return the model with one input's delay as a delay line.
+
+    A feedback loop computes the input, so there is no record to read further back.
     """
     device = _LateInput(model, name, dict(model.delays)[name], order)
-    # The delay of this input is no longer one of the record: left in both places it would act
-    # twice.
+    # Without this the delay would act twice: on the record and in the line.
     rest = tuple((n, parameter) for n, parameter in model.delays if n != name)
     return device.made(
         "delay-line",
         lambda bare: with_delay_line(bare, name, order),
         delays=rest,
-        # A log can be read ahead, for a stick that it has late; a line has the past alone.
+        # A log can be read ahead for a stick that is logged late. A delay line only has the past.
         positive=(*model.positive, device.parameter),
         delay_lines=(*model.delay_lines, (name, device.parameter)),
     )
 
 
 class _LateInput(Device):
-    """A delay line on one input; its delay is a parameter that the model has."""
+    """Delay line on one input, whose delay is a parameter of the model already."""
 
     def __init__(self, model: Model, name: str, parameter: str, order: int) -> None:
         unit = naming.unit(model.Inputs, name)
@@ -219,26 +217,25 @@ class _LateInput(Device):
         self.name, self.parameter = name, parameter
 
     def inputs(self, p: Record, s: Record, u: Record) -> Record:
-        """The inputs, the late one read from its line."""
+        """Return the inputs, with the delayed one read from its line."""
         past = [getattr(s, n) for n in self.parts.states]
         late = line_value(past, getattr(u, self.name), getattr(p, self.parameter))
         return naming.replace(u, **{self.name: late})
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """The derivatives of the line's states, per second."""
+        """Return the time derivatives of the line's states."""
         past = [getattr(s, n) for n in self.parts.states]
         changes = line_rates(past, getattr(u, self.name), getattr(p, self.parameter))
         return dict(zip(self.parts.states, changes, strict=True))
 
 
 def line_states(name: str, order: int) -> tuple[str, ...]:
-    """The names of a delay line's states."""
+    """Return the names of a delay line's states."""
     return tuple(f"{name}_late{i}" for i in range(order))
 
 
 def line_value(past: Sequence[Any], value: Any, delay: Any) -> Any:
-    """Return the output of a delay line: the signal one delay ago, or the current value without
-    delay.
+    """Return the output of a delay line, or the current value if the delay is zero.
 
     Args:
         delay: [s].
@@ -247,28 +244,29 @@ def line_value(past: Sequence[Any], value: Any, delay: Any) -> Any:
 
 
 def line_end(past: Sequence[Any]) -> Any:
-    """The signal at the far end of a delay line of one state at least, one delay ago."""
-    # Shifted Legendre polynomials are all one there: the sum of the coefficients is the value.
+    """Return the signal one delay ago, from the one or more states of a delay line."""
+    # All shifted Legendre polynomials are 1 at the far end, so the value is the sum of
+    # coefficients.
     return sum(past)
 
 
 _UNREAD = 0.02
-"""[s], the delay of a line of which nothing is read: fast, but not for a solver's steps"""
+"""Substitute for a zero delay, whose line is not read; slow enough for solver steps [s]."""
 
 
 def _possible(delay: Any) -> Any:
-    """The delay by which a line's rates are divided [s]."""
-    # A line of no delay passes its signal on (`line_value`), and its states, which nothing reads,
-    # stay finite. One that looked ahead would diverge: a run of it might end at 1e100 and be called
-    # a success, so that it is not a number from the beginning.
+    """Return the delay by which a line's rates are divided [s]."""
+    # A line without delay passes its signal on (`line_value`), and its unread states must stay
+    # finite. A line with a negative delay would diverge, and a run that ends at 1e100 might count
+    # as a success. NaN makes it fail at once.
     return jnp.where(delay > 0, delay, jnp.where(delay == 0, _UNREAD, jnp.nan))
 
 
 def require_past(model: Model, params: Record) -> None:
-    """Refuse a delay line that would look ahead.
+    """Raise if a delay line has a negative delay.
 
     Raises:
-        ValueError: naming the signal and its delay.
+        ValueError: with the signal and its delay.
     """
     for name, parameter in model.delay_lines:
         delay = float(getattr(params, parameter))
@@ -280,23 +278,22 @@ def require_past(model: Model, params: Record) -> None:
 
 
 def line_rates(past: Sequence[Any], value: Any, delay: Any) -> list[Any]:
-    r"""The derivatives of a delay line's states, per second.
+    r"""Return the time derivatives of a delay line's states.
 
     $\tau\dot m_i = (2i+1)\left[(-1)^i u - \sum_j a_{ij} m_j\right]$ with a_ij = 1 for j > i, else
-    $(-1)^{i-j}$ (Voelker, Kajic and Eliasmith, 2019). The sum of all m is u one delay ago. All are
-    NaN where tau is negative.
+    $(-1)^{i-j}$ (Voelker, Kajic and Eliasmith, 2019). The sum of all m is u one delay ago. All
+    derivatives are NaN for negative tau.
 
     Args:
         delay: tau [s].
     """
     rates, delay = [], _possible(delay)
     for i in range(len(past)):
-        # The signal enters at the near end of the delay, where Legendre's polynomials are 1 and -1
-        # in turn.
+        # The signal enters at the near end, where Legendre polynomials alternate between 1 and -1.
         change = value if i % 2 == 0 else -value
         for j, m in enumerate(past):
             change = change - m if j > i or (i - j) % 2 == 0 else change + m
-        # The line's rates grow as one over the delay. One of less than about 12 ms is too fast for
-        # the steps of 5 ms at most in which models that are not linear are solved.
+        # The rates grow as 1/delay. Below about 12 ms they are too fast for the steps of at most 5
+        # ms that nonlinear models use.
         rates.append((2 * i + 1) / delay * change)
     return rates

@@ -1,4 +1,4 @@
-"""A device around a model: what stands between stick and blade, or between motion and log."""
+"""Devices around a model, between stick and blade or between motion and log."""
 
 import abc
 import dataclasses
@@ -12,18 +12,18 @@ from heli_jax.naming import Record, Scalar
 
 
 class Quantity(NamedTuple):
-    """A parameter, a state or an output that a device brings."""
+    """A parameter, state or output that a device adds."""
 
     unit: str | None
-    """SI; None where that of the model is unknown"""
+    """SI unit; None if the model's unit is unknown."""
     meaning: str
     default: float | None = None
-    """of a parameter; NaN has to be given, by the vehicle or as a start value"""
+    """Default of a parameter; for NaN the vehicle or a start value must give it."""
     positive: bool = False
 
     @property
     def annotation(self) -> Any:
-        """As a record class has it."""
+        """Annotation of the field in a record class."""
         return Scalar if self.unit is None else Annotated[Scalar, self.unit, self.meaning]
 
 
@@ -34,24 +34,24 @@ class Parts(NamedTuple):
     states: Mapping[str, Quantity]
     outputs: Mapping[str, Quantity] = {}
     linear: bool = True
-    """whether it is linear in state and inputs, and zero where both are"""
+    """True if the device is linear in state and inputs, without a constant term."""
 
 
 class Device(abc.ABC):
-    """A model with a device around it; a subclass says what the device does.
+    """A model with a device around it.
 
-    Compared by identity, since a model is static to `jax.jit`: each is made once and kept.
+    Devices are compared by identity, since a model is static to `jax.jit`. Each is made once and
+    cached.
     """
 
     def __init__(self, model: Model, parts: Parts) -> None:
         self.model = model
-        # Before anything is made: a name that is taken would silently replace the model's own
-        # field.
+        # Check first: a name that is taken would silently replace the model's own field.
         _check_new(model, parts)
         title = type(self).__name__.strip("_")
 
         def with_more(record: type, more: Mapping[str, Quantity]) -> type:
-            # The same class where nothing is added: its name is that of the model.
+            # Keep the same class if nothing is added, because its name is the model's.
             fields = {n: (q.annotation, q.default) for n, q in more.items()}
             return naming.extended(record, f"{record.__name__}{title}", fields) if more else record
 
@@ -61,74 +61,72 @@ class Device(abc.ABC):
         self.Outputs = with_more(model.Outputs, parts.outputs)
 
     def inputs(self, p: Record, s: Record, u: Record) -> Record:
-        """The inputs that reach the model; those from outside unless the device drives it."""
+        """Return the inputs that reach the model; by default the outer ones."""
         return u
 
     @abc.abstractmethod
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """The derivatives of the device's own states, per second."""
+        """Return the time derivatives of the device's own states."""
 
     def shown(self, p: Record, s: Record, u: Record, y: Record) -> Record:
-        """The outputs, from those of the model."""
+        """Return the outputs, given those of the model."""
         return y
 
     def first(self, p: Record) -> dict[str, Any]:
-        """The device's own states at the first sample: at rest."""
-        # Zeros made of a parameter have its type and its batch axis.
+        """Return the device's own states at the first sample (at rest)."""
+        # Zeros computed from a parameter have its type and batch axis.
         zero = 0.0 * getattr(p, naming.names(self.Params)[0])
         return dict.fromkeys(self.parts.states, zero)
 
     def inner(self, s: Record) -> Record:
-        """The State of the model itself."""
+        """Return the State of the inner model."""
         return self.model.State(**{n: getattr(s, n) for n in naming.names(self.model.State)})
 
     def vector_field(self, p: Record, s: Record, u: Record) -> Record:
-        """Derivatives of the model behind its device."""
+        """Return the time derivatives of model and device."""
         of_model = self.model.vector_field(p, self.inner(s), self.inputs(p, s, u))
-        # The device's states stand behind the model's: matrices of the model keep their rows and
-        # columns.
+        # The device's states come last, so that matrices of the model keep their rows and columns.
         return self.State(**naming.asdict(of_model), **self.rates(p, s, u))
 
     def output(self, p: Record, s: Record, u: Record) -> Record:
-        """Logged outputs."""
+        """Return the logged outputs."""
         return self.shown(p, s, u, self.measured(p, s, u))
 
     def measured(self, p: Record, s: Record, u: Record) -> Record:
-        """The outputs of the model itself."""
+        """Return the outputs of the inner model."""
         return self.model.output(p, self.inner(s), self.inputs(p, s, u))
 
     def start(self, p: Record) -> Record:
-        """The state at the first sample."""
+        """Return the state at the first sample."""
         return self.State(**naming.asdict(self.model.initial_state(p)), **self.first(p))
 
     def noise_intensity(self, p: Record) -> Record:
-        """The model's own; no device adds noise to the state."""
+        """Return the process-noise intensity of the model, zero for the device's states."""
         assert self.model.noise_intensity is not None
-        # A device computes or filters: noise of a sensor is measurement noise, which the fit has by
-        # itself.
+        # Sensor noise is measurement noise, which the fit models separately.
         own = naming.asdict(self.model.noise_intensity(p))
         zero = 0.0 * next(iter(own.values()))
         return self.State(**own, **dict.fromkeys(self.parts.states, zero))
 
     def limits(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """Limits of the model, with the inputs that reach it."""
+        """Return the model's limits, evaluated with the inputs that reach it."""
         assert self.model.limits is not None
         return self.model.limits(p, self.inner(s), self.inputs(p, s, u))
 
     def made(self, suffix: str, again: Callable[[Model], Model], **changes: Any) -> Model:
-        """The Model with its device.
+        """Return the model with its device.
 
         Args:
-            again: puts the same device around another model: that without the stand.
+            again: puts the same device around another model (the one without the stand).
         """
         model, states = self.model, tuple(self.parts.states)
         steady = model.steady_flight
         if steady is not None:
-            # The device rests too: a state more to solve for, and its derivative to vanish.
+            # The device is at rest in steady flight too: its states are unknowns, their derivatives
+            # zero.
             steady = SteadyFlight((*states, *steady.unknowns), (*states, *steady.equations))
         bare = model.without_stand
-        # Time constants, frequencies and damping of a device are above zero whatever the model
-        # around which it stands: a fit then searches their logarithm.
+        # These parameters are positive around any model, so a fit searches their logarithm.
         positive = tuple(n for n, q in self.parts.params.items() if q.positive)
         fields = {
             "name": f"{model.name}+{suffix}",
@@ -138,7 +136,7 @@ class Device(abc.ABC):
             "State": self.State,
             "Outputs": self.Outputs,
             "linear": model.linear and self.parts.linear,
-            # A filter or a line of delays may be as fast as it likes.
+            # A filter or delay line may be stiff.
             "explicit": False,
             "start": self.start,
             "noise_intensity": None if model.noise_intensity is None else self.noise_intensity,
@@ -148,15 +146,15 @@ class Device(abc.ABC):
             "positive": (*model.positive, *positive),
             "within": _around(model.within, again),
         }
-        # Fields that are not named stay unchanged. `initial_sd` and `correlation` go by names of
-        # states, so they hold for a State that has grown; axes and delays name what is still there.
+        # Other fields stay unchanged. `initial_sd`, `correlation`, axes and delays refer to names,
+        # which the larger State still has.
         return dataclasses.replace(model, **{**fields, **changes})
 
 
 def _around(
     within: tuple[Model, Callable[[Model], Model]] | None, again: Callable[[Model], Model]
 ) -> tuple[Model, Callable[[Model], Model]] | None:
-    """`Model.within` of a model that gets one more device around it."""
+    """Return `Model.within` after one more device is added."""
     if within is None:
         return None
     model, before = within
@@ -164,7 +162,7 @@ def _around(
 
 
 def _check_new(model: Model, parts: Parts) -> None:
-    """Refuse a device whose names the model has already: one would hide the other."""
+    """Raise if the model already has a name that the device adds."""
     records = {
         "parameter": (model.Params, parts.params),
         "state": (model.State, parts.states),
@@ -179,10 +177,10 @@ def _check_new(model: Model, parts: Parts) -> None:
 
 
 def require(names: Iterable[str], record: type, kind: str, model: Model) -> None:
-    """Refuse names that a model's record does not have, none at all, and one twice.
+    """Raise if names are missing from the model's record, repeated, or none at all.
 
     Raises:
-        ValueError: naming the first that is wrong.
+        ValueError: with the first wrong name.
     """
     seen: set[str] = set()
     known = naming.names(record)
@@ -197,24 +195,22 @@ def require(names: Iterable[str], record: type, kind: str, model: Model) -> None
 
 
 def quotient(above: str | None, below: str | None) -> str | None:
-    """The SI unit of one quantity per unit of another; None where either is unknown or not SI.
+    """Return the SI unit of a quotient; None if either unit is unknown or not SI.
 
     Args:
-        above: unit of the first, as `rad/s`.
+        above: unit of the numerator, for example `rad/s`.
     """
     if above is None or below is None:
         return None
     try:
-        # By exponents of the base units and not as text: rad/s over 1 has to come out as rad/s, and
-        # what cancels has to vanish.
+        # Exponents of the base units let equal units cancel: rad/s over 1 must give rad/s.
         exponents = units.base_of(above), units.base_of(below)
-        # Params are kept in SI. A unit that would need a factor is not that of a stored number, and
-        # no unit is better than one that is wrong by it.
+        # Params are stored in SI. If a unit needs a factor, no unit is better than one wrong by it.
         si = all(
             units.factor(u, units.as_text(e)) == 1.0
             for u, e in zip((above, below), exponents, strict=True)
         )
-    except ValueError:  # a unit of the user's own, which nobody converts
+    except ValueError:  # a unit that the user defined and that has no conversion
         return None
     if not si:
         return None

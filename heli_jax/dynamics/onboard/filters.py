@@ -1,10 +1,9 @@
 r"""Filters of a flight controller between sensor and log: low-passes, notches, pure delays.
 
-Their constants are stated, not estimated: they are settings of a firmware, known to the digit. A
-low-pass of first order is $H = \omega/(s+\omega)$, one of second order
-$H = \omega^2/(s^2 + s\,\omega/Q + \omega^2)$, a notch
-$H = (s^2 + d\,s\,\omega/Q + \omega^2)/(s^2 + s\,\omega/Q + \omega^2)$, where d is what it leaves of
-its centre. In the firmware they are digital; docs/onboard.md says how far apart the two are.
+Their constants are firmware settings, so they are fixed. A low-pass of first order is
+$H = \omega/(s+\omega)$, one of second order $H = \omega^2/(s^2 + s\,\omega/Q + \omega^2)$. A notch
+is $H = (s^2 + d\,s\,\omega/Q + \omega^2)/(s^2 + s\,\omega/Q + \omega^2)$, with gain d at its
+centre. The firmware's filters are digital; docs/onboard.md gives the difference.
 """
 
 import functools
@@ -24,33 +23,32 @@ from heli_jax.naming import Record
 
 KINDS = ("pt1", "pt2", "pt3", "biquad", "notch")
 LONGEST_DELAY = 1.0
-"""s: a line of four states follows nothing faster than 4 rad/s through a longer one"""
+"""Longest delay [s]: through a longer one, four states follow nothing above 4 rad/s."""
 _BUTTERWORTH = 1.0 / math.sqrt(2.0)
 _FASTEST_MOTION = 160.0
-"""rad/s (25 Hz): up to here a delay line is to err by less than `_LINE_ERROR`"""
+"""Highest frequency at which a delay line errs by less than `_LINE_ERROR` [rad/s] (25 Hz)."""
 _LINE_ERROR = 1e-3
 
 
 class Filter(NamedTuple):
-    """A filter as a firmware states it."""
+    """Filter with a firmware's settings."""
 
     kind: str
-    """of `KINDS`: pt1, pt2 and pt3 are one, two and three equal lags whose cascade is 3 dB down at
-    `hz` (Betaflight, Rotorflight); biquad is a low-pass of second order (PX4's and ArduPilot's
-    LowPassFilter2p), notch one too"""
+    """One of `KINDS`. pt1, pt2 and pt3 are one, two and three equal lags, together 3 dB down at
+    `hz` (Betaflight, Rotorflight). biquad is a second-order low-pass (LowPassFilter2p of PX4 and
+    ArduPilot); a notch has second order too."""
     hz: float
-    """where a low-pass is 3 dB down (a biquad with the Q of Butterworth), or the notch's centre"""
+    """Cutoff (3 dB) of a low-pass, for a biquad with Butterworth's Q, or centre of a notch [Hz]."""
     q: float | None = None
-    """quality factor, centre over width of a notch; a biquad's is that of Butterworth unless
-    given"""
+    """Quality factor: centre over width of a notch; for a biquad Butterworth's by default."""
     attenuation: float = math.inf
-    """of a notch at its centre [dB]; infinite unless given"""
+    """Attenuation of a notch at its centre [dB]."""
 
     def checked(self) -> "Filter":
-        """The filter itself.
+        """Return the filter if its settings are valid.
 
         Raises:
-            ValueError: it is none.
+            ValueError: a setting is invalid.
         """
         if self.kind not in KINDS:
             raise ValueError(f"kind: expected one of {', '.join(KINDS)}, got {self.kind!r:.40}")
@@ -71,14 +69,14 @@ class Filter(NamedTuple):
 
     @property
     def delay(self) -> float:
-        """By how much slow signals are late behind it [s]: the phase's slope at zero."""
+        """Delay of slow signals [s]: minus the phase's slope at zero frequency."""
         return sum(section.delay for section in _sections(self))
 
 
 def cutoff(filters: Sequence[Filter]) -> float:
     """Return the frequency at which low-passes in series are 3 dB down together [Hz]."""
-    # Equal steps of the logarithm, 0.1 % apart: more digits than are shown. A section of high
-    # quality rises before it falls, so the last crossing counts.
+    # Steps of 0.1 % give more digits than are shown. A section of high quality rises before it
+    # falls, so the last crossing counts.
     hz = np.geomspace(0.01, 3.0, 5700) * min(f.hz for f in filters)
     size = gain(filters, hz)
     return float(hz[np.flatnonzero(size >= np.sqrt(0.5))[-1]])
@@ -101,18 +99,18 @@ def gain(filters: Sequence[Filter], hz: np.ndarray) -> np.ndarray:
 
 
 class _Section(NamedTuple):
-    """A part of first or second order."""
+    """Filter section of first or second order."""
 
     order: int
     omega: float
-    """[rad/s]"""
+    """Corner frequency [rad/s]."""
     q: float = _BUTTERWORTH
     left: float | None = None
-    """of a notch what it leaves of its centre; None for a low-pass"""
+    """Gain of a notch at its centre; None for a low-pass."""
 
     @property
     def delay(self) -> float:
-        """[s]"""
+        """Delay of slow signals [s]."""
         if self.order == 1:
             return 1.0 / self.omega
         return (1.0 if self.left is None else 1.0 - self.left) / (self.q * self.omega)
@@ -125,8 +123,8 @@ def _sections(filter: Filter) -> tuple[_Section, ...]:
         return (_Section(2, omega, filter.q, 10.0 ** (-filter.attenuation / 20.0)),)
     if filter.kind == "biquad":
         return (_Section(2, omega, filter.q or _BUTTERWORTH),)
-    # n equal lags are 3 dB down together where each is by 3/n: it is faster than the whole by this
-    # factor (CUTOFF_CORRECTION_PT2 and PT3 of Betaflight's filter.c).
+    # n equal lags are 3 dB down together where each is 3/n dB down. Each is therefore faster by
+    # this factor (CUTOFF_CORRECTION_PT2 and PT3 of Betaflight's filter.c).
     n = int(filter.kind[-1])
     return (_Section(1, omega / math.sqrt(2.0 ** (1.0 / n) - 1.0)),) * n
 
@@ -136,17 +134,17 @@ def with_filters(
     filters: Mapping[str, Sequence[Filter]] | None = None,
     delays: Mapping[str, float] | None = None,
 ) -> Model:
-    """The model with its outputs as a flight controller filters them, late by fixed delays.
+    """Return the model with filtered outputs and fixed output delays.
 
-    Each filter has states `OUTPUT_filter1` and, of second order, `OUTPUT_filter1_rate`; a delay is
-    a line of states as in `with_delays`. Both are linear, with constants that are fixed.
+    Each filter has states `OUTPUT_filter1` and, of second order, `OUTPUT_filter1_rate`. A delay is
+    a delay line as in `with_delays`. Both are linear, with fixed constants.
 
     Args:
-        delays: by output [s], at most `LONGEST_DELAY`; the delay stands behind the filters.
+        delays: by output [s], at most `LONGEST_DELAY`; the delay follows the filters.
 
     Raises:
-        ValueError: no such output, a filter that is none, a negative or too long delay, or one
-            beside a delay that the output has already.
+        ValueError: no such output, an invalid filter, a negative or too long delay, or an output
+            that has a delay already.
     """
     check_model(model)
     filters, delays = filters or {}, delays or {}
@@ -163,7 +161,7 @@ def with_filters(
                 f"delay of {name}: it has the delay {dict(model.delay_lines)[name]} already, "
                 "expected one"
             )
-    # A filter or delay without effect adds no device, so model and compiled program stay.
+    # Without a filter or delay the model stays the same object, so it is not compiled again.
     channels = tuple(
         (name, tuple(filters.get(name, ())), float(delays.get(name, 0.0)))
         for name in dict.fromkeys((*filters, *delays))
@@ -173,13 +171,13 @@ def with_filters(
 
 
 def check_delay(delay: float, where: str) -> None:
-    """Refuse what is no delay of an output.
+    """Raise if a number is not a possible output delay.
 
     Args:
         delay: [s].
 
     Raises:
-        ValueError: it is negative, too long or no number.
+        ValueError: it is negative, too long or not a number.
     """
     if not delay >= 0:
         raise ValueError(
@@ -216,9 +214,9 @@ def _lowpasses(filters: Iterable[Filter]) -> list[Filter]:
 
 
 def _low_pass(name: str, filters: tuple[Filter, ...]) -> LowPass:
-    """Return the state at which white noise before an output's filters enters, and its intensity.
+    """Return the state where white noise before an output's filters enters, and its intensity.
 
-    A notch before the first low-pass is left out: white noise stays nearly that behind it.
+    A notch before the first low-pass is left out, since noise behind it is still nearly white.
     """
     named = list(_named(name, tuple(s for filter in filters for s in _sections(filter))))
     while named[0][2].left is not None:
@@ -234,10 +232,10 @@ def _low_pass(name: str, filters: tuple[Filter, ...]) -> LowPass:
 
 
 def _chain(sections: Sequence[_Section]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A (n, n), b (n,) and c (n,) of sections one behind the other, as `_Filtered` has them."""
+    """Return A (n, n), b (n,) and c (n,) of sections in series, with the states of `_Filtered`."""
     n = sum(section.order for section in sections)
     rows, unit = np.zeros((n, n + 1)), np.eye(n + 1)
-    # The signal as a sum of states and, last, of what comes in.
+    # The signal is a combination of the states and, last, the input.
     value, i = unit[n], 0
     for section in sections:
         x = unit[i]
@@ -277,7 +275,7 @@ class _Filtered(Device):
         super().__init__(model, Parts({}, states))
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """The derivatives of filters and lines, per second."""
+        """Return the time derivatives of filters and delay lines."""
         measured, rates = self.measured(p, s, u), {}
         for n, sections in self.sections.items():
             value = getattr(measured, n)
@@ -297,7 +295,7 @@ class _Filtered(Device):
         return rates
 
     def shown(self, p: Record, s: Record, u: Record, y: Record) -> Record:
-        """The outputs as they are logged."""
+        """Return the outputs as logged."""
         logged = {}
         for n, sections in self.sections.items():
             value = getattr(y, n)
@@ -309,15 +307,15 @@ class _Filtered(Device):
         return naming.replace(y, **logged)
 
     def _behind(self, s: Record, state: str, speed: str, section: _Section, value: Any) -> Any:
-        """The signal behind a section."""
+        """Return the signal behind a section."""
         if section.left is None:
             return getattr(s, state)
-        # The low-passed signal's rate over omega Q is the band that a notch takes away.
+        # The low-passed signal's rate over omega Q is the band that a notch removes.
         band = getattr(s, speed) / (section.omega * section.q)
         return value - (1.0 - section.left) * band
 
     def first(self, p: Record) -> dict[str, Any]:
-        # As if the vehicle had always been where it starts: low-passes there, their rates at zero.
+        # The filters have settled at the first output, with rates zero.
         y = self.model.output(p, self.model.initial_state(p), zeros(self.model.Inputs))
         first = super().first(p)
         for n, sections in self.sections.items():
@@ -329,13 +327,13 @@ class _Filtered(Device):
 
 
 def _named(name: str, sections: tuple[_Section, ...]) -> Iterator[tuple[str, str, _Section]]:
-    """Each section with the names of its state and of the state that is its rate."""
+    """Yield the names of each section's state and rate state, and the section."""
     for i, section in enumerate(sections):
         yield f"{name}_filter{i + 1}", f"{name}_filter{i + 1}_rate", section
 
 
 def states_behind(model: Model) -> frozenset[str]:
-    """The states of a model that are filters and delay lines behind its outputs."""
+    """Return the states of filters and delay lines behind a model's outputs."""
     names = "|".join(map(re.escape, naming.names(model.Outputs)))
     pattern = re.compile(rf"({names})_(filter\d+(_rate)?|late\d+)")
     return frozenset(n for n in naming.names(model.State) if pattern.fullmatch(n))
@@ -343,14 +341,14 @@ def states_behind(model: Model) -> frozenset[str]:
 
 @functools.cache
 def line_order(delay: float) -> int:
-    """The states of a fixed delay's line: as few as are exact to a thousandth up to 25 Hz, at most
-    four.
+    """Return the smallest order of a fixed delay's line with an error below 0.1 % up to 25 Hz, at
+    most 4.
 
     Args:
         delay: [s].
     """
-    # Few, because a line's own rates grow with its states, and a fixed-step solver has to follow
-    # them: a delay of 3 ms needs two states, and is four times as slow as with four.
+    # Higher orders have faster rates, which a fixed-step solver must follow. A delay of 3 ms needs
+    # two states; its fastest rate is then four times slower than with four.
     for order in range(1, ORDER):
         A, b = _line(order)
         x = 1j * _FASTEST_MOTION * delay
@@ -361,7 +359,7 @@ def line_order(delay: float) -> int:
 
 
 def line_rate(order: int, delay: float) -> float:
-    """The fastest rate of a delay line [rad/s].
+    """Return the fastest rate of a delay line [rad/s].
 
     Args:
         delay: [s].
@@ -370,7 +368,7 @@ def line_rate(order: int, delay: float) -> float:
 
 
 def _line(order: int) -> tuple[np.ndarray, np.ndarray]:
-    """A and b of a line of one second."""
+    """Return A and b of a delay line of 1 s."""
     no = [0.0] * order
     b = np.array(line_rates(no, 1.0, 1.0))
     columns = [line_rates([float(i == j) for i in range(order)], 0.0, 1.0) for j in range(order)]

@@ -1,4 +1,4 @@
-"""Rate loops that fly along: the flybarless unit about roll and pitch, the gyro of the tail."""
+"""Rate loops: the flybarless unit of roll and pitch, and the tail gyro."""
 
 import functools
 import math
@@ -14,23 +14,25 @@ from heli_jax.errors import nearest
 from heli_jax.naming import Record
 
 type Loops = Sequence[str] | Mapping[str, str] | None
-"""sticks; or by stick the rate that it commands, a state, or p, q or r where the model's angles are
-Euler angles; None: those of the model's axes"""
+"""Sticks; or a mapping of sticks to the rates that they command; None for the model's axes.
+
+A rate is a state, or p, q or r if the model has Euler angles.
+"""
 
 _BODY = {"roll": "p", "pitch": "q", "yaw": "r"}
-"""by axis the rate that a gyro on the body measures"""
+"""Rate that a gyro on the body measures, by axis."""
 
 
 class Law(NamedTuple):
-    """Parts of a rate loop."""
+    """Options of a rate loop."""
 
     command: bool
-    """whether the stick commands a rate; else it goes to the swashplate, less the feedback"""
+    """True if the stick commands a rate; otherwise the feedback is subtracted from the stick."""
     integral: bool
-    """of the rate error: the heading or attitude is held"""
+    """True for an integral of the rate error, which holds heading or attitude."""
     feedforward: bool
     lag: bool
-    """of the gyro, first order"""
+    """True for a first-order lag of the gyro."""
 
 
 def with_rate_loop(
@@ -41,30 +43,26 @@ def with_rate_loop(
     feedforward: bool = True,
     lag: bool = False,
 ) -> Model:
-    r"""The model with a flybarless unit: sticks command rates, which PI loops and a feed-forward
-    make.
+    r"""Return the model with a flybarless unit: PI loops and a feed-forward track commanded rates.
 
-    The rate is that which a gyro on the body measures: p, q or r where the model's angles are Euler
-    angles (`Model.body_rates`), else the state that is the axis's rate.
-
-    $\delta = K_{ff} r_c + K_p (r_c - r) + K_i \int (r_c - r)\,dt$ with the command
-    $r_c = K_c u$, u the stick and r the rate. The stick keeps the unit of the input in whose
-    place it stands.
+    $\delta = K_{ff} r_c + K_p (r_c - r) + K_i \int (r_c - r)\,dt$ with $r_c = K_c u$, stick u and
+    rate r. The stick has the unit of the input that it replaces. The rate is that of a gyro on the
+    body: p, q or r if the model has Euler angles (`Model.body_rates`), otherwise the axis's rate.
 
     New parameters, with `STICK` the input's name: `Kc_STICK` [the rate's unit per unit of stick],
     `Kp_STICK`, `Ki_STICK`, `Kff_STICK`, with a lag `tau_gyro_STICK` [s]. New states: the integral
-    of the rate error, `STICK_integral`, and the lagged rate, `STICK_gyro`. An input that is late in
-    the model is late within the loop: by a delay line (`with_delays`).
+    of the rate error, `STICK_integral`, and the lagged rate, `STICK_gyro`. An input delay of the
+    model becomes a delay line within the loop (`with_delays`).
 
     Args:
-        model: with servos already, where it has them (`with_servos`): they are in the loop.
-        on: the sticks; by stick its rate where the model's axes do not say it: a state, or p, q or
-            r of a model with `body_rates`; None for those of the model's roll and pitch axes.
-        lag: whether the unit's gyro is low-passed, tau dr_m/dt = r - r_m.
+        model: includes its servos (`with_servos`), since they are in the loop.
+        on: sticks, or a mapping of sticks to rates if the model's axes do not define them. None for
+            the sticks of the roll and pitch axes.
+        lag: True for a low-pass of the unit's gyro, tau dr_m/dt = r - r_m.
 
     Raises:
-        ValueError: no such stick, no rate known for it, one whose unit is not that of an angular
-            rate, or a name that is taken.
+        ValueError: no such stick, no rate known for it, a unit other than an angular rate's, or a
+            name that is taken.
     """
     check_model(model)
     loops = _loops(model, on, ("roll", "pitch"))
@@ -74,20 +72,20 @@ def with_rate_loop(
 def with_gyro(
     model: Model, on: Loops = None, *, heading_hold: bool = True, lag: bool = True
 ) -> Model:
-    r"""The model with a gyro on the tail: the pedal is a rate command, the heading is held.
+    r"""Return the model with a tail gyro: the pedal commands a yaw rate, and the heading is held.
 
-    $\delta = K_p (r_c - r_m) + K_i \int (r_c - r_m)\,dt$, $r_c = K_c u$,
-    $\tau\,\dot r_m = r - r_m$; without heading hold a damper, $\delta = u - K_p r_m$. The names
-    are those of `with_rate_loop`.
+    $\delta = K_p (r_c - r_m) + K_i \int (r_c - r_m)\,dt$, $r_c = K_c u$, $\tau\,\dot r_m = r -
+    r_m$. Without heading hold it is a damper, $\delta = u - K_p r_m$. Names are as in
+    `with_rate_loop`.
 
     Args:
-        model: with the tail's servo already, where it has one.
+        model: includes the tail's servo, since it is in the loop.
         on: the pedal, as the sticks of `with_rate_loop`; None for that of the yaw axis.
-        heading_hold: whether the pedal commands a rate, with an integral of its error.
+        heading_hold: True if the pedal commands a rate, with an integral of its error.
 
     Raises:
-        ValueError: no such pedal, no rate known for it, one whose unit is not that of an angular
-            rate, or a name that is taken.
+        ValueError: no such pedal, no rate known for it, a unit other than an angular rate's, or a
+            name that is taken.
     """
     check_model(model)
     law = Law(heading_hold, heading_hold, False, lag)
@@ -95,8 +93,8 @@ def with_gyro(
 
 
 def _loops(model: Model, on: Loops, axes: tuple[str, ...]) -> tuple[tuple[str, str], ...]:
-    """Sticks with their rates: states, or those of the body."""
-    # The model's axes say which rate a stick turns: most loops need no table of their own.
+    """Return sticks with their rates, which are states or body rates."""
+    # The model's axes define the rate of most sticks.
     known = {a.stick: _measured_by_gyro(model, a) for a in axes_of(model) if a.stick is not None}
     if on is None:
         own = [a for a in axes_of(model) if a.name in axes and a.stick in known]
@@ -120,21 +118,21 @@ def _loops(model: Model, on: Loops, axes: tuple[str, ...]) -> tuple[tuple[str, s
 
 
 def _checked(model: Model, loops: Mapping[str, str]) -> tuple[tuple[str, str], ...]:
-    """Sticks with their rates, each of which is an angular rate."""
+    """Return sticks with their rates, which must be angular rates."""
     for stick, rate in loops.items():
         _check_rate(model, stick, rate)
     return tuple(loops.items())
 
 
 def _measured_by_gyro(model: Model, axis: Axis) -> str:
-    """The rate about an axis as a gyro on the body has it."""
-    # The derivatives of Euler angles are no rates of the body: in a steady turn at a bank the body
-    # pitches although theta stays.
+    """Return the rate about an axis that a gyro on the body measures."""
+    # Derivatives of Euler angles are not body rates: in a steady banked turn q is not zero although
+    # theta is constant.
     return axis.rate if model.body_rates is None else _BODY.get(axis.name, axis.rate)
 
 
 def _is_of_body(model: Model, rate: str) -> bool:
-    """True if a rate is computed from the state, and is none of its fields."""
+    """True if a rate is computed from the state and is not a field of it."""
     states = naming.names(model.State)
     return model.body_rates is not None and rate in _BODY.values() and rate not in states
 
@@ -144,7 +142,7 @@ def _unit_of(model: Model, rate: str) -> str | None:
 
 
 def _check_rate(model: Model, stick: str, rate: str) -> None:
-    """Refuse what is no state, and a state whose unit is not that of an angular rate."""
+    """Raise if a rate is not a state with the unit of an angular rate."""
     if _is_of_body(model, rate):
         return
     states = naming.names(model.State)
@@ -156,9 +154,9 @@ def _check_rate(model: Model, stick: str, rate: str) -> None:
     unit = naming.unit(model.State, rate)
     try:
         kind = None if unit is None else units.base_of(unit)
-    except ValueError:  # a unit of the user's own, of which nobody knows what it measures
+    except ValueError:  # a unit that the user defined: its kind is unknown
         return
-    # A file may leave the radian out.
+    # A file may omit the radian.
     if kind not in (None, {"s": -1, "rad": 1}, {"s": -1}):
         raise ValueError(
             f"{stick}: {rate!r} of model {model.name} is in {unit}, expected the state that is the "
@@ -170,8 +168,8 @@ def _check_rate(model: Model, stick: str, rate: str) -> None:
 def _with_loops(model: Model, loops: tuple[tuple[str, str], ...], law: Law, suffix: str) -> Model:
     for stick, _ in loops:
         _check_free(model, stick)
-        # The loop computes the input from the state at hand, so there is no record of it to read
-        # further back, as exact delays do: the past has to be carried along in states.
+        # The loop computes the input, so there is no record to read further back. Its past must be
+        # kept in states.
         if stick in dict(model.delays):
             model = with_delay_line(model, stick)
     return _RateLoop(model, loops, law).made(
@@ -180,10 +178,10 @@ def _with_loops(model: Model, loops: tuple[tuple[str, str], ...], law: Law, suff
 
 
 def _check_free(model: Model, stick: str) -> None:
-    """Refuse a stick that drives a loop already."""
+    """Raise if a stick drives a loop already."""
     looped = {"rate-loop", "gyro"} & set(model.name.split("+")[1:])
     if looped and f"Kp_{stick}" in naming.names(model.Params):
-        # Both would be proportional and integral of the same rate, exchangeable in any log.
+        # Both loops would act on the same rate, so no log could distinguish their gains.
         raise ValueError(
             f"{stick} has a rate loop already, expected one of rate_loop and gyro: name the "
             "sticks of each (on: [...])"
@@ -197,14 +195,13 @@ class _RateLoop(Device):
         params: dict[str, Quantity] = {}
         states: dict[str, Quantity] = {}
         for stick, rate in loops:
-            # The stick of the loop takes the place and the unit of the input that it drives, so
-            # that a log of sticks fits the model with its loop and without.
+            # The loop's stick has the name and unit of the input that it drives. A log of sticks
+            # therefore fits the model with and without the loop.
             unit = naming.unit(model.Inputs, stick), _unit_of(model, rate)
             params |= _gains(stick, *unit, law)
             if law.integral:
                 angle = quotient(unit[1], "1/s")
-                # The integral is an angle and a state: it remembers, which makes a heading hold of
-                # a rate loop.
+                # The integral of the rate error is an angle, which gives heading hold.
                 states[f"{stick}_integral"] = Quantity(angle, f"integral of the error of {rate}")
             if law.lag:
                 states[f"{stick}_gyro"] = Quantity(unit[1], f"{rate} as measured by the gyro")
@@ -213,32 +210,31 @@ class _RateLoop(Device):
         self.loops, self.law = loops, law
 
     def rate(self, s: Record, name: str) -> Any:
-        """The rate itself."""
+        """Return the true rate."""
         if _is_of_body(self.model, name) and self.model.body_rates is not None:
             return self.model.body_rates(s)[name]
         return getattr(s, name)
 
     def seen(self, s: Record, stick: str, rate: str) -> Any:
-        """The rate as the loop has it."""
+        """Return the rate that the loop uses."""
         return getattr(s, f"{stick}_gyro") if self.law.lag else self.rate(s, rate)
 
     def inputs(self, p: Record, s: Record, u: Record) -> Record:
-        """Commands of the loops in place of their sticks; other inputs pass."""
+        """Return the inputs, with the loops' commands in place of their sticks."""
         driven = {}
         for stick, rate in self.loops:
-            # From the state and not from an output: an output may be delayed or filtered by the
-            # sensors of the log, which are not those of the loop.
+            # Use the state: outputs may be delayed or filtered by the log's sensors, which are not
+            # the loop's.
             measured, gain = self.seen(s, stick, rate), getattr(p, f"Kp_{stick}")
             if not self.law.command:
-                # A damper has no Kc: a gain before the pedal would be exchangeable with the pedal's
-                # own effect.
+                # A damper has no Kc: no log could distinguish it from the pedal's own effect.
                 driven[stick] = getattr(u, stick) - gain * measured
                 continue
             command = getattr(p, f"Kc_{stick}") * getattr(u, stick)
             driven[stick] = gain * (command - measured)
             if self.law.feedforward:
-                # It stands outside the loop: it changes what the stick does, not poles and margins.
-                # So a record with the stick at rest, or flown by gusts alone, says nothing of it.
+                # The feed-forward is outside the loop, so it does not change poles or margins. A
+                # record without stick motion does not determine it.
                 driven[stick] = driven[stick] + getattr(p, f"Kff_{stick}") * command
             if self.law.integral:
                 held = getattr(p, f"Ki_{stick}") * getattr(s, f"{stick}_integral")
@@ -246,15 +242,14 @@ class _RateLoop(Device):
         return naming.replace(u, **driven)
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """The derivatives of integrals and lagged rates, per second."""
+        """Return the time derivatives of integrals and lagged rates."""
         rates = {}
         for stick, rate in self.loops:
             measured = self.seen(s, stick, rate)
             if self.law.integral:
                 command = getattr(p, f"Kc_{stick}") * getattr(u, stick)
-                # Nothing limits the integral: no device here has end stops that it could wind up
-                # against, and a rate limit of the servos delays what is asked for without holding
-                # it.
+                # The integral needs no anti-windup: no device has end stops, and a servo's rate
+                # limit only delays its command.
                 rates[f"{stick}_integral"] = command - measured
             if self.law.lag:
                 lag = getattr(p, f"tau_gyro_{stick}")
@@ -263,10 +258,9 @@ class _RateLoop(Device):
 
 
 def _gains(stick: str, of_stick: str | None, of_rate: str | None, law: Law) -> dict[str, Quantity]:
-    """The parameters of one loop; the stick's unit is that of the input that it drives."""
+    """Return the parameters of one loop; the stick has the unit of the input that it drives."""
     per_rate = quotient(of_stick, of_rate)
-    # None of the gains is marked positive: their sign depends on that of the input's effect, which
-    # is how a servo is mounted.
+    # No gain is marked positive: the sign depends on how the servo is mounted.
     gains = {f"Kp_{stick}": Quantity(per_rate, f"rate loop of {stick}, proportional", math.nan)}
     if law.command:
         command = quotient(of_rate, of_stick)

@@ -1,16 +1,16 @@
 r"""Sensors between motion and log: accelerometers, low-passes, delays.
 
-Sensors of the body's motion show specific force, angular acceleration and airspeed. At r from the
-centre of gravity $f = a - g + \dot\omega \times r + \omega \times (\omega \times r)$ and $V = v -
-v_{wind} + \omega \times r$, along the body forward, right and down. Three kinds of models know
-their velocities:
+Motion sensors show specific force, angular acceleration and airspeed. At r from the centre of
+gravity, $f = a - g + \dot\omega \times r + \omega \times (\omega \times r)$ and
+$V = v - v_{wind} + \omega \times r$, along the body forward, right and down. Three kinds of models
+know their velocities:
 
-- linear ones with speeds u, v, w of the body: about hover, $f_x = \dot u + g\theta$,
-  $f_y = \dot v - g\phi$, $f_z = \dot w$ (the steady -g of a level hover is left to the bias);
-- others with speeds u, v, w and rates p, q, r of the body among their states;
-- those with speeds dx, dy, dz over the ground (dz up) and the angles phi, theta, psi, and with
-  either the angles' derivatives dphi, dtheta, dpsi as states or the rates of the body as outputs:
-  the whole helicopter.
+- linear models with body speeds u, v, w: about hover, $f_x = \dot u + g\theta$,
+  $f_y = \dot v - g\phi$, $f_z = \dot w$ (the bias absorbs the steady -g of a level hover);
+- other models with body speeds u, v, w and body rates p, q, r among their states;
+- models with speeds dx, dy, dz over the ground (dz up) and angles phi, theta, psi, such as the
+  whole helicopter. They also need either the derivatives dphi, dtheta, dpsi as states or the body
+  rates as outputs.
 """
 
 import functools
@@ -39,18 +39,18 @@ def with_sensors(
     airspeed: bool = False,
     order: int = ORDER,
 ) -> Model:
-    r"""The model as its sensors see it: what they show of the motion, then low-passes, then delays.
+    r"""Return the model with motion sensors, then low-passes, then delays.
 
     An accelerometer adds the outputs `ax`, `ay`, `az` [m/s^2] along the body (forward, right,
-    down): the specific force at (`x_imu`, `y_imu`, `z_imu`) [m] from the centre of gravity, new
-    parameters (`heli_jax.dynamics.onboard.sensors`). A low-pass is first order,
-    `tau_lowpass_OUTPUT` [s] with the state `OUTPUT_lowpass`. Delays are those of `with_delays`.
+    down). They are the specific force at (`x_imu`, `y_imu`, `z_imu`) [m] from the centre of
+    gravity, which are new parameters. A low-pass is first order, `tau_lowpass_OUTPUT` [s] with the
+    state `OUTPUT_lowpass`. Delays are those of `with_delays`.
 
     Args:
-        lowpass: outputs that are low-passed, `ax` and its like among them.
-        delay: outputs that are late, by names or by name the parameter.
-        angular_acceleration: whether `pdot`, `qdot`, `rdot` [rad/s^2] are outputs.
-        airspeed: whether `airspeed` and `u_air`, `v_air`, `w_air` [m/s] are outputs, at (`x_air`,
+        lowpass: low-passed outputs, which may include `ax` and the like.
+        delay: delayed outputs: names, or a mapping to delay parameters.
+        angular_acceleration: True for outputs `pdot`, `qdot`, `rdot` [rad/s^2].
+        airspeed: True for outputs `airspeed` and `u_air`, `v_air`, `w_air` [m/s], at (`x_air`,
             `y_air`, `z_air`) [m] from the centre of gravity.
 
     Raises:
@@ -61,9 +61,8 @@ def with_sensors(
     motion = {"imu": imu, "angular_acceleration": angular_acceleration, "airspeed": airspeed}
     if not (any(motion.values()) or lowpass or delay):
         raise ValueError(f"expected {', '.join(motion)}, lowpass or delay, got none")
-    # In the order of the signal's way to the log, so that a low-pass can be on what the IMU shows.
-    # The delay comes last since its line follows slow signals best: behind the low-pass it errs
-    # least.
+    # The order is the signal's path to the log, so a low-pass can act on the IMU's outputs. A delay
+    # line errs least for slow signals, so it follows the low-pass.
     model = with_motion_sensors(model, **motion) if any(motion.values()) else model
     model = _with_lowpass(model, tuple(lowpass)) if lowpass else model
     return with_delays(model, outputs=delay, order=order) if delay else model
@@ -92,7 +91,7 @@ class _LowPass(Device):
         self.on = on
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """The derivatives of the low-passed outputs, per second."""
+        """Return the time derivatives of the low-passed outputs."""
         y = self.measured(p, s, u)
         return {
             f"{n}_lowpass": (getattr(y, n) - getattr(s, f"{n}_lowpass"))
@@ -101,14 +100,13 @@ class _LowPass(Device):
         }
 
     def shown(self, p: Record, s: Record, u: Record, y: Record) -> Record:
-        """The outputs, those that are low-passed read from their states."""
+        """Return the outputs, with low-passed ones read from their states."""
         return naming.replace(y, **{n: getattr(s, f"{n}_lowpass") for n in self.on})
 
     def first(self, p: Record) -> dict[str, Any]:
-        # As if the vehicle had always been where it starts.
+        # The low-pass has settled at the first output.
         y = self.model.output(p, self.model.initial_state(p), zeros(self.model.Inputs))
-        # Zero in its place would show as a start-up transient of the filter, which a logger that
-        # runs before the record begins has long behind it.
+        # Zero would add a start-up transient, which is over before a logger's record begins.
         return {f"{n}_lowpass": getattr(y, n) for n in self.on}
 
 
@@ -119,36 +117,36 @@ _ALONG = {"x": "forward", "y": "to the right", "z": "down"}
 def with_motion_sensors(
     model: Model, *, imu: bool = False, angular_acceleration: bool = False, airspeed: bool = False
 ) -> Model:
-    """The model with outputs that its sensors make of the motion; each costs only if asked for.
+    """Return the model with outputs of its motion sensors.
 
     Args:
-        imu: whether there is an accelerometer: outputs ax, ay, az [m/s^2], the specific force at
-            the new parameters x_imu, y_imu, z_imu [m].
-        angular_acceleration: whether pdot, qdot, rdot [rad/s^2] are shown, the derivatives of the
-            body's rates as far as the model has these.
-        airspeed: whether the speed through the air is shown, at the new parameters x_air, y_air,
-            z_air [m]: u_air, v_air, w_air along the body and their norm airspeed [m/s].
+        imu: True for an accelerometer: outputs ax, ay, az [m/s^2], the specific force at the new
+            parameters x_imu, y_imu, z_imu [m].
+        angular_acceleration: True for pdot, qdot, rdot [rad/s^2], the derivatives of those body
+            rates that the model has.
+        airspeed: True for the speed through the air at the new parameters x_air, y_air, z_air [m]:
+            u_air, v_air, w_air along the body and their norm airspeed [m/s].
 
     Raises:
-        ValueError: the model does not know what is asked for, or has the name already.
+        ValueError: the model does not know a requested quantity, or has the name already.
     """
     asked = {"imu": imu, "angular_acceleration": angular_acceleration, "airspeed": airspeed}
     return _with_sensors(model, tuple(name for name, on in asked.items() if on))
 
 
-# Cached: a model is static to jit, and a second one of the same kind would be compiled again.
+# Cached because a model is static to jit: an equal second model would be compiled again.
 @functools.cache
 def _with_sensors(model: Model, shown: tuple[str, ...]) -> Model:
     def again(other: Model) -> Model:
         return _with_sensors(other, shown)
 
-    # Sensors use derivatives, so a disturbance must act before them: `with_disturbance` puts it on
-    # the model within.
+    # Sensors use derivatives, so a disturbance must act before them. `with_disturbance` therefore
+    # adds it to the inner model.
     return _MotionSensors(model, shown).made("+".join(shown), again, within=(model, again))
 
 
 class _MotionSensors(Device):
-    """Sensors somewhere in the body, without a dynamics of their own."""
+    """Sensors at given positions in the body, without dynamics."""
 
     def __init__(self, model: Model, shown: tuple[str, ...]) -> None:
         self.asked = shown
@@ -206,14 +204,14 @@ class _MotionSensors(Device):
         return {"airspeed": Quantity("m/s", "airspeed at the probe"), **speeds}
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """None: these sensors have no states."""
+        """Return no derivatives, since these sensors have no states."""
         return {}
 
     def output(self, p: Record, s: Record, u: Record) -> Record:
-        """The model's outputs and those of the sensors beside them."""
+        """Return the outputs of the model and of its sensors."""
         model, motion = self.model, self.motion
         s = self.inner(s)
-        # Once for all sensors: it is the field that costs.
+        # Evaluate the vector field once for all sensors, since it is the expensive part.
         rates = model.vector_field(p, s, u)
         y = naming.asdict(model.output(p, s, u))
         if "imu" in self.asked and motion is not None:
@@ -229,8 +227,7 @@ class _MotionSensors(Device):
 
 
 def _place(suffix: str, what: str) -> dict[str, Quantity]:
-    # Zero as default, the centre of gravity, where the levers vanish: the one position that needs
-    # no measurement.
+    # The default is the centre of gravity, the one position that needs no measurement.
     return {
         f"{axis}_{suffix}": Quantity("m", f"{what} {where} the centre of gravity", 0.0)
         for axis, where in _AXES.items()
@@ -243,28 +240,28 @@ type Vector = tuple[Any, Any, Any]
 
 _ANGLE_RATES = ("dphi", "dtheta", "dpsi")
 _BODY_RATES = (("p", "q", "r"), ("roll_rate", "pitch_rate", "yaw_rate"))
-"""the names that outputs may have which are the rates of the body"""
+"""Names of outputs that are body rates."""
 
 
 class MotionKind(NamedTuple):
-    """Form in which a model has its velocities."""
+    """Form of a model's velocities."""
 
     kind: str
-    """linear, body or ground"""
+    """One of linear, body and ground."""
     outputs: tuple[str, ...]
-    """those of ax, ay, az that it can show"""
+    """Accelerations among ax, ay, az that the model can show."""
 
     @property
     def along(self) -> str:
-        """The letters of the axes along which it knows its velocity."""
+        """Letters of the axes along which the model knows its velocity."""
         return "".join(name[1] for name in self.outputs)
 
 
 def motion_of(model: Model) -> MotionKind:
-    """Return the form in which a model has its velocities.
+    """Return the form of a model's velocities.
 
     Raises:
-        ValueError: it knows none.
+        ValueError: the model has no velocities.
     """
     states = naming.names(model.State)
     if model.linear:
@@ -285,7 +282,7 @@ def motion_of(model: Model) -> MotionKind:
 
 
 def _body_rates(model: Model) -> tuple[str, ...]:
-    """The outputs that are the rates of the body; () where there are none."""
+    """Return the outputs that are body rates; () if there are none."""
     outputs = naming.names(model.Outputs)
     return next((names for names in _BODY_RATES if set(names) <= set(outputs)), ())
 
@@ -293,9 +290,9 @@ def _body_rates(model: Model) -> tuple[str, ...]:
 def specific_force(
     model: Model, motion: MotionKind, p: Record, s: Record, u: Record, rates: Record
 ) -> dict[str, Any]:
-    """The specific force at the IMU [m/s^2], by output."""
-    # From the model's own derivatives, so that thrust, drag and gusts are in it without being
-    # named: an accelerometer shows all forces but weight.
+    """Return the specific force at the IMU [m/s^2], by output."""
+    # An accelerometer shows all forces except weight. The model's derivatives include thrust, drag
+    # and gusts without naming them.
     of_kind = {"linear": _linear, "body": _body, "ground": _ground}[motion.kind]
     force = of_kind(model, p, s, u, rates)
     return {n: force["xyz".index(n[1])] for n in motion.outputs}
@@ -304,11 +301,13 @@ def specific_force(
 def airspeed(
     model: Model, motion: MotionKind, p: Record, s: Record, u: Record, rates: Record
 ) -> dict[str, Any]:
-    """The speed through the air at the probe, by output: u_air, v_air, w_air along the body
-    forward, right, down, and airspeed, their norm [m/s].
+    """Return the speed through the air at the probe [m/s], by output.
+
+    The outputs are u_air, v_air, w_air along the body (forward, right, down), and airspeed, their
+    norm.
 
     Args:
-        u: the model's Inputs; the wind is wind_x, wind_y, wind_z where it is among them.
+        u: the model's Inputs; the wind is wind_x, wind_y, wind_z if they are among them.
     """
     at = (p.x_air, p.y_air, p.z_air)
     if motion.kind == "linear":
@@ -326,13 +325,12 @@ def airspeed(
         velocity = _into_body(s, over_ground if wind is None else _less(over_ground, wind))
     velocity = _sum(velocity, _cross(omega, at))
     shown = {f"{'uvw'['xyz'.index(n)]}_air": velocity["xyz".index(n)] for n in motion.along}
-    # About hover a norm has no linear part: a linear model shows components alone.
+    # About hover the norm has no linear part, so a linear model only shows components.
     return shown if motion.kind == "linear" else {"airspeed": _norm(velocity), **shown}
 
 
 def rate_of(model: Model, letter: str) -> tuple[str, str] | None:
-    """Return the place of the body rate p, q or r in a model: ('state', name), ('output', name),
-    or None if it has none."""
+    """Return ('state', name) or ('output', name) for the body rate p, q or r; None without one."""
     states, outputs = naming.names(model.State), naming.names(model.Outputs)
     if letter in states:
         return "state", letter
@@ -348,7 +346,7 @@ def rate_of(model: Model, letter: str) -> tuple[str, str] | None:
 def angular_acceleration(
     model: Model, rate: tuple[str, str], p: Record, s: Record, u: Record, rates: Record
 ) -> Any:
-    """The derivative of one of the body's rates [rad/s^2]."""
+    """Return the derivative of a body rate [rad/s^2]."""
     kind, name = rate
     if kind == "state":
         return getattr(rates, name)
@@ -356,8 +354,7 @@ def angular_acceleration(
 
 
 def _g(p: Record) -> Any:
-    # The model's own g where it has one: a fit in which weight and specific force had two values
-    # would find the difference as a force.
+    # Use the model's own g: with two values a fit would see their difference as a force.
     return getattr(p, "g", _G)
 
 
@@ -366,13 +363,12 @@ def _at(p: Record) -> Vector:
 
 
 def _linear(model: Model, p: Record, s: Record, u: Record, rates: Record) -> Vector:
-    """About hover, of first order in all states; a state that the model has not is zero."""
+    """Return the specific force about hover, to first order; states the model lacks are zero."""
 
     def of(record: Record, name: str) -> Any:
         return getattr(record, name, 0.0)
 
-    # omega x v and omega x (omega x r) are products of two small numbers, of which a linear model
-    # knows nothing: kept here, they would make the output nonlinear.
+    # omega x v and omega x (omega x r) are of second order, and would make the output nonlinear.
     turning = _cross((of(rates, "p"), of(rates, "q"), of(rates, "r")), _at(p))
     return (
         of(rates, "u") + _g(p) * of(s, "theta") + turning[0],
@@ -383,8 +379,8 @@ def _linear(model: Model, p: Record, s: Record, u: Record, rates: Record) -> Vec
 
 def _body(model: Model, p: Record, s: Record, u: Record, rates: Record) -> Vector:
     omega, velocity = (s.p, s.q, s.r), (s.u, s.v, s.w)
-    # u, v and w are components along axes that turn: their derivatives lack omega x v, without
-    # which a steady turn would show no acceleration.
+    # u, v and w are along rotating axes, so their derivatives lack omega x v. Without it a steady
+    # turn would show no acceleration.
     along = _sum((rates.u, rates.v, rates.w), _cross(omega, velocity))
     cos_theta = jnp.cos(s.theta)
     weight = (
@@ -397,14 +393,16 @@ def _body(model: Model, p: Record, s: Record, u: Record, rates: Record) -> Vecto
 
 
 def _ground(model: Model, p: Record, s: Record, u: Record, rates: Record) -> Vector:
-    # Acceleration less gravity while still along the ground, where gravity has one component.
+    # Subtract gravity in ground axes, where it has one component.
     force = _into_body(s, (rates.dx, rates.dy, -rates.dz - _g(p)))
     return _sum(force, _lever(p, *_turning(model, p, s, u, rates)))
 
 
 def _into_body(s: Record, vector: Vector) -> Vector:
-    """A vector forward, right, down over the ground along the body: yaw, pitch, roll (Stevens and
-    Lewis, 2003, eq. 1.3-20)."""
+    """Return a vector in body axes, given it forward, right, down over the ground.
+
+    The order is yaw, pitch, roll (Stevens and Lewis, 2003, eq. 1.3-20).
+    """
     x, y, z = vector
     (cphi, sphi), (ctheta, stheta), (cpsi, spsi) = (
         (jnp.cos(angle), jnp.sin(angle)) for angle in (s.phi, s.theta, s.psi)
@@ -418,9 +416,9 @@ def _into_body(s: Record, vector: Vector) -> Vector:
 
 
 def _turning(model: Model, p: Record, s: Record, u: Record, rates: Record) -> tuple[Vector, Vector]:
-    """The rates of the body and their derivatives, where the velocities are over the ground."""
-    # Use the derivatives of the angles if these are states. The paper's helicopter takes them for
-    # body rates, which holds only in level flight.
+    """Return the body rates and their derivatives, for velocities over the ground."""
+    # Derivatives of the angles take precedence if they are states. The paper's helicopter takes
+    # them for body rates, which holds only in level flight.
     if set(_ANGLE_RATES) <= set(naming.names(model.State)):
         return _along_motion(_from_angles, s, rates)
 
@@ -443,28 +441,28 @@ def _from_angles(s: Record) -> Vector:
 
 
 def _along_motion(function: Callable[[Record], Any], s: Record, rates: Record) -> tuple[Any, Any]:
-    """A function of the state, and its derivative in time."""
+    """Return a function of the state and its time derivative."""
     as_arrays = jax.tree.map(jnp.asarray, s)
     tangent = jax.tree.map(lambda v, like: jnp.asarray(v, like.dtype), _as(s, rates), as_arrays)
     return jax.jvp(function, (as_arrays,), (tangent,))
 
 
 def _as(state: Record, rates: Record) -> Record:
-    """The rates in the state's class, which a device around the model may have extended."""
+    """Return the rates in the state's class, which a device around the model may have extended."""
     return type(state)(**{n: getattr(rates, n) for n in naming.names(type(state))})
 
 
 def _wind(u: Record) -> Vector | None:
-    """The velocity of the air forward, right, down over the ground; None in still air."""
+    """Return the wind velocity forward, right, down over the ground; None in still air."""
     names = naming.names(type(u))
     if not {"wind_x", "wind_y", "wind_z"} <= set(names):
         return None
-    # The model's z is up, as that of the helicopter's position.
+    # The model's z is up.
     return u.wind_x, u.wind_y, -u.wind_z
 
 
 def _norm(v: Vector) -> Any:
-    # The root of zero has no derivative: at rest this one's is zero.
+    # The square root has no derivative at zero; use zero there.
     square = v[0] ** 2 + v[1] ** 2 + v[2] ** 2
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0 * square)
 

@@ -23,24 +23,25 @@ def with_servos(
     delay: bool = False,
     name: str = "servo",
 ) -> Model:
-    r"""The model with equal servos on some of its inputs.
+    r"""Return the model with equal servos on some of its inputs.
 
-    $\ddot\delta = \omega^2(u - \delta) - 2\zeta\omega\dot\delta$. With a rate limit the servo's
-    motor is asked for no more than that speed,
-    $\ddot\delta = 2\zeta\omega\,(\mathrm{sat}(\omega (u - \delta)/(2\zeta)) - \dot\delta)$: the
-    same equation below the limit, and $|\dot\delta|$ never exceeds it.
+    $\ddot\delta = \omega^2(u - \delta) - 2\zeta\omega\dot\delta$. With a rate limit the commanded
+    speed saturates:
+    $\ddot\delta = 2\zeta\omega\,(\mathrm{sat}(\omega (u - \delta)/(2\zeta)) - \dot\delta)$. This is
+    the same equation below the limit, and $|\dot\delta|$ never exceeds it.
 
-    New parameters: `omega_NAME` [rad/s], the natural frequency (the bandwidth where zeta is 0.707),
-    `zeta_NAME`, with a limit `rate_NAME` [the input's unit per second], with a delay `delay_NAME`
-    [s]. New states: the servo's position and speed, `INPUT_NAME` and `INPUT_NAME_rate`.
+    New parameters: `omega_NAME` [rad/s], the natural frequency (the bandwidth if zeta is 0.707),
+    and `zeta_NAME`. A rate limit adds `rate_NAME` [the input's unit per second], a delay adds
+    `delay_NAME` [s]. New states: the servo's position and speed, `INPUT_NAME` and
+    `INPUT_NAME_rate`.
 
     Args:
-        rate_limit: whether they are limited in rate; the model is then no longer linear.
-        delay: whether they act late by a pure delay, exact (`Model.delays`).
-        name: ends the names of parameters and states, for a second kind of servo.
+        rate_limit: True for a limited rate, which makes the model nonlinear.
+        delay: True for a pure delay, which is exact (`Model.delays`).
+        name: suffix of parameters and states, for a second kind of servo.
 
     Raises:
-        ValueError: no such input, one that is late already, or a name that is taken.
+        ValueError: no such input, one that has a delay already, or a name that is taken.
     """
     check_model(model)
     return _with_servos(model, tuple(on), rate_limit, delay, name)
@@ -60,14 +61,14 @@ def _with_servos(
     def again(bare: Model) -> Model:
         return _with_servos(bare, on, rate_limit, delay, name)
 
-    # The delay goes outside the servo: the two commute, and an input that is late by its record is
-    # exact and costs no states.
+    # Delay and servo commute. A delay outside the servo acts on the input's record, so it is exact
+    # and needs no states.
     made = device.made(f"{name}s", again)
     return with_input_delays(made, dict.fromkeys(on, f"delay_{name}")) if delay else made
 
 
 class _Servos(Device):
-    """Second order, one on each of some inputs."""
+    """Second-order servos on some inputs."""
 
     def __init__(self, model: Model, on: tuple[str, ...], rate_limit: bool, name: str) -> None:
         params = {
@@ -75,8 +76,7 @@ class _Servos(Device):
             f"zeta_{name}": Quantity("1", "servo's damping ratio", math.nan, True),
         }
         if rate_limit:
-            # Equal servos share their parameters, the limit too: one number for inputs of different
-            # units would be two limits under one name.
+            # Equal servos share the limit, so their inputs must have one unit.
             unit = quotient(_one_unit(model, on), "s")
             params[f"rate_{name}"] = Quantity(unit, "servo's greatest speed", math.nan, True)
         states = {}
@@ -88,22 +88,19 @@ class _Servos(Device):
         self.on, self.rate_limit, self.name = on, rate_limit, name
 
     def inputs(self, p: Record, s: Record, u: Record) -> Record:
-        """The inputs that are moved by servos, where these stand; the others as they are."""
-        # The position alone reaches the model: blades follow where the servo stands, not what it
-        # was told.
+        """Return the inputs, with servo positions in place of their commands."""
         return naming.replace(u, **{n: getattr(s, f"{n}_{self.name}") for n in self.on})
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """The derivatives of positions and speeds, per second."""
+        """Return the time derivatives of positions and speeds."""
         omega, zeta = (getattr(p, f"{k}_{self.name}") for k in ("omega", "zeta"))
         rates = {}
         for n in self.on:
             position, speed = f"{n}_{self.name}", f"{n}_{self.name}_rate"
-            # The equation of second order as a position loop around a speed loop: in this form
-            # there is a speed that is asked for, which a limit can act on.
+            # A position loop around a speed loop gives a commanded speed, which a limit can act on.
             asked = omega / (2.0 * zeta) * (getattr(u, n) - getattr(s, position))
-            # The speed that is asked for is limited, not the speed itself: a state that is clipped
-            # would wind up behind its limit, and come off it late.
+            # Limit the commanded speed: a clipped state would wind up behind its limit and leave it
+            # late.
             if self.rate_limit:
                 most = getattr(p, f"rate_{self.name}")
                 asked = jnp.clip(asked, -most, most)

@@ -364,7 +364,7 @@ def _listed_numbers(path: str, settings: dict[str, str], name: str, count: int) 
 # Frames have no length: each ends where the next begins, and that is known only after its fields
 # are decoded. Decoding frame by frame is a hundred times too slow in Python. Therefore every byte
 # that might begin a frame is treated as one, and NumPy decodes all of them at once. A walk from
-# each frame's end to the next one's beginning keeps the real frames. Where none follows, the log is
+# each frame's end to the next one's beginning keeps the real frames. If none follows, the log is
 # damaged, and the walk goes on at the next candidate.
 
 LONGEST_FRAME = 256

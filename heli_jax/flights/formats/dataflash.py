@@ -1,8 +1,8 @@
 """Reader of ArduPilot DataFlash logs, binary (.bin) and text (.log), with NumPy alone.
 
 Source: the messages FMT, FMTU, UNIT and MULT of ArduPilot's AP_Logger. Numbers and names follow
-pymavlink's DFReader. That reader is not used: a message with length zero makes it loop forever, and
-it reads one message at a time.
+pymavlink's DFReader. pymavlink's reader is not used: a message with length zero makes it loop
+forever, and it reads one message at a time.
 """
 
 import array
@@ -184,7 +184,7 @@ def _walk(data: bytes) -> tuple[list[_Described], int]:
             if at < 0:
                 break
             continue
-        # A log seldom ends with a whole message, because the power goes off before the last block
+        # A log rarely ends with a whole message, because the power goes off before the last block
         # is written.
         if at + length > size:
             damaged += 1
@@ -353,8 +353,8 @@ def _in_order(messages: _Messages, clock: str) -> _Messages:
     back = np.flatnonzero(np.diff(times) < 0) + 1
     if not 0 < back.size <= max(1, times.size // 1000):
         return messages
-    # Where the time goes back, either this row or the previous one is wrong. The one is removed
-    # that leaves the others in order.
+    # If the time goes back, either this row or the previous one is wrong. The one is removed that
+    # leaves the others in order.
     rows = [r if r + 1 == times.size or times[r + 1] >= times[r - 1] else r - 1 for r in back]
     kept = np.delete(np.arange(times.size), rows)
     return messages.rows(kept) if np.all(np.diff(times[kept]) >= 0) else messages

@@ -128,8 +128,7 @@ def _room(values: np.ndarray, margin: float, series: Sequence[Series]) -> tuple[
 
 
 def match(pair: FittedPair, unit: str, note: str, baseline: Baseline | None = None) -> Chart:
-    """Draw gain, phase and partial coherence of data and model, and their ratio, with 95 %
-    intervals and the envelopes of unnoticeable dynamics.
+    """Draw gain, phase and partial coherence of data and model, their ratio, and the envelopes.
 
     Args:
         baseline: the recursive least squares of this input and output, as an additional curve.

@@ -1,5 +1,4 @@
-"""Figures over time and by lag: outputs with residuals and inputs, RLS coefficients, whiteness, and
-a manoeuvre."""
+"""Figures over time and by lag: signals, residuals, RLS coefficients, whiteness, manoeuvre."""
 
 from collections.abc import Mapping, Sequence
 
@@ -128,8 +127,7 @@ def residual_correlation(
     together: int = 1,
     test: Whiteness | None = None,
 ) -> Chart:
-    """Draw the autocorrelation of the residual (filter error: innovations) and its correlation with
-    each input, with 99 % bands.
+    """Draw the residual's autocorrelation and its correlation with each input, with 99 % bands.
 
     Args:
         together: number of residuals tested together (Bonferroni, as in `whiteness`).
