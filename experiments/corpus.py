@@ -162,10 +162,10 @@ def run_group(
     import jax
     from corpus_cases import cases
 
-    from heli_jax import cli
+    from heli_jax.cli import commands
 
     # 64 bit before any trace, since cases of Problems do not use the command line.
-    cli._prepare_jax()
+    commands._prepare_jax()
     known, done = {c.name: c for c in cases(Path(shared))}, []
     for name, how in entries:
         with way(how) if way and how else contextlib.nullcontext({}) as added:

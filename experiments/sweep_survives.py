@@ -64,7 +64,7 @@ def configuration(folder: Path, n: int = 81920, chunk: int = 512, duration: floa
 
 
 def command(config: Path, out: Path, *more: str) -> list[str]:
-    program = [sys.executable, "-m", "heli_jax.cli", "sweep", str(config), "--out", str(out)]
+    program = [sys.executable, "-m", "heli_jax", "sweep", str(config), "--out", str(out)]
     return [*program, "--resume", "--no-figures", *more]
 
 

@@ -186,7 +186,7 @@ def judged(run: FitRun) -> Compatibility:
     compatible = converged and not bad
     verdict = _verdict(errors, r_squared, bad, drifting, converged)
     if compatible:
-        verdict = f"{verdict}{_untold(run, errors)}"
+        verdict = f"{verdict}{_undetermined_words(run, errors)}"
     # If the signals are incompatible, the model is wrong and its errors are no corrections.
     known = {e.name: e.estimate.value for e in errors if e.determined and compatible}
     corrections = _corrections(run, known, errors)
@@ -262,7 +262,7 @@ def _verdict(
     return f"Compatible once {', '.join(shown)} are corrected: {agree}."
 
 
-def _untold(run: FitRun, errors: Sequence[SensorError]) -> str:
+def _undetermined_words(run: FitRun, errors: Sequence[SensorError]) -> str:
     """Return what these channels cannot determine if the verdict is good; empty if they determine
     all.
     """

@@ -69,7 +69,7 @@ def searched() -> tuple[str, ...]:
     return tuple(_looked_in)
 
 
-def pass_over_style_of_folder() -> None:
+def ignore_folder_style() -> None:
     """Import Matplotlib elsewhere if the working folder has a matplotlibrc, which it would read."""
     if os.path.lexists("matplotlibrc"):
         with contextlib.chdir(os.sep):
@@ -105,5 +105,5 @@ def _words(e: BaseException) -> str:
     # The last frame is the line in the user's module, or in code that it calls.
     at = traceback.extract_tb(e.__traceback__)
     line = f"{at[-1].filename}, line {at[-1].lineno}: " if at else ""
-    said = " ".join(str(e).split())[:200]
-    return f"{line}{type(e).__name__}{f': {said}' if said else ''}"
+    words = " ".join(str(e).split())[:200]
+    return f"{line}{type(e).__name__}{f': {words}' if words else ''}"

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from heli_jax.dynamics import kinematics
-from heli_jax.dynamics.check_model import check_model, what_instead
+from heli_jax.dynamics.check_model import check_model, description_of
 from heli_jax.dynamics.helicopter import Corrections, helicopter
 from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.onboard.delays import with_delays
@@ -102,7 +102,7 @@ def _imported(name: str, where: str, folder: str | Path | None) -> Model:
         raise InputError(f"{where}: unknown model {name!r}{nearest(name, known)}")
     model = by_path(name, where, folder)
     if not isinstance(model, Model):
-        kind = "nothing" if model is None else what_instead(model)
+        kind = "nothing" if model is None else description_of(model)
         raise InputError(f"{where}: expected a heli_jax.Model at {name!r}, got {kind}")
     # Check here, so that the message can name the configuration's key.
     with located(where):

@@ -120,7 +120,7 @@ def plain(text: str) -> str:
     if not value:
         return digits
     mantissa, _, exponent = f"{value:e}".partition("e")
-    if _reads_well(int(exponent)):
+    if _is_readable(int(exponent)):
         return f"{value:f}"
     return f"{mantissa}e{int(exponent):+03d}"
 
@@ -155,7 +155,7 @@ def _decimal(m: re.Match[str]) -> str | None:
     """Return a number with exponent in full; None if it reads better with a power of ten."""
     value = Decimal(m[1]).scaleb(int(m[2]))
     sign = "+" if m[1].startswith("+") else ""
-    return f"{sign}{value:f}" if _reads_well(value.adjusted()) or not value else None
+    return f"{sign}{value:f}" if _is_readable(value.adjusted()) or not value else None
 
 
 _POWER = re.compile(r"[−-]?\d[\d.]*·10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+")
@@ -215,10 +215,10 @@ def _power(value: float) -> int:
     if value == 0 or not math.isfinite(value):
         return 0
     power = math.floor(math.log10(abs(value)))
-    return 0 if _reads_well(power) else power
+    return 0 if _is_readable(power) else power
 
 
-def _reads_well(power: int) -> bool:
+def _is_readable(power: int) -> bool:
     """True if numbers of this magnitude read well in full, such as 0.0032 and 12345."""
     return -4 < power < 5
 

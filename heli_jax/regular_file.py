@@ -91,7 +91,7 @@ def read_regular(path: str | Path, what: str, at_most: int) -> bytes:
     return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
 
-def in_the_way(path: str | Path) -> str | None:
+def obstacle_at(path: str | Path) -> str | None:
     """Return the reason why a file cannot be written at a path, in words; None if it can."""
     try:
         mode = os.stat(path).st_mode

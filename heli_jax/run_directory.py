@@ -12,7 +12,7 @@ from datetime import datetime
 from pathlib import Path
 
 from heli_jax.errors import InputError
-from heli_jax.regular_file import in_the_way
+from heli_jax.regular_file import obstacle_at
 
 # Paths are added before they are created, so that no interrupt can leave one behind.
 _unfinished: set[Path] = set()
@@ -107,7 +107,7 @@ def whole(path: Path, *, replaces: bool = False, or_beside: bool = False) -> Ite
         yield temporary
         temporary.chmod(0o755)  # so far only its owner had access
         if replaces:
-            _give_way(path)
+            _remove_own(path)
         _finished.append(_renamed(temporary, path, or_beside))
     except OSError as e:
         raise InputError(f"--out {path}: cannot be written ({e.strerror or e})") from e
@@ -119,16 +119,16 @@ def whole(path: Path, *, replaces: bool = False, or_beside: bool = False) -> Ite
 
 def _renamed(temporary: Path, path: Path, or_beside: bool) -> Path:
     """Rename the directory, to the next free name if `path` is taken; return the name."""
-    beside = (path.with_name(f"{path.name}-{number}") for number in itertools.count(2))
+    candidates = (path.with_name(f"{path.name}-{number}") for number in itertools.count(2))
     place = path
     while or_beside and os.path.lexists(place):
-        place = next(beside)
+        place = next(candidates)
     # rename replaces an empty directory, and nothing else.
     os.rename(temporary, place)
     return place
 
 
-def _give_way(path: Path) -> None:
+def _remove_own(path: Path) -> None:
     """Remove a directory of this process."""
     aside = path.absolute().parent / f".{path.name}-{secrets.token_hex(4)}"
     _unfinished.add(aside)
@@ -143,7 +143,7 @@ def require_place(path: Path, where: str) -> None:
     Raises:
         InputError: the path is a folder, a pipe or a device.
     """
-    obstacle = in_the_way(path)
+    obstacle = obstacle_at(path)
     if obstacle is not None:
         raise InputError(f"{where}: is {obstacle}, expected a new name or that of a regular file")
 

@@ -180,13 +180,13 @@ def of_trajectory(run: Any, statuses: Sequence[str]) -> Summary:
         for role, record in (("state", run.states), ("output", run.outputs), ("input", run.inputs))
         for name, values in naming.asdict(record).items()
     ]
-    said = tuple(filter(None, (precision_of(run)[1],)))
+    remark = tuple(filter(None, (precision_of(run)[1],)))
     # A repr must never fail. Within jit only shapes are known.
     if np.ndim(run.times) != 1 or not _concrete([run.times, run.finite, *(v for *_, v in signals)]):
         shape = tuple(np.shape(run.times))
         rows = tuple((role, name, str(tuple(np.shape(v)))) for role, name, v in signals)
         head = ("", "signal", "shape")
-        return Summary(f"Trajectory, times of shape {shape}", head, rows, said)
+        return Summary(f"Trajectory, times of shape {shape}", head, rows, remark)
     times = np.asarray(run.times)
     # The key includes the role, since an output and a state of the same name may differ in unit.
     units = {
@@ -201,7 +201,7 @@ def of_trajectory(run: Any, statuses: Sequence[str]) -> Summary:
         tuple((role, n, *_range(np.asarray(v)), units[role, n]) for role, n, v in signals),
         (
             *(f"outside: {n}" for n, where in run.outside.items() if np.any(np.asarray(where))),
-            *said,
+            *remark,
         ),
     )
 

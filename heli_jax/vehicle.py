@@ -51,7 +51,7 @@ class Helicopter(eqx.Module):
     """
 
     # Fields of the reduced roll model have no default. Fields of the whole helicopter alone default
-    # to NaN, which `needed_but_missing` reports.
+    # to NaN, which `missing_parameters` reports.
     Ixx: Annotated[Scalar, "kg m^2", "fuselage inertia about the roll axis"] = _field()
     If: Annotated[Scalar, "kg m^2", "flybar inertia in flapping"] = _absent()
     R: Annotated[Scalar, "m", "length of a main rotor blade"] = _field(kw_only=True)
@@ -228,8 +228,8 @@ def vehicle_from_mapping(
     values = {n: e.get("value") if isinstance(e, Mapping) else e for n, e in content.items()}
     stands = [n for n, value in values.items() if value == EDIT]
     if stands:
-        asked = ", ".join(f"{n} in {naming.unit(params, n) or '1'}" for n in stands)
-        raise InputError(f"{where}: still {EDIT}, expected numbers for {asked}")
+        requested = ", ".join(f"{n} in {naming.unit(params, n) or '1'}" for n in stands)
+        raise InputError(f"{where}: still {EDIT}, expected numbers for {requested}")
     for name, entry in content.items():
         constants[name] = constant(entry, name, naming.unit(params, name), where)
     lacking = [n for n in known if n not in constants and n not in naming.defaults(params)]

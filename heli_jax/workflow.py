@@ -172,8 +172,8 @@ def _fit_run(
             )
         problem = configuration.problem(config)
     # Report before the fit, so that a wrong unit or hold is seen while the fit runs.
-    for said in reading_notes(problem):
-        progress(Note(said.sentence))
+    for one in reading_notes(problem):
+        progress(Note(one.sentence))
     options = config.config.fit
     assert options is not None  # `problem` refuses a configuration without fit
     # `fit` does not know the file that its messages need
@@ -193,8 +193,8 @@ def _fit_run(
     with stage("recursive least squares", name="rls"):
         rls = _baseline(config, problem, fitted, progress)
     kept = None
-    asked = options.intervals
-    if out is not None and (asked.profile or asked.bootstrap or asked.nuts):
+    requested = options.intervals
+    if out is not None and (requested.profile or requested.bootstrap or requested.nuts):
         kept = _keep(FitRun(config, problem, fitted, rls, began=began), Path(out), progress)
     try:
         further = _supplementary(config, problem, fitted, progress)
@@ -234,8 +234,8 @@ def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Ch
     config = config if isinstance(config, Experiment) else load_config(config)
     problem = configuration.problem(config)
     notes = reading_notes(problem)
-    for said in notes:
-        progress(Note(said.sentence))
+    for one in notes:
+        progress(Note(one.sentence))
     with located(f"{config.path}: fit"), stage("what the log can determine"):
         return replace(check(problem), log_notes=tuple(notes))
 
@@ -293,14 +293,14 @@ def _supplementary(
     """Compute further intervals and model selection, if the configuration asks for them."""
     options = config.config.fit
     assert options is not None
-    asked, further, choice, methods = options.intervals, None, None, None
-    if asked.profile or asked.bootstrap or asked.nuts:
+    requested, further, choice, methods = options.intervals, None, None, None
+    if requested.profile or requested.bootstrap or requested.nuts:
         with located(f"{config.path}: fit"):
             further = intervals(
                 fitted,
-                profiles=asked.profile,
-                runs=asked.bootstrap,
-                draws=asked.nuts,
+                profiles=requested.profile,
+                runs=requested.bootstrap,
+                draws=requested.nuts,
                 seed=options.seed,
                 progress=progress,
             )
@@ -401,8 +401,8 @@ def _with_responses(run: FitRun) -> SupplementaryAnalyses:
     points = options.points or Settings().points
     settings = Settings(options.band, options.window, points)
     logged = {n for f in run.problem.training for n in f.outputs}
-    asked = asked_handling(run.config, logged)
-    responses = fitted_responses(run.fit, run.problem, settings, asked)
+    requested = asked_handling(run.config, logged)
+    responses = fitted_responses(run.fit, run.problem, settings, requested)
     gaps = missing_handling(run.config, logged)
     responses = responses._replace(notes=(*responses.notes, *gaps))
     return run.supplementary._replace(responses=responses)

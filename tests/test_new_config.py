@@ -11,7 +11,7 @@ from heli_jax.config import read_flights
 from heli_jax.config.problems import problem
 from heli_jax.config.schema import Config
 from heli_jax.errors import InputError
-from heli_jax.flights.channel_names import no_stick, words_in
+from heli_jax.flights.channel_names import quantity_of_output, words_in
 from heli_jax.flights.log import ChannelLog, Topic
 from heli_jax.new_config import scales, tables, write_config
 from heli_jax.new_config.guess import (
@@ -491,9 +491,9 @@ def test_a_rate_is_never_taken_for_the_stick(tmp_path: Path, rate: str) -> None:
 
 
 def test_what_a_controller_puts_out_is_a_stick_and_its_rate_is_none() -> None:
-    assert no_stick("RATE.R", "", "1") == "an angular rate"
+    assert quantity_of_output("RATE.R", "", "1") == "an angular rate"
     # ArduPilot's controller output, which its preset takes for the stick.
-    assert no_stick("RATE.ROut", "", "1") == ""
+    assert quantity_of_output("RATE.ROut", "", "1") == ""
     assert words_in("RATE.RDes") == ("rate", "r", "des")
     assert words_in("rollRate") == words_in("Roll Rate") == ("roll", "rate")
 

@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from heli_jax.cli import fits as output
-from heli_jax.cli.terminal import print_table, tell
+from heli_jax.cli.terminal import print_table, print_text
 from heli_jax.identification.result import Estimate
 
 HEAD = ("parameter", "estimate", "95 % (autocorrelated residuals)", "unit", "of another method")
@@ -32,7 +32,7 @@ def test_every_cell_is_whole(
 
 def test_a_terminal_obeys_no_name(capsys: pytest.CaptureFixture[str]) -> None:
     name = "p\x1b[2J\x07\x9b1m\u202e\u2066\u200f\u2028\udcff\tq"
-    tell(f"log {name}\nnext")
+    print_text(f"log {name}\nnext")
     print_table(("channel", name), [(name, "1")])
     out = capsys.readouterr().out
     assert out.startswith("log p?[2J??1m???")
@@ -52,7 +52,7 @@ def test_sentences_begin_new_lines_between_words(
         monkeypatch.setenv("COLUMNS", str(width))
         monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     for sentence in sentences:
-        tell(sentence)
+        print_text(sentence)
     lines = capsys.readouterr().out.splitlines()
     assert " ".join(" ".join(lines).split()) == " ".join(sentences)
     if width is None:

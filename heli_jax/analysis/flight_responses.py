@@ -499,7 +499,7 @@ _BLOCK = 4096
 """Frequencies that are computed together, each with its images."""
 
 
-def forgets(fitted: TransferFit, seconds: float) -> bool:
+def decays_within(fitted: TransferFit, seconds: float) -> bool:
     """True if the slowest mode of a transfer function falls to 1/e within a window."""
     poles = fitted.poles
     return bool(np.isfinite(poles).all() and np.all(np.real(poles) * seconds < -1.0))
@@ -512,7 +512,7 @@ def window_error(
 
     Returns None if the response does not decay within a window.
     """
-    if not forgets(fitted, windows.seconds):
+    if not decays_within(fitted, windows.seconds):
         return None
     kept = sorted({*windows.inputs, *(windows.instruments or ())})
     place = {i: j for j, i in enumerate(kept)}

@@ -136,7 +136,7 @@ def measured_curve(
             f"octave, expected at least {_LEAST_BINS}: more `points`, or more excitation"
         )
     # Beyond a bin that jumps, unwrapping may be wrong by a turn.
-    known[coherent] &= ~_leaps(H[coherent], sd[coherent])
+    known[coherent] &= ~_phase_jumps(H[coherent], sd[coherent])
     run = _widest(np.log(omega), known)
     if run.size < _LEAST_BINS:
         return "its phase jumps from bin to bin"
@@ -177,7 +177,7 @@ def _too_sharp(w: np.ndarray, off: np.ndarray, relative: np.ndarray) -> str:
     )
 
 
-def _leaps(H: np.ndarray, sd: np.ndarray) -> np.ndarray:
+def _phase_jumps(H: np.ndarray, sd: np.ndarray) -> np.ndarray:
     """Return a mask of bins (k,) more than a right angle from the phase of their neighbours."""
     relative = sd / np.abs(H)
     # Weighted by the errors, but limited so that no single bin dominates. Its error may be too

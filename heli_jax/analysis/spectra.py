@@ -434,18 +434,18 @@ def _complete(
     flights: Sequence[Flight],
     starts: tuple[tuple[int, ...], ...],
     length: int,
-    asked: tuple[float, int],
+    requested: tuple[float, int],
 ) -> tuple[tuple[str, ...], np.ndarray, dict[str, str]]:
     """Return the outputs with enough windows, their mask (W, p), and the reasons for the others.
 
     Args:
-        asked: length of a window [s], and number of inputs that move.
+        requested: length of a window [s], and number of inputs that move.
     """
     outputs = tuple(dict.fromkeys(n for f in flights for n in f.outputs))
     seen = np.concatenate(
         [_seen(f, s, length, outputs) for f, s in zip(flights, starts, strict=True)]
     )
-    seconds, inputs = asked
+    seconds, inputs = requested
     averages = np.sum(seen, axis=0) / PER_AVERAGE
     kept = averages >= inputs + 1
     many = "1 input" if inputs == 1 else f"{inputs} inputs"

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from heli_jax import import_path, run_directory
 from heli_jax.cli import interrupts, terminal
 from heli_jax.cli.interrupts import resumable
-from heli_jax.cli.terminal import print_table, tell, tell_table
+from heli_jax.cli.terminal import print_page_table, print_table, print_text
 from heli_jax.errors import InputError, located
 from heli_jax.numbers import ADEQUATE
 from heli_jax.regular_file import read_regular
@@ -207,7 +207,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     # Tests and other programs pass arguments. An interrupt must not end their process.
     if arguments is None:
-        import_path.pass_over_style_of_folder()
+        import_path.ignore_folder_style()
         # These warnings concern numbers of a log or a configuration, which the message explains.
         warnings.filterwarnings(
             "ignore", category=RuntimeWarning, module=r"(heli_jax|numpy|scipy)\b"
@@ -395,7 +395,7 @@ def _fit_study(options: argparse.Namespace, study: "Study") -> int:
         how = {"workers": options.workers, "client": client, "reports": options.reports}
         result = studies.run(study, out, studies.Options(options.resume, **how, say=options.say))
     simulations.print_study(result)
-    tell(f"fits: {out / 'fits'}\nDataset: {out / studies.STORE}")
+    print_text(f"fits: {out / 'fits'}\nDataset: {out / studies.STORE}")
     return simulations.study_exit_code(result)
 
 
@@ -488,8 +488,8 @@ def _simulate(options: argparse.Namespace) -> int:
         raise InputError(f"--out {out}: expected a name ending in .csv or .parquet")
     view = None
     if options.view is not None:
-        beside = (out or Path(Path(options.config).name)).with_suffix(".html")
-        view = Path(options.view) if options.view else beside
+        page = (out or Path(Path(options.config).name)).with_suffix(".html")
+        view = Path(options.view) if options.view else page
         if view.suffix.lower() not in (".html", ".htm"):
             raise InputError(f"--view {view}: expected a name ending in .html")
     # Check both places before the simulation.
@@ -674,12 +674,14 @@ def _compare(options: argparse.Namespace) -> int:
     numbered = compared._replace(labels=tuple(str(i + 1) for i in range(len(compared.runs))))
     for number, row in zip(numbered.labels, compared.verdicts.rows, strict=True):
         label, model, method, status, verdict, adequate = row
-        tell(f"{number}: {label}: {model} by {method}, {status}. {verdict} adequate: {adequate}")
-    tell_table(numbered.estimates)
+        print_text(
+            f"{number}: {label}: {model} by {method}, {status}. {verdict} adequate: {adequate}"
+        )
+    print_page_table(numbered.estimates)
     # Output, flights and metric name a row, also where a narrow terminal splits the table.
-    tell_table(numbered.agreement, keys=3)
+    print_page_table(numbered.agreement, keys=3)
     for found in numbered.notes:
-        tell(f"! {found.sentence}")
+        print_text(f"! {found.sentence}")
     if place is None:
         return DONE
     run_directory.require_place(place, f"--out {place}")
@@ -746,7 +748,7 @@ def _new_model(options: argparse.Namespace) -> int:
     from heli_jax.new_model import write_skeleton
 
     written = write_skeleton(options.name, options.out)
-    tell("\n".join(map(str, written)))
+    print_text("\n".join(map(str, written)))
     options.say(
         f"wrote {len(written)} files; next: heli-jax simulate {written[2]} --out "
         f"{written[2].with_suffix('.csv')}, then heli-jax fit {written[2]}"

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from heli_jax import compatibility
-from heli_jax.cli.terminal import print_table, tell, tell_table
+from heli_jax.cli.terminal import print_page_table, print_table, print_text
 from heli_jax.compatibility import Compatibility
 from heli_jax.config.frequency import missing_handling
 from heli_jax.finding import Finding
@@ -36,16 +36,18 @@ def print_fit(run: FitRun, *, verbose: bool = False) -> None:
     """
     fit = run.fit
     for line in lines(fit):
-        tell(f"{line.word}: {line.text}")
+        print_text(f"{line.word}: {line.text}")
     stopped = fit.status == "not-converged"
     head, rows = of_estimates({**fit.estimates, **_shown_nuisances(fit.nuisance)}, stopped=stopped)
     determined = [(c.name, *cells_of(c), "", "") for c in report_tables.determined(fit)]
-    tell_table(report_tables.Table((*head[:3], fit.interval, *head[4:]), [*rows, *determined]))
+    print_page_table(
+        report_tables.Table((*head[:3], fit.interval, *head[4:]), [*rows, *determined])
+    )
     print_findings(fit.findings, verbose=verbose)
     if verbose:
         _print_details(run)
     if run.directory is not None:
-        tell(f"report: {run.directory / 'report.html'}")
+        print_text(f"report: {run.directory / 'report.html'}")
 
 
 def _print_details(run: FitRun) -> None:
@@ -55,29 +57,29 @@ def _print_details(run: FitRun) -> None:
     problem, fit, supplementary = run.problem, run.fit, run.supplementary
     if supplementary.intervals is not None:
         table = report_tables.intervals(supplementary.intervals, fit)
-        tell_table(table)
+        print_page_table(table)
         for sentence in supplementary.intervals.sentences:
-            tell(f"! {sentence}")
+            print_text(f"! {sentence}")
     if supplementary.methods is not None:
         side_by_side = report_tables.methods(supplementary.methods)
-        tell_table(side_by_side)
+        print_page_table(side_by_side)
         for sentence in supplementary.methods.sentences:
-            tell(f"! {sentence}")
-    tell_table(report_tables.agreement(fit, None))
+            print_text(f"! {sentence}")
+    print_page_table(report_tables.agreement(fit, None))
     if (held := report_tables.held_out_flights(fit.held_out_frequency)) is not None:
-        tell_table(held)
+        print_page_table(held)
     _print_handling(run)
     if (responses := report_tables.responses(fit.responses)) is not None:
-        tell_table(responses)
+        print_page_table(responses)
     if problem.first_guess is not None:
         _print_first_guess(problem.first_guess)
     gates = card(fit, supplementary.responses)
-    tell(plain_words(f"acceptance card: {summary(gates, _GATES)}"))
+    print_text(plain_words(f"acceptance card: {summary(gates, _GATES)}"))
     if supplementary.choice is not None:
         compared = report_tables.choice(supplementary.choice)
-        tell_table(compared)
+        print_page_table(compared)
         for sentence in supplementary.choice.sentences:
-            tell(sentence)
+            print_text(sentence)
     if run.baseline is not None:
         _print_baseline(run.baseline)
 
@@ -108,31 +110,31 @@ def _print_handling(run: FitRun) -> None:
     if run.config.config.frequency is not None:
         for found in run.supplementary.responses.notes:
             if found.code == NO_RESPONSES:
-                tell(f"! {found.sentence}")
+                print_text(f"! {found.sentence}")
     if handling := run.supplementary.responses.handling:
-        tell_table(report_tables.handling(handling))
+        print_page_table(report_tables.handling(handling))
     logged = {n for f in run.problem.training for n in f.outputs}
     for found in missing_handling(run.config, logged):
-        tell(f"! {found.sentence}")
+        print_text(f"! {found.sentence}")
 
 
 def print_compatibility(result: Compatibility) -> None:
     """Print the agreement of a log's sensors and their errors on standard output."""
-    tell(result.verdict)
+    print_text(result.verdict)
     for found in result.doubts:
-        tell(f"! {found.sentence}")
+        print_text(f"! {found.sentence}")
     head, rows = compatibility.table(result)
     print_table(head, [tuple(map(plain_cell, row)) for row in rows])
     r_squared = ", ".join(f"{n} {r:.4f}" for n, r in result.r_squared.items())
-    tell(f"R2 of the reconstructed signals: {r_squared}")
+    print_text(f"R2 of the reconstructed signals: {r_squared}")
     assert result.run.directory is not None
-    tell(f"corrections: {result.run.directory / compatibility.FILE}")
-    tell(f"report: {result.run.directory / 'report.html'}")
+    print_text(f"corrections: {result.run.directory / compatibility.FILE}")
+    print_text(f"report: {result.run.directory / 'report.html'}")
 
 
 def _print_first_guess(guess: EquationErrorStart | FrequencyErrorStart) -> None:
-    tell(f"Start values, by {report_tables.start_method(guess)} (no result):")
-    tell_table(report_tables.first_guess(guess))
+    print_text(f"Start values, by {report_tables.start_method(guess)} (no result):")
+    print_page_table(report_tables.first_guess(guess))
 
 
 _MOST_OFFSETS = 4
@@ -148,17 +150,17 @@ def _print_baseline(b: Baseline) -> None:
         if math.isfinite(b.metrics.vaf)
         else "its simulation diverges"
     )
-    tell(f"RLS (order {b.order}, {b.output}): {vaf}" + (f"; {ratios}" if ratios else ""))
+    print_text(f"RLS (order {b.order}, {b.output}): {vaf}" + (f"; {ratios}" if ratios else ""))
     for sentence in b.sentences:
-        tell(f"  ! {sentence}")
+        print_text(f"  ! {sentence}")
 
 
 def print_check(check: Check, *, verbose: bool = False) -> None:
     """Print the identifiability at the initial guess on standard output."""
     verdict = check.verdict
     # The fit's result at its estimates may differ, since sensitivities depend on the parameters.
-    tell("At the start values (a fit repeats this at its estimates):")
-    tell(verdict.text)
+    print_text("At the start values (a fit repeats this at its estimates):")
+    print_text(verdict.text)
     rows = []
     for i, name in enumerate(verdict.names):
         # The covariance is that of the logarithms, so its root is the relative sd.
@@ -174,10 +176,10 @@ def print_check(check: Check, *, verbose: bool = False) -> None:
     for name, sd in check.noise.items():
         if verbose or name in check.guessed:
             guess = f" ({GUESSED})" if name in check.guessed else ""
-            tell(f"noise of {name}: {terse(sd, 3)}{guess}")
+            print_text(f"noise of {name}: {terse(sd, 3)}{guess}")
     if verbose:
         _print_rank(verdict)
-    tell("\nIs this log enough?")
+    print_text("\nIs this log enough?")
     print_findings(check.findings, verbose=verbose)
 
 
@@ -192,9 +194,9 @@ def print_findings(findings: Sequence[Finding], *, verbose: bool) -> None:
     first = [f for f in findings if f is by_topic.get(f.topic)]
     shown = findings if verbose else first[:_IN_FULL]
     for f in shown:
-        tell(f"{_MARKS[f.severity]} {f.topic}: {f.sentence}")
+        print_text(f"{_MARKS[f.severity]} {f.topic}: {f.sentence}")
     rest = [f for f in findings if f not in shown]
-    for said, severities in (
+    for label, severities in (
         ("also in doubt", ("refuse", "doubt")),
         ("notes", ("note",)),
         ("passed", ("ok",)),
@@ -202,7 +204,7 @@ def print_findings(findings: Sequence[Finding], *, verbose: bool) -> None:
         titles = Counter(f.topic for f in rest if f.severity in severities)
         if titles:
             each = (t if count == 1 else f"{t} ({count})" for t, count in titles.items())
-            tell(f"  {said}: {', '.join(each)}")
+            print_text(f"  {label}: {', '.join(each)}")
 
 
 _MARKS = {"ok": " ", "note": "-", "doubt": "!", "refuse": "x"}
@@ -210,10 +212,10 @@ _MARKS = {"ok": " ", "note": "-", "doubt": "!", "refuse": "x"}
 
 def _print_rank(verdict: Verdict) -> None:
     values = ", ".join(terse(s, 3) for s in verdict.singular_values)
-    tell(
+    print_text(
         f"rank {verdict.rank} of {len(verdict.names)} ({verdict.rank_without_priors} without "
         f"priors), condition number {terse(verdict.condition, 3)}, singular values {values}"
     )
     for direction in verdict.null_directions:
         words = ", ".join(f"{n} {v:+.4f}" for n, v in direction.items())
-        tell(f"null direction (log coordinates): {words}")
+        print_text(f"null direction (log coordinates): {words}")

@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from heli_jax.cli.terminal import print_table, tell
+from heli_jax.cli.terminal import print_table, print_text
 from heli_jax.finding import as_data
 from heli_jax.flights.clock import ROWS
 from heli_jax.flights.describe import ColumnInfo, LogInfo, TimeInfo, TopicInfo
@@ -41,7 +41,7 @@ def print_flights(
     """
     log = flights[0]
     rows = "" if log.topics else f", {log.n_rows} rows"
-    tell(f"{log.path}: {log.format}, {log.size} bytes{rows}\nsha256 {log.sha256}")
+    print_text(f"{log.path}: {log.format}, {log.size} bytes{rows}\nsha256 {log.sha256}")
     for flight in flights:
         _print_flight(flight, flight.flight[1] if chosen else len(flights), pattern)
 
@@ -49,17 +49,17 @@ def print_flights(
 def _print_flight(flight: LogInfo, count: int, pattern: str | None) -> None:
     # A table has one clock and no firmware, so most of these lines would be empty.
     for line in _flight_lines(flight, count) if flight.topics else _clock_lines(flight.time):
-        tell(line)
+        print_text(line)
     # Notes on losses and assumptions come before the numbers they affect.
     for found in flight.notes[:_MOST_LINES]:
-        tell(f"! {found.sentence}")
+        print_text(f"! {found.sentence}")
     # With a pattern of channel names the topics are not shown.
     if flight.topics and pattern is None:
         _print_topics(flight.topics)
     _print_channels(flight.columns, pattern)
     if pattern is None:
         for line in _setting_lines(flight):
-            tell(line)
+            print_text(line)
 
 
 def as_json(flights: Sequence[LogInfo]) -> str:
@@ -206,7 +206,7 @@ def _print_channels(columns: Sequence[ColumnInfo], pattern: str | None) -> None:
             if pattern
             else ("--channels 'att*' lists those whose names match")
         )
-        tell(f"{len(columns)} channels; {of}")
+        print_text(f"{len(columns)} channels; {of}")
         return
     rows = []
     for c in shown:

@@ -12,7 +12,7 @@ from heli_jax.analysis.attitude_responses import (
 )
 from heli_jax.analysis.flight_responses import FlightResponses, Settings, Wanted, flight_responses
 from heli_jax.analysis.spectra import COHERENT, octave_mean
-from heli_jax.cli.terminal import print_table, tell, tell_table
+from heli_jax.cli.terminal import print_page_table, print_table, print_text
 from heli_jax.config.experiment import Experiment, resolved
 from heli_jax.config.frequency import asked_handling, check_pairs, missing_handling, units_of
 from heli_jax.config.frequency_section import FrequencyConfig
@@ -166,11 +166,11 @@ def run_responses(
 
     responses = responses_of_log(experiment, log, say)
     # Axes that did not move need no message unless they were requested by name.
-    asked = asked_handling(experiment, responses.outputs)
+    requested = asked_handling(experiment, responses.outputs)
     named = (experiment.config.frequency or FrequencyConfig()).handling is not None
     handling = [
         Handling(pair, None, measured_handling(responses, pair))
-        for pair in asked
+        for pair in requested
         if named or pair.input in responses.holds
     ]
     gaps = missing_handling(experiment, responses.outputs)
@@ -185,9 +185,9 @@ def run_responses(
         say(Note(found.sentence))
     print_responses(responses)
     if handling:
-        tell_table(handling_table(handling))
+        print_page_table(handling_table(handling))
     for sentence in (*handling_sentences(handling), *sentences(gaps)):
-        tell(f"! {sentence}")
+        print_text(f"! {sentence}")
     say(f"wrote {out / 'responses.html'}")
     return [transfer_status(fit) for _, fit in responses.fits]
 
@@ -218,9 +218,9 @@ def print_responses(responses: FlightResponses) -> None:
     print_table(head, rows)
     for request, fit in responses.fits:
         orders = f"{request.zeros} zeros, {request.poles} poles"
-        tell(f"{request.input} to {request.output}, {orders}:")
+        print_text(f"{request.input} to {request.output}, {orders}:")
         if not isinstance(fit, str):
             for head, cell in zip(FIT_HEAD, fit_row(fit), strict=True):
-                tell(f"  {head}: {cell}")
+                print_text(f"  {head}: {cell}")
         for sentence in fit_sentences(fit, responses.window):
-            tell(f"  {plain_words(sentence)}")
+            print_text(f"  {plain_words(sentence)}")

@@ -12,7 +12,7 @@ import numpy as np
 
 from heli_jax import config as configuration
 from heli_jax import run_directory
-from heli_jax.cli.terminal import print_table, tell
+from heli_jax.cli.terminal import print_table, print_text
 from heli_jax.finding import sentences
 from heli_jax.flights import write as tables
 from heli_jax.numbers import rounded, terse
@@ -54,8 +54,8 @@ def write_view(
 
     title, params = experiment.path.stem, experiment.vehicle.params
     # Paths are relative to the page, so that both can be moved together.
-    beside = (Path(os.path.relpath(p, out.parent)) for p in (experiment.path, table) if p)
-    made = origin(as_yaml(configuration.resolved(experiment)), tuple(p.as_posix() for p in beside))
+    files = (Path(os.path.relpath(p, out.parent)) for p in (experiment.path, table) if p)
+    made = origin(as_yaml(configuration.resolved(experiment)), tuple(p.as_posix() for p in files))
     notes = sentences(simulated.notes)
     with run_directory.whole_file(out, f"--view {out}") as temporary:
         write(temporary, simulated.runs, simulated.model, params, title, notes, made)
@@ -69,7 +69,7 @@ def print_sweep(out: Path) -> None:
     words = ", ".join(f"{v} {k.replace('_', ' ')}" for k, v in counts.items())
     # Stores of earlier versions have no backend entry; it was always xla.
     backend = totals["split"].get("backend", "xla")
-    tell(f"{totals['elements']} elements of {totals['model']}: {words}; backend {backend}")
+    print_text(f"{totals['elements']} elements of {totals['model']}: {words}; backend {backend}")
     rows = []
     for name, result in totals["results"].items():
         numbers = [
@@ -87,29 +87,29 @@ def print_sweep(out: Path) -> None:
         for name, [element, *_] in totals[words].items():
             at = ", ".join(f"{n} = {terse(v)}" for n, v in element["axes"].items())
             value = f"{terse(element['value'])} {totals['results'].get(name, {}).get('unit', '')}"
-            tell(
+            print_text(
                 f"{words} {name}: {value.removesuffix(' 1').rstrip()}, element "
                 f"{element['element']}, {at}"
             )
     for found in totals["notes"]:
-        tell(f"! {found['sentence']}")
+        print_text(f"! {found['sentence']}")
     for name, result in totals["results"].items():
         # Quantiles cover only finite values, so the number of others is printed.
         apart = {"infinite": result.get("infinite", 0), "not a number": result.get("nan", 0)}
         if sum(apart.values()):
             words = " and ".join(f"{k} {what}" for what, k in apart.items() if k)
             of = result["n"] + sum(apart.values())
-            tell(f"! {name}: {words} of {of} values, which its line leaves out")
+            print_text(f"! {name}: {words} of {of} values, which its line leaves out")
     timing = totals["timing"]
     # A sweep resumed after its end computes nothing and has no rate.
     if timing["computed_elements"]:
-        tell(
+        print_text(
             f"{timing['computed_elements']} elements in {terse(timing['seconds'], 3)} s "
             f"({terse(timing['elements_per_s'], 3)} per second, with compilation)"
         )
-    tell(f"store: {out / 'sweep.zarr'}")
+    print_text(f"store: {out / 'sweep.zarr'}")
     if (out / "report.html").is_file():
-        tell(f"report: {out / 'report.html'}")
+        print_text(f"report: {out / 'report.html'}")
 
 
 DONE, NOT_DETERMINED, NOT_CONVERGED = 0, 3, 4  # as for a single fit
@@ -143,7 +143,7 @@ def print_study(result: "xr.Dataset") -> None:
     counts = ", ".join(f"{count} {words}" for words, count in Counter(status).items())
     adequate = Counter(str(a) for a in flat["adequate"].to_numpy() if a)
     judged = ", ".join(f"{count} {words}" for words, count in adequate.items())
-    tell(f"{len(status)} fits: {counts}" + (f"; adequate: {judged}" if judged else ""))
+    print_text(f"{len(status)} fits: {counts}" + (f"; adequate: {judged}" if judged else ""))
     outputs = [f"fit of {o} [%]" for o in result["output"].to_numpy()]
     rows = []
     for i in range(min(len(status), _MOST_ROWS)):
@@ -155,7 +155,7 @@ def print_study(result: "xr.Dataset") -> None:
     # All axes name a row. With one alone, rows would look alike where the table is split.
     print_table((*axes, "status", *parameters, *outputs), rows, keys=len(axes))
     if len(status) > _MOST_ROWS:
-        tell(f"... and {len(status) - _MOST_ROWS} more")
+        print_text(f"... and {len(status) - _MOST_ROWS} more")
     _print_scatter(flat, parameters)
     runs = [str(run) for run in flat["run"].to_numpy()]
     untrusted, failed = (list(map(str, flat[n].to_numpy())) for n in ("untrusted", "sentence"))
@@ -164,10 +164,10 @@ def print_study(result: "xr.Dataset") -> None:
     ]
     doubts += [f"{run}: {words}" for run, words in zip(runs, failed, strict=True) if words]
     for words in doubts[:_MOST_DOUBTS]:
-        tell(f"! {words}")
+        print_text(f"! {words}")
     if len(doubts) > _MOST_DOUBTS:
         more = len(doubts) - _MOST_DOUBTS
-        tell(f"! ... and {more} more: `untrusted` and `sentence` of study.zarr")
+        print_text(f"! ... and {more} more: `untrusted` and `sentence` of study.zarr")
 
 
 def _axis(value: Any) -> str:

@@ -36,7 +36,7 @@ def plain_text(text: str) -> str:
     return "".join(c if c.isprintable() or c == "\n" else " " if c.isspace() else "?" for c in text)
 
 
-def tell(text: str, file: TextIO | None = None) -> None:
+def print_text(text: str, file: TextIO | None = None) -> None:
     """Print sentences on `file` (default: standard output), wrapped on a terminal."""
     text = plain_text(terminal_sentence(text))
     stream = sys.stdout if file is None else file
@@ -98,14 +98,14 @@ def print_table(head: _Row, rows: Sequence[_Row], *, keys: int = 1) -> None:
 
 
 # Any: a page's table, a NamedTuple of head and rows.
-def tell_table(table: Any, keys: int = 1) -> None:
+def print_page_table(table: Any, keys: int = 1) -> None:
     """Print a page's table with numbers and units in ASCII; `keys` as for `print_table`."""
     print_table(table.head, [tuple(map(plain_cell, row)) for row in table.rows], keys=keys)
 
 
 def say(text: str) -> None:
     """Print a line on standard error. Standard output is for results, which may be piped."""
-    tell(f"heli-jax: {shortened(text)}", sys.stderr)
+    print_text(f"heli-jax: {shortened(text)}", sys.stderr)
 
 
 def say_notes(text: str) -> None:

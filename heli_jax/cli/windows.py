@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from heli_jax import config as configuration
-from heli_jax.cli.terminal import print_table, tell
+from heli_jax.cli.terminal import print_table, print_text
 from heli_jax.config import Experiment
 from heli_jax.config.logs import require_flights, with_log
 from heli_jax.errors import located
@@ -66,7 +66,7 @@ def print_ranking(ranking: Ranking) -> None:
     if cannot_be_fitted(ranking):
         # If the samples cannot show the model's modes, its predictions recommend no window.
         _print_doubts(ranking)
-        tell(f"No window of {ranking.length:.3g} s is recommended.")
+        print_text(f"No window of {ranking.length:.3g} s is recommended.")
         return
     taken = [choice.window for choice in ranking.taken]
     rest = [w for w in ranking.windows if not w.excluded and w not in taken]
@@ -82,16 +82,16 @@ def print_ranking(ranking: Ranking) -> None:
     print_table(head, rows, keys=head.index("to [s]") + 1)
     unshown = len(rest) - max(_MOST - len(taken), 0)
     if unshown > 0:
-        tell(f"less informative windows, not shown: {unshown}")
+        print_text(f"less informative windows, not shown: {unshown}")
     for w in ranking.windows:
         if w.excluded:
-            tell(f"left out: {w.label}, {w.start:.4g} s to {w.end:.4g} s: {w.excluded}")
+            print_text(f"left out: {w.label}, {w.start:.4g} s to {w.end:.4g} s: {w.excluded}")
     last = ranking.taken[-1]
     together = ", ".join(
         f"{n} {_percent(s)} ({_percent(a)})"
         for n, s, a in zip(ranking.parameters, last.sd, ranking.all_sd, strict=True)
     )
-    tell(
+    print_text(
         f"{len(taken)} of {len(ranking.windows)} windows of {ranking.length:.3g} s give "
         f"{100 * last.efficiency:.0f} % of the accuracy of all together (at least "
         f"{100 * ENOUGH:.0f} % required); expected sd with these (with all): {together}. At the "
@@ -114,14 +114,16 @@ def not_determined(ranking: Ranking) -> tuple[str, ...]:
 def _print_doubts(ranking: Ranking) -> None:
     """Print the assumptions of a ranking, and doubts about the record."""
     for finding in ranking.record:
-        tell(f"{'x' if finding.severity == 'refuse' else '!'} {finding.topic}: {finding.sentence}")
+        print_text(
+            f"{'x' if finding.severity == 'refuse' else '!'} {finding.topic}: {finding.sentence}"
+        )
     for name in ranking.guessed:
-        tell(f"noise of {name}: {ranking.noise[name]:.3g} ({GUESSED})")
+        print_text(f"noise of {name}: {ranking.noise[name]:.3g} ({GUESSED})")
     for found in ranking.notes:
-        tell(f"! {found.sentence}")
+        print_text(f"! {found.sentence}")
     if names := not_determined(ranking):
         whole = "The whole record does" if set(names) <= set(ranking.undetermined) else "All do"
-        tell(f"! {whole} not determine {', '.join(names)}; see heli-jax check.")
+        print_text(f"! {whole} not determine {', '.join(names)}; see heli-jax check.")
 
 
 def _of(w: Window) -> tuple[str, ...]:

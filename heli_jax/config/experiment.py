@@ -227,23 +227,23 @@ def _validated(content: dict[str, Any], where: str) -> Config:
         # For a key with several allowed kinds pydantic reports errors of each; those of the actual
         # kind are useful. An unknown key comes first, because it is the likeliest cause of the
         # others. Only one error is shown: a list of twenty is too long to read.
-        errors = sorted(e.errors(), key=_of_least_use)
+        errors = sorted(e.errors(), key=_by_usefulness)
         raise InputError(f"{where}: {_sentence(errors[0])}") from None
     # If a text is allowed, it would be taken as a channel's name or a unit.
-    if places := list(_still_to_edit(content)):
+    if places := list(_unedited_places(content)):
         others = ", ".join(map(_place, places[1:]))
         more = f"; {EDIT} stands also at {others}" if others else ""
         raise InputError(f"{where}: {_edit_words(places[0])}{more}")
     return config
 
 
-def _still_to_edit(at: Any, place: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+def _unedited_places(at: Any, place: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
     """Yield the places that the user still has to fill in."""
     if at == EDIT and place:
         yield place
     children = at.items() if isinstance(at, dict) else enumerate(at) if isinstance(at, list) else ()
     for key, value in children:
-        yield from _still_to_edit(value, (*place, key))
+        yield from _unedited_places(value, (*place, key))
 
 
 def _edit_words(place: tuple[str | int, ...]) -> str:
@@ -255,7 +255,7 @@ _KIND = re.compile(r"(str|int|float|bool|[A-Z]\w*Config|(list|dict|tuple|literal
 """Member of a union, which pydantic inserts into places as if it were a key."""
 
 
-def _of_least_use(error: ErrorDetails) -> tuple[bool, bool]:
+def _by_usefulness(error: ErrorDetails) -> tuple[bool, bool]:
     """Sort key of errors: those of another kind than the actual value come last."""
     return _is_of_another_kind(error), error["type"] != "extra_forbidden"
 

@@ -126,12 +126,12 @@ def _names(content: dict[str, Any], role: str) -> set[str]:
 
 def _named(signals: dict[str, Any], role: str) -> set[str]:
     """Return the named signals of one log, with all inputs that its preset's outputs need."""
-    named, asked = signals.get(role), signals.get("preset_outputs")
+    named, requested = signals.get(role), signals.get("preset_outputs")
     names = {str(n) for n in named} if isinstance(named, dict) else set()
-    asked = {str(n) for n in asked} if isinstance(asked, list) else set()
+    requested = {str(n) for n in requested} if isinstance(requested, list) else set()
     if role == "outputs":
-        return names | asked
-    return names | ({*FORCES} if asked & {*GROUND, *BODY, *POSITION, "V"} else set())
+        return names | requested
+    return names | ({*FORCES} if requested & {*GROUND, *BODY, *POSITION, "V"} else set())
 
 
 _STRAIGHT_UP = 1.6

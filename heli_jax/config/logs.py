@@ -36,7 +36,7 @@ from heli_jax.flights.convert import Selection
 from heli_jax.flights.flight import Source
 from heli_jax.flights.log import ChannelLog, Table
 from heli_jax.flights.preset import Named, NamedBy
-from heli_jax.flights.request import taken_note
+from heli_jax.flights.request import unit_note
 from heli_jax.identification.methods import objective_of
 
 _PULSE = (800.0, 2200.0)
@@ -97,11 +97,11 @@ def _read_flight(experiment: Experiment, i: int, f: FlightConfig, gain: bool) ->
     time, path = f.signals.time, experiment.path.parent / f.log
     # The log is opened here only if its content decides the signals. Otherwise a wrong unit or a
     # reversed window is reported before minutes of reading.
-    asked = f.signals.preset is not None or f.signals.ccpm is not None
+    requested = f.signals.preset is not None or f.signals.ccpm is not None
     swashplate = None if f.signals.ccpm is None else f.signals.ccpm.swashplate()
     logs = experiment.logs
-    opened = logs.open(path, f.flight) if asked else logs.get(path, f.flight)
-    named = _resolved(experiment, f, f"{where}.signals", opened if asked else None)
+    opened = logs.open(path, f.flight) if requested else logs.get(path, f.flight)
+    named = _resolved(experiment, f, f"{where}.signals", opened if requested else None)
     # Signals of all logs together: one log may supply what another lacks.
     everything = _with_also(named, f, where)
     inputs, outputs = _of_model(model, everything, f"{where}.signals", gain)
@@ -342,7 +342,7 @@ def _unstated_units(
     both = ((model.Inputs, stated.inputs), (model.Outputs, stated.outputs))
     for (record, signals), read in zip(both, as_read, strict=True):
         for name, signal in signals.items():
-            if name in read and (taken := taken_note(name, read[name])):
+            if name in read and (taken := unit_note(name, read[name])):
                 notes.append(taken)
                 continue
             # Plain numbers have no unit that could be wrong.

@@ -172,21 +172,21 @@ def filter_cautions(
     """Return cautions on filters that the log states and the configuration does not model."""
     if source is None:
         return ()
-    said = []
+    doubts = []
     for name, output in outputs.items():
         logged = logged_filters(source.firmware, source.parameters, output.signal)
         if logged is None:
             continue
         if output.filter is None and logged.filters:
-            said.append(_not_modelled(name, output, logged))
+            doubts.append(_not_modelled(name, output, logged))
         if logged.unknown:
             words = (
                 f"{name} was also filtered by {', '.join(_short(s) for s in logged.unknown)}. "
                 "These filters are not modelled, because they change in flight or are of an "
                 "unknown kind"
             )
-            said.append(Finding("filters.unknown", "doubt", words, subjects=(name,)))
-    return tuple(said)
+            doubts.append(Finding("filters.unknown", "doubt", words, subjects=(name,)))
+    return tuple(doubts)
 
 
 def coloured_noise_cautions(flight: Flight, model: Model) -> tuple[Finding, ...]:
@@ -253,13 +253,13 @@ _SEGMENT, _FEWEST = 256, 1500
 
 def unfiltered_cautions(flight: Flight, outputs: Mapping[str, OutputConfig]) -> tuple[Finding, ...]:
     """Return a doubt for each output whose noise did not pass its stated filter."""
-    said = []
+    doubts = []
     for name, output in outputs.items():
         filters = [f for f in _stated(flight, output) if f.kind != "notch"]
         y = flight.outputs.get(name)
         if not filters or y is None or y.size < _FEWEST or not np.isfinite(y).all():
             continue
-        found = _not_taken(y, flight.dt, filters)
+        found = _unfiltered_bands(y, flight.dt, filters)
         if found is not None:
             slow, fast, there, left = found
             words = (
@@ -268,8 +268,8 @@ def unfiltered_cautions(flight: Flight, outputs: Mapping[str, OutputConfig]) -> 
                 f"{percent(left, 0)}. If it was logged before the filter, the fit makes the "
                 "vehicle too fast by the filter's lag; remove the filter and compare"
             )
-            said.append(Finding("filters.not-passed", "doubt", words, there, "power", (name,)))
-    return tuple(said)
+            doubts.append(Finding("filters.not-passed", "doubt", words, there, "power", (name,)))
+    return tuple(doubts)
 
 
 def _stated(flight: Flight, output: OutputConfig) -> list[Filter]:
@@ -284,7 +284,7 @@ def _stated(flight: Flight, output: OutputConfig) -> list[Filter]:
     return filters
 
 
-def _not_taken(
+def _unfiltered_bands(
     y: np.ndarray, dt: float, filters: list[Filter]
 ) -> tuple[float, float, float, float] | None:
     """Return the most significant pair of bands, or None if the noise was filtered.

@@ -82,7 +82,7 @@ def resolve(
             continue
         chosen, why = search.output(name)
         if chosen is None and stated.preset_outputs is not None:
-            raise InputError(f"{where}.preset_outputs: {name}: {why}{search.holdings()}")
+            raise InputError(f"{where}.preset_outputs: {name}: {why}{search.channels_in_words()}")
         if chosen is None:
             left[name] = f"{name} ({why})"
             continue
@@ -90,7 +90,7 @@ def resolve(
         origins["outputs", name] = search.origin(chosen)
     if not outputs and not elsewhere:
         problem = f"{where}: preset {stated.preset} supplies no output of model {model.name}: "
-        raise InputError(problem + ", ".join(left.values()) + search.holdings())
+        raise InputError(problem + ", ".join(left.values()) + search.channels_in_words())
     # In the model's own order, independent of the source.
     inputs = {n: inputs[n] for n in (*naming.names(model.Inputs), *inputs) if n in inputs}
     words = f"outputs that preset {stated.preset} left out: {', '.join(left.values())}"
@@ -163,7 +163,7 @@ class _Search(NamedTuple):
         chosen, why = self._signal(known.stick if pilot else known.command)
         if chosen is None:
             problem = f"{name}: {why}, expected it by name"
-            raise InputError(f"{self.where}.inputs: {problem}{self.holdings()}")
+            raise InputError(f"{self.where}.inputs: {problem}{self.channels_in_words()}")
         # Two inversions cancel.
         return Alternative(**{**vars(chosen), "invert": chosen.invert != known.invert})
 
@@ -190,7 +190,7 @@ class _Search(NamedTuple):
         """Return the source of unit, axes and sign."""
         return f"by preset {self.table.title}: {chosen.source}"
 
-    def holdings(self) -> str:
+    def channels_in_words(self) -> str:
         """Return the channels in the log, as the end of a sentence."""
         if self.log is None:
             return ""

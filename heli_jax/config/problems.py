@@ -132,8 +132,8 @@ def _of_method(
         free = {**free_noise(model, params, flights), **free}
         fixed = () if config.disturbance is None else tuple(config.disturbance.fixed)
     # If windows are requested but the method has none, the fit itself reports it.
-    asked = method == config.fit.method or objective_of(method).noise_model == "white"
-    shooting = config.fit.shooting if asked else None
+    requested = method == config.fit.method or objective_of(method).noise_model == "white"
+    shooting = config.fit.shooting if requested else None
     return {
         "model": model,
         "vehicle": params,
@@ -179,8 +179,8 @@ def with_chosen_windows(problem: Problem) -> Problem:
     from heli_jax.identification.fit import windows
 
     # Only these flights' information counts: the others are fitted in any case.
-    asked = dataclasses.replace(problem, flights=chosen)
-    parts = window_flights(asked, windows(asked))
+    requested = dataclasses.replace(problem, flights=chosen)
+    parts = window_flights(requested, windows(requested))
     by_flight = {id(f): parts.get(i, ()) for i, f in enumerate(chosen)}
     flights = [part for f in problem.flights for part in by_flight.get(id(f), (f,))]
     return dataclasses.replace(problem, flights=tuple(flights))
@@ -240,13 +240,13 @@ def candidate_models(experiment: Experiment, fitted: Problem) -> "Alternatives":
     stated = disturbance.names if disturbance is not None else ()
     # With a list, the other axes are candidates as well. With `axis: roll` the axis is fixed and
     # only its poles are compared.
-    asked = (
+    requested = (
         stated if disturbance is not None and disturbance.axis else undisturbed_too(model, stated)
     )
     # The stand is compared only if its stiffness is free.
-    bare = model.without_stand if len(asked) == 1 and "kappa" in fitted.free else None
+    bare = model.without_stand if len(requested) == 1 and "kappa" in fitted.free else None
     with located(f"{experiment.path}: disturbance"):
-        return alternatives(fitted, model, asked, stated=stated, without_stand=bare)
+        return alternatives(fitted, model, requested, stated=stated, without_stand=bare)
 
 
 # Params are classes of each model, hence Any.
@@ -291,9 +291,9 @@ def _first_guesses(
     # Before the search: a parameter that the model lacks has no start.
     known = naming.names(experiment.model.Params)
     found = config.start == "equation-error"
-    asked = [n for n, f in free.items() if found or math.isnan(f.start)]
+    requested = [n for n, f in free.items() if found or math.isnan(f.start)]
     words = f"model {experiment.model.name} has no parameter"
-    require_known(asked, known, f"{path}: fit.free", words)
+    require_known(requested, known, f"{path}: fit.free", words)
     # NaN means that a start was left out; no optimiser can use it. A fit in frequency begins at the
     # given starts, and its result replaces them later.
     if config.start != "equation-error":

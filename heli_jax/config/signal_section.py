@@ -102,7 +102,7 @@ class CcpmConfig(Section):
         )
 
 
-def _of_those_that_ship(schema: dict[str, Any]) -> None:
+def _list_shipped_presets(schema: dict[str, Any]) -> None:
     """List the presets in the JSON schema, as suggestions for editors."""
     text = next(option for option in schema["anyOf"] if option["type"] == "string")
     text["enum"] = list(presets())
@@ -111,7 +111,7 @@ def _of_those_that_ship(schema: dict[str, Any]) -> None:
 class PresetConfig(Section):
     """Signals from a table or from a geometry (docs/logs.md)."""
 
-    preset: Annotated[str | None, Field(json_schema_extra=_of_those_that_ship)] = None
+    preset: Annotated[str | None, Field(json_schema_extra=_list_shipped_presets)] = None
     """table of an autopilot; `inputs` and `outputs` override it"""
     preset_outputs: list[str] | None = None
     """outputs to take from it; default all that it can supply"""

@@ -72,7 +72,7 @@ def check_model(model: Any, *, traceable: bool = True) -> None:
     if not isinstance(model, Model):
         raise TypeError(
             "model: expected a heli_jax.Model, made by Model(name, vector_field, output, Params, "
-            f"State, Inputs, Outputs), got {what_instead(model)}"
+            f"State, Inputs, Outputs), got {description_of(model)}"
         )
     # Models of this package are tested, and wrapped functions were checked when they were wrapped.
     if str(getattr(_bare(model.vector_field), "__module__", "")).startswith("heli_jax."):
@@ -87,7 +87,7 @@ def check_model(model: Any, *, traceable: bool = True) -> None:
         _check_once(parts, traceable)
 
 
-def what_instead(value: Any) -> str:
+def description_of(value: Any) -> str:
     """Describe an object that is no Model, for the end of a message."""
     if isinstance(value, type):
         return f"the class {value.__name__}"
@@ -176,10 +176,10 @@ def _check_record(model: _Parts, role: str) -> None:
     try:
         names = naming.names(record)
     except Exception as e:
-        said = " ".join(str(e).split())[:200]
+        words = " ".join(str(e).split())[:200]
         raise ValueError(
             f"model {model.name!r}: {role}: {expected}, got {record.__name__}, whose fields are "
-            f"unknown ({type(e).__name__}: {said})"
+            f"unknown ({type(e).__name__}: {words})"
         ) from e
     # A vehicle without inputs may fall, but one without states has nothing to integrate.
     if not names and role != "Inputs":
@@ -309,13 +309,13 @@ def _words(e: Exception) -> str:
             "makes a Python number of a traced value (float, int, the functions of math, an "
             "index); expected the value itself, and jax.numpy, as jnp.sin in place of math.sin"
         )
-    said = " ".join(str(e).split())[:200]
+    words = " ".join(str(e).split())[:200]
     order = ""
     if isinstance(e, AttributeError | TypeError):
         order = (
             "; the arguments are (params, state, inputs), for start and noise_intensity only params"
         )
-    return f"expected a return value, got {type(e).__name__}{f' ({said})' if said else ''}{order}"
+    return f"expected a return value, got {type(e).__name__}{f' ({words})' if words else ''}{order}"
 
 
 def _is_named_tuple(value: Any) -> bool:

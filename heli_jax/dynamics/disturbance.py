@@ -101,7 +101,7 @@ def _with_disturbances(model: Model, on: tuple[str, ...], poles: int) -> Model:
         raise ValueError(f"poles must be 1 or 2, got {poles}")
     added = _disturbances(model, on, poles)
     Params, State = _records(model, added)
-    disturbed = _Disturbed(model, added, State, _felt(model, added))
+    disturbed = _Disturbed(model, added, State, _derivative_outputs(model, added))
     return Model(
         f"{model.name}-disturbed",
         disturbed.vector_field,
@@ -202,7 +202,9 @@ def _pushed_unit(model: Model, state: str) -> str:
     return f"{unit}^2" if unit.endswith("/s") else f"{unit}/s"
 
 
-def _felt(model: Model, added: tuple[Disturbance, ...]) -> tuple[tuple[str, str, float], ...]:
+def _derivative_outputs(
+    model: Model, added: tuple[Disturbance, ...]
+) -> tuple[tuple[str, str, float], ...]:
     """Return outputs that are plus or minus a disturbed derivative: name, disturbing lag, sign.
 
     They are found by two evaluations, as kinematics in `disturbable_states`. Units are compared
@@ -217,7 +219,7 @@ def _felt(model: Model, added: tuple[Disturbance, ...]) -> tuple[tuple[str, str,
     if not pairs:
         return ()
     rng = np.random.default_rng(8)
-    at = [_anywhere(model, rng) for _ in range(2)]
+    at = [_at_random(model, rng) for _ in range(2)]
     # The tolerance allows for evaluation in single precision.
     return tuple(
         (name, d.lags[-1], sign)
@@ -233,7 +235,7 @@ def _same_kind(unit: str | None, other: str) -> bool:
     return units.base_of(unit) == units.base_of(other)
 
 
-def _anywhere(model: Model, rng: np.random.Generator) -> tuple[dict[str, float], dict[str, float]]:
+def _at_random(model: Model, rng: np.random.Generator) -> tuple[dict[str, float], dict[str, float]]:
     """Return a model's rates and outputs at random numbers that no formula maps to one another."""
     p, s, u = (
         record(**{n: np.float64(rng.uniform(0.5, 1.5)) for n in naming.names(record)})

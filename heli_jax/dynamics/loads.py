@@ -94,8 +94,8 @@ def _throttle(
     if not corrections.governor:
         return u.x_throttle, None
     # A throttle stick that is also the collective cannot command a speed.
-    asked = set_point(p, u.x_throttle if corrections.collective else None)
-    return throttle(p, asked, s.Omega, s.governor)
+    commanded = set_point(p, u.x_throttle if corrections.collective else None)
+    return throttle(p, commanded, s.Omega, s.governor)
 
 
 def moments(
@@ -176,16 +176,16 @@ def set_point(p: Helicopter, x_throttle: Scalar | None) -> Scalar:
 
 
 def throttle(
-    p: Helicopter, asked: Scalar, Omega: Scalar, integral: Scalar
+    p: Helicopter, commanded: Scalar, Omega: Scalar, integral: Scalar
 ) -> tuple[Scalar, Scalar]:
     """Return the throttle, 0 to 1, and the derivative of the integral part [1/s].
 
     Args:
-        asked: commanded rotor speed [rad/s].
+        commanded: commanded rotor speed [rad/s].
         Omega: main rotor speed [rad/s].
         integral: the state i_g [1].
     """
-    error = asked - Omega
+    error = commanded - Omega
     free = p.K_P * error + integral
     # A motor cannot brake the rotor or exceed full power. At a limit the throttle does not depend
     # on the gains, so such parts of a record have no information on K_P.

@@ -332,7 +332,7 @@ def plain(record: Record, **changes: Any) -> Record:
     return made
 
 
-def needed_but_missing(model: Model, params: Record) -> list[str]:
+def missing_parameters(model: Model, params: Record) -> list[str]:
     """Return the parameters that the model reads and that are NaN (not given), in field order."""
     # NaN propagates through every operation, so it marks the parameters that are read. An optional
     # one (c_paddle) is replaced by jnp.where and does not show.
@@ -354,7 +354,7 @@ def require_constants(model: Model, params: Record, given: Collection[str] = ())
     Raises:
         VehicleError: one is missing.
     """
-    missing = [n for n in needed_but_missing(model, params) if n not in given]
+    missing = [n for n in missing_parameters(model, params) if n not in given]
     if missing:
         it = "it" if len(missing) == 1 else "them"
         raise VehicleError(f"{', '.join(missing)} missing, model {model.name} needs {it}")

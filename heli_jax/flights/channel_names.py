@@ -94,7 +94,7 @@ def kind_of_unit(unit: str) -> str:
     return next((si for si in _MEANINGS if _is_of(unit, si)), "")
 
 
-def no_stick(name: str, unit: str, si: str) -> str:
+def quantity_of_output(name: str, unit: str, si: str) -> str:
     """Return the measured quantity, such as `an angular rate`, of a channel that is no input.
 
     It is empty if the channel can be an input.
@@ -105,7 +105,7 @@ def no_stick(name: str, unit: str, si: str) -> str:
         si: SI unit of the model's input.
     """
     words = words_in(name)
-    called = names_a_stick(name)
+    called = is_stick_name(name)
     kind = kind_of_unit(unit)
     if kind and not _is_of(unit, si) and (kind not in _OF_STICKS or not called):
         return _MEANINGS[kind]
@@ -118,7 +118,7 @@ def no_stick(name: str, unit: str, si: str) -> str:
     return _WORDS[matches[0]] if matches else ""
 
 
-def names_a_stick(name: str) -> bool:
+def is_stick_name(name: str) -> bool:
     """True if a word of a name means a stick, a servo or a command."""
     words = set(words_in(name))
     return bool(_STICKS & words) and "gps" not in words

@@ -276,8 +276,8 @@ def _resampled(
         topic = log.topic_of(name).name
         clock = clocks[topic]
         logged = _finite(log.channel(name).values[clock.rows])
-        values, said = without_marks_and_turns(shown(name), logged)
-        notes += said
+        values, notices = without_marks_and_turns(shown(name), logged)
+        notes += notices
         # The hold is decided from valid samples only, because a move to or from NaN is none.
         known = values[~np.isnan(values)]
         stays = not known.size or decide(known).hold == "zero-order"

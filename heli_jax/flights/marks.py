@@ -42,7 +42,7 @@ def at_marks(numbers: np.ndarray) -> np.ndarray:
     These are known marks far outside of all other numbers, or the only ones of their sign, and
     numbers too large for any measurement.
     """
-    absurd, known = is_absurd(numbers), _is_one_of(_KNOWN, numbers)
+    absurd, known = is_impossible(numbers), _is_one_of(_KNOWN, numbers)
     none = np.zeros(numbers.shape, bool)
     if not (absurd.any() or known.any()):
         return none
@@ -71,7 +71,7 @@ def infinite(values: np.ndarray, numbers: np.ndarray) -> np.ndarray:
     return np.isinf(values) & ~at_marks(numbers)
 
 
-def is_absurd(numbers: np.ndarray) -> np.ndarray:
+def is_impossible(numbers: np.ndarray) -> np.ndarray:
     """Return a mask of the numbers (N,) of a log that no sensor measures, in any unit."""
     with np.errstate(invalid="ignore"):
         return np.abs(numbers) > _ABSURD
@@ -176,7 +176,7 @@ def strays(seconds: np.ndarray, numbers: np.ndarray, kind: str) -> tuple[Strays,
 
     They are isolated samples that no motion reaches, or samples larger than any measurement.
     """
-    absurd, (alone, far) = is_absurd(numbers), _unreached(seconds, numbers, kind)
+    absurd, (alone, far) = is_impossible(numbers), _unreached(seconds, numbers, kind)
     off = f"impossible as motion: more than {far:g} times the range of the other values away"
     kinds = ((absurd, "larger than any measurement"), (alone & ~absurd, off))
     return tuple(Strays(seconds[at], numbers[at], words) for at, words in kinds if at.any())

@@ -238,7 +238,7 @@ def flight_of_signals(
     logged = as_logged(request, {key: s.timed for key, s in signals.items()})
     values = {key: timed.values for key, timed in logged.signals.items()}
     # Before any resampling, which makes an input move at more samples than the log shows.
-    holds = decided_holds(request, values)
+    holds = holds_of_inputs(request, values)
     outputs = request.of_kind("output", values)
     stated = {name: request.signals[name, "output"].repeats for name in outputs}
     once, repeated = repeats_removed(outputs, stated)
@@ -290,7 +290,7 @@ def flight_of_signals(
     )
 
 
-def decided_holds(request: Request, values: Mapping[Key, np.ndarray]) -> dict[str, Decision]:
+def holds_of_inputs(request: Request, values: Mapping[Key, np.ndarray]) -> dict[str, Decision]:
     """Decide the hold of each input: as stated, or by its own samples (N,)."""
     return {
         # A stated hold has no reason.
@@ -320,7 +320,7 @@ def clocks_of(signals: Iterable[ClockedSignal]) -> list[TopicClock]:
     return list({s.clock.name: s.clock for s in signals}.values())
 
 
-def on_all_the_time(signals: Mapping[Key, ClockedSignal], rate: float) -> list[TopicClock]:
+def fast_clocks(signals: Mapping[Key, ClockedSignal], rate: float) -> list[TopicClock]:
     """Return the clocks of inputs and of outputs not slower than `rate` [Hz].
 
     The flight needs their samples throughout; slower outputs are missing most of the time anyway.
@@ -336,7 +336,7 @@ def _times(
     path: str, signals: Mapping[Key, ClockedSignal], rate: float
 ) -> tuple[np.ndarray, list[Finding]]:
     """Return the times (M,) [s] of a grid of a rate [Hz], and notes on the resampling."""
-    clocks, notes = on_all_the_time(signals, rate), []
+    clocks, notes = fast_clocks(signals, rate), []
     for clock in clocks:
         found = rate_notes(clock.seconds, rate)
         notes += [n.of(clock.name) if clock.topic.rows is None else n for n in found]

@@ -22,9 +22,9 @@ from heli_jax.flights.marks import without_marks
 from heli_jax.flights.onto_grid import (
     ClockedSignal,
     clocks_of,
-    decided_holds,
+    fast_clocks,
     flight_of_signals,
-    on_all_the_time,
+    holds_of_inputs,
     rows_in_window,
     signals_of,
     window_note,
@@ -111,14 +111,14 @@ def read_parts(
         for key, s in _clocked(logs, request).items()
     }
     rate = options.rate
-    needed = clocks_of(signals.values()) if rate is None else on_all_the_time(signals, rate)
+    needed = clocks_of(signals.values()) if rate is None else fast_clocks(signals, rate)
     clocks = [clock.seconds for clock in needed]
     intervals = stretches(clocks)
     if len(intervals) < 2:
         return (_flight(logs, request),)
     # Decided from the whole run, because a part has few moves and the same stick may look
     # different.
-    holds = decided_holds(request, {key: signal.values for key, signal in signals.items()})
+    holds = holds_of_inputs(request, {key: signal.values for key, signal in signals.items()})
     inputs_of = [s for (_, kind), s in signals.items() if kind == "input"]
     moving = [i for i in intervals if any(_moves(u, *i) for u in inputs_of)]
     parts, left_out, why = [], [], None
@@ -213,7 +213,7 @@ class _Opened(NamedTuple):
     log: ChannelLog
     keys: frozenset[Key]
     """Signals in the first log."""
-    beside: tuple[_Beside, ...]
+    further: tuple[_Beside, ...]
     request: Request
     """Request for the signals of all logs."""
     inputs: Mapping[str, Signal]
@@ -234,24 +234,24 @@ def _opened(
     request = Request(path.path if is_open else str(path), time, logged, outputs, options)
     log = _open(request, path if is_open else None)
     request = with_file_units(log, request)
-    keys, everything, beside = frozenset(request.signals), copy.copy(request), []
+    keys, everything, further = frozenset(request.signals), copy.copy(request), []
     for also in options.also:
         signals = {(n, "input"): s for n, s in also.inputs.items()}
         signals |= {(n, "output"): s for n, s in also.outputs.items()}
         twice = next((key for key in signals if key in everything.signals), None)
         if twice is not None:
             raise wrong(also.path, f"{twice[1]} {twice[0]!r} comes from two logs, expected one")
-        one, asked = _beside(log, request, also)
-        everything.signals = {**everything.signals, **asked.signals}
-        beside.append(one)
+        one, requested = _beside(log, request, also)
+        everything.signals = {**everything.signals, **requested.signals}
+        further.append(one)
         inputs = {**inputs, **also.inputs}
-    return _Opened(log, keys, tuple(beside), everything, inputs)
+    return _Opened(log, keys, tuple(further), everything, inputs)
 
 
 def _clocked(logs: _Opened, request: Request) -> dict[Key, ClockedSignal]:
     """Return the signals inside the window on their clocks [s], from the first log's beginning."""
     signals = signals_of(logs.log, _only(request, logs.keys))
-    for one in logs.beside:
+    for one in logs.further:
         signals |= {key: _within(s, request) for key, s in one.signals.items()}
     return signals
 
@@ -260,7 +260,7 @@ def _flight(logs: _Opened, request: Request) -> Flight:
     """Return the flight inside the window, with its constant inputs."""
     log = logs.log
     try:
-        notes = (*log.notes, *_beyond(logs, request), *(one.note for one in logs.beside))
+        notes = (*log.notes, *_beyond(logs, request), *(one.note for one in logs.further))
         flight = flight_of_signals(
             _clocked(logs, request),
             request,
@@ -268,10 +268,10 @@ def _flight(logs: _Opened, request: Request) -> Flight:
         )
     except InputError as e:
         # A wrong unit of the clock causes errors of other kinds.
-        said = [n for n in log.notes if n.code == "units.contradicted"]
-        if not said:
+        notices = [n for n in log.notes if n.code == "units.contradicted"]
+        if not notices:
             raise
-        raise InputError("; ".join([str(e), *sentences(said)])) from e
+        raise InputError("; ".join([str(e), *sentences(notices)])) from e
     assert flight.source is not None
     values, reasons = dict(flight.inputs), dict(flight.hold_reason)
     for name, signal in logs.inputs.items():
@@ -322,20 +322,22 @@ def _only(request: Request, keys: frozenset[Key], whole: bool = False) -> Reques
 def _beside(log: ChannelLog, request: Request, also: Also) -> tuple[_Beside, Request]:
     """Return the signals of a further log on the first log's clock, and the request with units."""
     options = ReadOptions(number=also.number)
-    asked = Request(also.path, also.time, also.inputs, also.outputs, options)
+    requested = Request(also.path, also.time, also.inputs, also.outputs, options)
     # An open log is not opened again, because it may be large.
-    file = also.log or open_log(asked.path, asked.options.number)
-    other = _open(asked, file)
-    asked = with_file_units(other, asked)
-    signals = signals_of(other, asked)
+    file = also.log or open_log(requested.path, requested.options.number)
+    other = _open(requested, file)
+    requested = with_file_units(other, requested)
+    signals = signals_of(other, requested)
     name = Path(also.path).name
     stated = f"{name} (sha256 {file.sha256[:12]})"
     if also.same:
-        lag, said = _aligned(log, request, also, file, stated)
+        lag, notices = _aligned(log, request, also, file, stated)
     else:
         lag = float(other.begin - log.begin)
         ours = signals_of(log, _only(request, frozenset(request.signals), whole=True))
-        said = _as_one(request, also, _span(ours, log.begin), _span(signals, other.begin), stated)
+        notices = _as_one(
+            request, also, _span(ours, log.begin), _span(signals, other.begin), stated
+        )
     shifted = {}
     for key, signal in signals.items():
         # Two files may have topics of the same name.
@@ -343,7 +345,7 @@ def _beside(log: ChannelLog, request: Request, also: Also) -> tuple[_Beside, Req
         called = clock.name if clock.name == name else f"{name}, {clock.name}"
         clock = dataclasses.replace(clock, name=called, seconds=clock.seconds + lag)
         shifted[key] = dataclasses.replace(signal, clock=clock)
-    return _Beside(shifted, said), asked
+    return _Beside(shifted, notices), requested
 
 
 def _aligned(

@@ -68,9 +68,9 @@ def load_table(table: Table, request: Request) -> ChannelLog:
         except ValueError as e:
             raise wrong(table.path, str(e), column(signal.name)) from e
     numbers = columns_of(table, list(dict.fromkeys(names)))
-    said: tuple[Finding, ...] = ()
+    notices: tuple[Finding, ...] = ()
     if request.options.split:
-        numbers, said = with_runs(table, time.name, numbers, clock_scale(table, time), runs)
+        numbers, notices = with_runs(table, time.name, numbers, clock_scale(table, time), runs)
     log = with_derived(_with_clock(table, numbers, time), request.options.swashplate)
     stamps = numbers[time.name]
     # Stamps that are no clock are refused with their line.
@@ -78,8 +78,8 @@ def load_table(table: Table, request: Request) -> ChannelLog:
         columns = {s.name: log.channel(s.name).values for s in request.signals.values()}
         inputs = {s.name for (_, kind), s in request.signals.items() if kind == "input"}
         if is_joined(stamps * clock_scale(table, time), columns, inputs):
-            return without_joins(replace(log, notes=(*log.notes, *said)), joined=True)
-    return replace(log, notes=(*log.notes, *said, *_checked(table, time, stamps)))
+            return without_joins(replace(log, notes=(*log.notes, *notices)), joined=True)
+    return replace(log, notes=(*log.notes, *notices, *_checked(table, time, stamps)))
 
 
 @np.errstate(over="ignore", invalid="ignore")  # stamps that are no clock are refused later
@@ -104,7 +104,7 @@ def _checked(table: Table, time: Signal, stamps: np.ndarray) -> tuple[Finding, .
     scale = clock_scale(table, time)
     # A type is unmistakable; words may mean something else.
     is_sure = time.scale != 1.0 or (stated and not table.units.get(time.name))
-    said = () if is_sure else unit_notes(time, stated)
+    notices = () if is_sure else unit_notes(time, stated)
     with np.errstate(over="ignore"):
         bad = np.flatnonzero(~(np.abs(stamps * scale) <= LATEST))  # NaN is bad too
     if bad.size:
@@ -115,7 +115,7 @@ def _checked(table: Table, time: Signal, stamps: np.ndarray) -> tuple[Finding, .
     require_increasing(table, time.name, stamps)
     if not stated and time.scale == 1.0:
         require_likely(table.path, time, stamps)
-    return said
+    return notices
 
 
 # Without a request: the clock is guessed, and all columns are taken.
@@ -163,8 +163,8 @@ def guessed_log(table: Table, time: str | None, unit: str | None, rate: float | 
     numbers = columns_of(table, list(dict.fromkeys([*names, clock.column])))
     if clock.runs > 1:
         scale = clock_scale(table, clock.signal)
-        numbers, said = with_runs(table, clock.column, numbers, scale)
-        notes += said
+        numbers, notices = with_runs(table, clock.column, numbers, scale)
+        notes += notices
     log = _with_clock(table, numbers, clock.signal, "the table")
     return replace(log, notes=(*notes, *log.notes))
 
@@ -190,7 +190,7 @@ def row_groups(columns: Mapping[str, np.ndarray]) -> list[RowGroup]:
     return list(groups.values())
 
 
-def takes_turns(groups: Sequence[RowGroup]) -> bool:
+def rows_alternate(groups: Sequence[RowGroup]) -> bool:
     """True if two of the groups hardly share a row."""
     counts = [int(np.count_nonzero(g.rows)) for g in groups]
     some = [(g.rows, n) for g, n in zip(groups, counts, strict=True) if n >= _FEWEST]
@@ -226,7 +226,7 @@ def is_joined(
         return True
     step = usual_step(seconds)
     slower = any(usual_step(seconds[~np.isnan(columns[n])]) > SLOWER * step for n in lacking)
-    return slower or takes_turns(groups)
+    return slower or rows_alternate(groups)
 
 
 def without_joins(log: ChannelLog, joined: bool = False) -> ChannelLog:
@@ -240,7 +240,7 @@ def without_joins(log: ChannelLog, joined: bool = False) -> ChannelLog:
     for topic in log.topics:
         columns = {name: as_floats(values) for name, values in topic.columns.items()}
         groups = row_groups(columns)
-        if not joined and not takes_turns(groups):
+        if not joined and not rows_alternate(groups):
             topics.append(topic)
             continue
         parts = []

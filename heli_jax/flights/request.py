@@ -228,7 +228,7 @@ def other_units(request: Request) -> list[Finding]:
     ]
 
 
-def taken_note(name: str, signal: Signal) -> Finding | None:
+def unit_note(name: str, signal: Signal) -> Finding | None:
     """Return a note on a signal that is read in the file's unit; None for others."""
     if not signal.assumed or signal.unit == signal.si:
         return None

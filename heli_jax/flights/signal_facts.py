@@ -124,7 +124,7 @@ class SignalFacts:
             for one in self.stretches
             if one.begin < end and one.end > begin
         ]
-        stretches = _that_count(inside, end - begin)
+        stretches = _significant_parts(inside, end - begin)
         drops = None if self.dropouts is None else cut(self.dropouts)
         size = min(self.size, round((end - begin) / self.usual) + 1) if self.usual > 0 else 0
         strays = (s.within(begin, end) for s in self.strays)
@@ -177,7 +177,7 @@ def facts_of_all[K: Hashable](
                 for one in _stretches(*signals[key], facts[key])
                 if any(_goes_on(*other, one.begin, one.end) for other in others)
             ]
-            counted = _that_count(found, facts[key].size * facts[key].usual)
+            counted = _significant_parts(found, facts[key].size * facts[key].usual)
             drops = _dropouts(*signals[key])
             facts[key] = replace(facts[key], stretches=counted, dropouts=drops)
     return facts
@@ -223,7 +223,7 @@ def _goes_on(seconds: np.ndarray, x: np.ndarray, begin: float, end: float) -> bo
     return float(np.median(np.abs(np.diff(inside)))) >= _TRIFLE * float(np.median(moves[moves > 0]))
 
 
-def _that_count(stuck: Sequence[Stuck], duration: float) -> tuple[Stuck, ...]:
+def _significant_parts(stuck: Sequence[Stuck], duration: float) -> tuple[Stuck, ...]:
     """Return the long stuck parts, longest first; all, if short ones fill a share of a record."""
     total = sum(one.end - one.begin for one in stuck)
     often = len(stuck) >= _OFTEN and total >= max(STUCK_SECONDS, DROP_SHARE * duration)

@@ -38,10 +38,10 @@ def translating() -> Iterator[None]:
     except UnsupportedError:
         raise
     except Exception as e:
-        raise UnsupportedError(f"this model, whose translation failed ({said(e)})") from e
+        raise UnsupportedError(f"this model, whose translation failed ({in_one_line(e)})") from e
 
 
-def said(error: Exception) -> str:
+def in_one_line(error: Exception) -> str:
     """Return an error in one line."""
     words = " ".join(str(error).split())
     return f"{type(error).__name__}: {words[:200]}"
@@ -249,7 +249,7 @@ class Code:
         target = self.typed(dtype, value.shared)
         return self.made(f"{name} {source} {value.operand} to {target}", dtype, value.shared)
 
-    def remember_whole(self, value: Value, integer: Value) -> None:
+    def store_integer(self, value: Value, integer: Value) -> None:
         """Store the integer from which a floating-point number was converted."""
         self._whole[value.operand] = integer
 

@@ -214,7 +214,7 @@ def converted(code: Code, a: Value, *, new_dtype: Any, **_: Any) -> Value:
         made = code.cast("sitofp" if source == "i" else "uitofp", a, target)
         if source == "i" and a.shared:
             # The simulation uses the sample number as a time and rounds it back to an index.
-            code.remember_whole(made, a)
+            code.store_integer(made, a)
         return made
     if source == "b":
         return code.cast("zext", a, target)

@@ -32,7 +32,7 @@ from heli_jax.fused.code import (
     constant,
     dtype_of,
     elements,
-    said,
+    in_one_line,
 )
 from heli_jax.fused.operations import OPERATIONS
 
@@ -79,7 +79,7 @@ def translate(code: Code, jaxpr: Any, consts: Sequence[Any], operands: Sequence[
             raise
         except Exception as e:
             # Report any error with the line of the model.
-            error = UnsupportedError(f"the operation {_named(equation)[0]} here ({said(e)})")
+            error = UnsupportedError(f"the operation {_named(equation)[0]} here ({in_one_line(e)})")
             error.place = place_of(equation)
             raise error from e
         known |= dict(zip(equation.outvars, outputs, strict=True))

@@ -45,12 +45,12 @@ def matrices_of(mapping: Mapping[str, Any], content: Content) -> dict[str, tuple
     values = {n: q.constant.value for n, q in content.parameters.items()}
     # The file's own values are checked here. Otherwise the model would fail at its first use, far
     # from the wrong line.
-    if problem := not_possible(content, matrices, values):
+    if problem := impossible_parameters(content, matrices, values):
         raise InputError(problem)
     return matrices
 
 
-def not_possible(
+def impossible_parameters(
     content: Content, matrices: Mapping[str, tuple[Entry, ...]], values: Mapping[str, float]
 ) -> str:
     """Return a sentence on parameters that are impossible; empty if all are possible.
@@ -223,29 +223,29 @@ class _Matrices:
             InputError: it is no number or expression, or has the wrong dimension.
         """
         node = self.tree(place, source)
-        said = f"{place}: {source!r:.80}"
+        text = f"{place}: {source!r:.80}"
         over = self.columns[column] if per is None else per
         expected = _over(of, over)
         # Only parameters have units to check. Plain numbers, also 2*9.81, are in the file's units.
         if not expression.parameters_of(node):
             if not of.bare:
                 raise InputError(
-                    f"{said}: a number in a row whose E.{row}.{row} has a unit, expected a "
+                    f"{text}: a number in a row whose E.{row}.{row} has a unit, expected a "
                     f"parameter in {_unit_text(expected.dimension)}"
                 )
-            return Entry(row, column, node, expected.scale, said)
+            return Entry(row, column, node, expected.scale, text)
         try:
             # Parameters are in SI, so the entry needs no factor if its dimension is right.
             dimension = expression.dimension(node, self.dimensions, PLAIN)
         except ExpressionError as e:
-            raise InputError(f"{said}: {e}") from e
+            raise InputError(f"{text}: {e}") from e
         if dimension != expected.dimension:
             raise InputError(
-                f"{said}: expected {_unit_text(expected.dimension)} ({_unit_text(of.dimension)} of "
+                f"{text}: expected {_unit_text(expected.dimension)} ({_unit_text(of.dimension)} of "
                 f"the row over {_unit_text(over.dimension)} of the column), got "
                 f"{_unit_text(dimension)}"
             )
-        return Entry(row, column, node, 1.0, said)
+        return Entry(row, column, node, 1.0, text)
 
     def check_rows(self, states: Mapping[str, Any], outputs: Mapping[str, Signal]) -> None:
         """Refuse states without a derivative, and outputs without an equation or a state of their

@@ -13,7 +13,7 @@ from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
 from heli_jax.linear_models.content import Content, Signal, content_of
 from heli_jax.linear_models.expression import evaluate
-from heli_jax.linear_models.matrices import Entry, matrices_of, not_possible
+from heli_jax.linear_models.matrices import Entry, impossible_parameters, matrices_of
 from heli_jax.naming import Scalar
 from heli_jax.pickled import by_value
 from heli_jax.regular_file import read_regular
@@ -54,7 +54,7 @@ class LinearModel(NamedTuple):
         constants = {**own, **replaced}
         values = {n: c.value for n, c in constants.items()}
         # Checked together, since all values determine whether E is invertible.
-        if problem := not_possible(self.content, self.matrices, values):
+        if problem := impossible_parameters(self.content, self.matrices, values):
             raise InputError(f"{where}: {problem}")
         # Read again with all values, so that Params are made in one place with the record's units.
         entries = {n: {"value": c.value, "unit": c.unit} for n, c in constants.items()}

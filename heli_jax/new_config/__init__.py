@@ -17,7 +17,7 @@ from heli_jax.new_config.rate import channels_of_preset, common_rate, rate_of_ou
 from heli_jax.new_config.signals import (
     names_of_input,
     names_of_output,
-    only_turn,
+    rate_by_angle,
     signals_of,
 )
 from heli_jax.new_config.text import filter_settings, filtered_outputs
@@ -71,7 +71,7 @@ def write_config(
         signals = signals._replace(known={})
     others = () if model is not None else other_models(chosen.name)
     free = _free(chosen, constants, paths)
-    from_preset = tuple(only_turn(chosen.model).values())
+    from_preset = tuple(rate_by_angle(chosen.model).values())
     outputs = _outputs(preset, chosen.model, from_preset, read, signals)
     filtered = filtered_outputs(preset, chosen.model, read, from_preset) if preset else {}
     if signals is not None:
@@ -135,7 +135,7 @@ def write_config(
 def _outputs(
     preset: str | None,
     model: Any,
-    asked: Sequence[str],
+    requested: Sequence[str],
     log: Log,
     signals: text.Signals | None,
 ) -> Sequence[str]:
@@ -145,7 +145,7 @@ def _outputs(
         return [g.channel for g in taken.values() if g is not None]
     assert preset is not None
     known = tuple(log.series)
-    found = channels_of_preset(preset, known, asked or naming.names(model.Outputs))
+    found = channels_of_preset(preset, known, requested or naming.names(model.Outputs))
     return found or channels_of_preset(preset, known, naming.names(model.Inputs))
 
 
@@ -174,8 +174,8 @@ def _near(vehicle: Path, out: Path) -> str:
     # Relative too if the vehicle's folder is beside that of the configurations, so that both can
     # move together.
     folder, path = out.absolute().parent.resolve(), vehicle.absolute().resolve()
-    beside = folder.parent != Path(folder.anchor) and path.is_relative_to(folder.parent)
-    together = beside or path.is_relative_to(folder)
+    close = folder.parent != Path(folder.anchor) and path.is_relative_to(folder.parent)
+    together = close or path.is_relative_to(folder)
     return path.relative_to(folder, walk_up=True).as_posix() if together else str(path)
 
 

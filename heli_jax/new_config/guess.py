@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax import units
-from heli_jax.flights.channel_names import no_stick
+from heli_jax.flights.channel_names import quantity_of_output
 from heli_jax.new_config.name_units import FILLERS, without_unit
 
 _UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue"})
@@ -197,7 +197,7 @@ def may_be(name: str, series: Series, called: Sequence[str], si: str) -> bool:
 
 def may_move(name: str, series: Series, si: str) -> bool:
     """True if a channel's name and unit allow an input of the model."""
-    return not no_stick(name, series.unit or without_unit(name)[1], si)
+    return not quantity_of_output(name, series.unit or without_unit(name)[1], si)
 
 
 def by_motion(output: Series, channels: Mapping[str, Series]) -> tuple[str, float] | None:

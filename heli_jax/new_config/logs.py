@@ -125,8 +125,8 @@ def _read_table(table: Table, rate: float | None) -> Log:
     names = [n for n in names if n not in others]
     values = columns_of(table, list(dict.fromkeys([clock, *names])))
     if time.runs > 1:
-        values, said = with_runs(table, clock, values, clock_scale(table, time.signal))
-        notes += said
+        values, notices = with_runs(table, clock, values, clock_scale(table, time.signal))
+        notes += notices
     times = _from_first(values[clock], time.duration)
     series = {
         n: Series(times, without_marks(values[n]), table.units.get(n, ""))

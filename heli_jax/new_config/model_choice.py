@@ -12,7 +12,7 @@ from heli_jax.flights.preset import fitting_presets
 from heli_jax.linear_models import read as linear_models
 from heli_jax.new_config import guess, tables
 from heli_jax.new_config.logs import Log
-from heli_jax.new_config.signals import is_place, outputs_called, that_move
+from heli_jax.new_config.signals import is_place, moving_channels, outputs_by_name
 
 _AXES = {
     "roll": ("roll-flybarless", ("roll_rate", "roll")),
@@ -59,7 +59,7 @@ def chosen_model(
             problem = f"the log is of {vehicle}, and new chooses only helicopter models"
             remedy = "expected --model NAME, such as linear:FILE.yaml, a model file of your own"
             raise wrong(path, f"{problem}; {remedy}")
-        name = _by_what_moves(log, path)
+        name = _by_moving_stick(log, path)
     # For roll and pitch there are the paper's model and a linear one: {linear: roll} is the latter.
     stated = name.strip().removeprefix("{").removesuffix("}")
     linear = stated.startswith("linear:")
@@ -118,7 +118,7 @@ def _of_ardupilot(has: Mapping[str, str | int | float], firmware: str) -> str:
     return ""
 
 
-def _by_what_moves(log: Log, path: str) -> str:
+def _by_moving_stick(log: Log, path: str) -> str:
     """Return the linear model of the axis whose stick moves most and whose motion is logged."""
     called = tables.names()
     names = tuple(n for n in log.series if not is_place(n, log.series))
@@ -126,11 +126,11 @@ def _by_what_moves(log: Log, path: str) -> str:
     for stick, (model, measured) in _AXES.items():
         by_name = guess.by_name(called["inputs"][stick], names, called["commands"][stick])
         by_name = by_name or guess.by_number(called["numbered"][stick], names)
-        sticks = that_move(log, [n for n in by_name if not guess.is_excitation(n)])
+        sticks = moving_channels(log, [n for n in by_name if not guess.is_excitation(n)])
         outputs = [
-            n for m in measured for n in outputs_called(log, called["outputs"][m], _UNITS[m])
+            n for m in measured for n in outputs_by_name(log, called["outputs"][m], _UNITS[m])
         ]
-        if sticks and that_move(log, outputs):
+        if sticks and moving_channels(log, outputs):
             moving[model] = log.series[sticks[0]].values
     if fitting_presets(log.format, names):
         return "roll-flybarless"

@@ -7,7 +7,7 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.dynamics.model import axes_of
-from heli_jax.flights.channel_names import names_a_stick, words_in
+from heli_jax.flights.channel_names import is_stick_name, words_in
 from heli_jax.flights.preset import model_inputs, model_outputs
 from heli_jax.new_config import guess, scales, tables, text
 from heli_jax.new_config.guess import Guess, Series
@@ -36,13 +36,13 @@ def signals_of(model: Any, log: Log) -> text.Signals:
         allowed = [n for n in sticks if guess.may_move(n, log.series[n], unit)]
         found = guess.by_name(known, allowed, commands)
         inputs[name] = _found(log, found, unit, taken, is_input=True)
-        for channel in that_move(log, guess.excitations(known, tuple(log.series)))[:1]:
+        for channel in moving_channels(log, guess.excitations(known, tuple(log.series)))[:1]:
             excitations[name] = channel
     taken += excitations.values()
     outputs: dict[str, Guess] = {}
     for name in naming.names(model.Outputs):
         unit = naming.unit(model.Outputs, name) or "1"
-        output = _found(log, outputs_called(log, names_of_output(name), unit), unit, taken)
+        output = _found(log, outputs_by_name(log, names_of_output(name), unit), unit, taken)
         if output is not None:
             outputs[name] = output
     # With several inputs, correlation with an output is the better criterion and comes before
@@ -65,7 +65,7 @@ def signals_of(model: Any, log: Log) -> text.Signals:
     return text.Signals(inputs, outputs, known, rest, excitations, wandering, smooth, ranges)
 
 
-def only_turn(model: Any) -> dict[str, str]:
+def rate_by_angle(model: Any) -> dict[str, str]:
     """Return the rate by angle, for a model whose only outputs are one axis's rate and angle.
 
     The angle then adds no information to the rate.
@@ -79,7 +79,7 @@ def _wandering(model: Any, log: Log, outputs: Mapping[str, Guess]) -> dict[str, 
     """Return angles with a drift error, as from a rate integrated by an autopilot."""
     return {
         angle: outputs[angle]
-        for angle, rate in only_turn(model).items()
+        for angle, rate in rate_by_angle(model).items()
         if {angle, rate} <= set(outputs) and wanders(log.series[outputs[angle].channel].values)
     }
 
@@ -110,7 +110,7 @@ def words_of(name: str) -> str:
     return " ".join(guess.words_of(name))
 
 
-def outputs_called(log: Log, called: Sequence[str], si: str) -> list[str]:
+def outputs_by_name(log: Log, called: Sequence[str], si: str) -> list[str]:
     """Return channels that may be an output, the likeliest first."""
     # Spelled out among all names, because neighbouring names may decide the meaning.
     spelled = guess.spelled_out(tuple(log.series))
@@ -122,7 +122,7 @@ def outputs_called(log: Log, called: Sequence[str], si: str) -> list[str]:
     return [names[n] for n in guess.by_name(called, list(names))]
 
 
-def that_move(log: Log, names: Sequence[str]) -> list[str]:
+def moving_channels(log: Log, names: Sequence[str]) -> list[str]:
     """Return the channels that move."""
     return [n for n in names if np.nanstd(log.series[n].values) > 0]
 
@@ -132,7 +132,7 @@ def _found(
 ) -> Guess | None:
     candidates = [n for n in names if n not in taken]
     # A constant channel is a trim or not connected, but better than none.
-    candidates = that_move(log, candidates) or candidates
+    candidates = moving_channels(log, candidates) or candidates
     if not candidates:
         return None
     chosen = guess.of_known_unit(candidates, log.series, si)
@@ -146,7 +146,7 @@ def _found(
 
 
 def _full_travel(log: Log) -> float | None:
-    return guess.full_travel({n: s for n, s in log.series.items() if names_a_stick(n)})
+    return guess.full_travel({n: s for n, s in log.series.items() if is_stick_name(n)})
 
 
 def _by_number(
@@ -179,7 +179,7 @@ def _by_correlation(
     # the stick does.
     motions = {c for names in tables.names()["outputs"].values() for c in names} - _STICKS_TOO
     moving = guess.by_name(sorted(motions), tuple(log.series))
-    measured = {n for n in moving if not names_a_stick(n)}
+    measured = {n for n in moving if not is_stick_name(n)}
     for name, input in inputs.items():
         if input is not None or not known:
             continue
@@ -218,8 +218,8 @@ def is_place(name: str, log: Mapping[str, Series]) -> bool:
     words = words_in(name)
     if not words or words[-1] not in _CALLED:
         return False
-    beside = {other for other in log if other.rpartition(".")[0] == name.rpartition(".")[0]}
-    if any(words_in(other)[-1:] in (("lng",), ("longitude",)) for other in beside):
+    siblings = {other for other in log if other.rpartition(".")[0] == name.rpartition(".")[0]}
+    if any(words_in(other)[-1:] in (("lng",), ("longitude",)) for other in siblings):
         return True
     values = log[name].values[np.isfinite(log[name].values)]
     if not values.size:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from heli_jax import naming
 from heli_jax.config.firmware_filters import logged_filters
-from heli_jax.dynamics.model import axes_of, needed_but_missing, reads
+from heli_jax.dynamics.model import axes_of, missing_parameters, reads
 from heli_jax.flights.clock import ROWS
 from heli_jax.flights.describe import TimeInfo
 from heli_jax.flights.preset import Alternative, choose, model_outputs, preset
@@ -54,17 +54,17 @@ def filter_settings(log: Log, channel: str) -> str:
 
 
 def filtered_outputs(
-    name: str, model: Any, log: Log, asked: Collection[str]
+    name: str, model: Any, log: Log, requested: Collection[str]
 ) -> dict[str, Filtered]:
     """Return the filtered outputs among those that a preset supplies.
 
     Args:
         name: name of the preset.
-        asked: outputs to take from the preset; all if empty.
+        requested: outputs to take from the preset; all if empty.
     """
     table, known = preset(name).signals, model_outputs()
     result: dict[str, Filtered] = {}
-    for output in asked or naming.names(model.Outputs):
+    for output in requested or naming.names(model.Outputs):
         signals = table.get(known.get(output, ""), ())
         chosen = choose(log.autopilot, signals) if log.autopilot is not None else None
         if chosen is not None and (settings := filter_settings(log, chosen.channel)):
@@ -185,7 +185,7 @@ def vehicle(model: Any, means: Mapping[str, tuple[str, float]]) -> str:
     defaults, known = naming.defaults(model.Params), naming.names(model.Params)
     # Any number replaces required ones: it only shows which constants the model reads.
     params = model.Params(**{n: defaults.get(n, 1.0) for n in known})
-    needed = {*(n for n in known if n not in defaults), *needed_but_missing(model, params)}
+    needed = {*(n for n in known if n not in defaults), *missing_parameters(model, params)}
     for name in known:
         unset = not math.isfinite(float(getattr(params, name)))
         if name not in needed and (unset or not reads(model, params, name)):

@@ -50,9 +50,9 @@ def hoisted(
         known |= dict(zip(equation.outvars, computed, strict=True))
     # Matrices that start as zeros are made now. The remaining part makes them again, since it can
     # then see that they are zeros.
-    asked = {v for e in later for v in e.invars if not isinstance(v, Literal)}
-    asked |= {v for v in jaxpr.outvars if not isinstance(v, Literal)}
-    again = [e for e in repeated if e.outvars[0] in asked]
+    used = {v for e in later for v in e.invars if not isinstance(v, Literal)}
+    used |= {v for v in jaxpr.outvars if not isinstance(v, Literal)}
+    again = [e for e in repeated if e.outvars[0] in used]
     known = {v: n for v, n in known.items() if all(v is not e.outvars[0] for e in again)}
     later = again + later
     # Only values that later equations or the result need are passed on. A dictionary keeps a fixed

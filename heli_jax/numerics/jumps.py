@@ -50,8 +50,8 @@ def jumps(u: Any, xp: Any = np) -> Any:
     """
     size, weight = _sizes(u, xp)[0], weights(u, xp)
     none = xp.zeros(1, size.dtype)
-    beside = xp.maximum(xp.concatenate([none, size[:-1]]), xp.concatenate([size[1:], none]))
-    alone = (weight > 0) & (beside <= _QUIET * size)
+    neighbours = xp.maximum(xp.concatenate([none, size[:-1]]), xp.concatenate([size[1:], none]))
+    alone = (weight > 0) & (neighbours <= _QUIET * size)
     nearby = xp.ones(2 * _BESIDE + 1, weight.dtype)
 
     def around(w: Any) -> Any:

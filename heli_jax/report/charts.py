@@ -96,8 +96,8 @@ def samples(label: str, x: np.ndarray, y: np.ndarray, color: str, width: float) 
     It is a line, or dots if few samples have neighbours.
     """
     seen = ~np.isnan(y)
-    beside = np.convolve(seen, [1, 0, 1], "same")[seen] > 0
-    if seen.any() and beside.mean() < 0.5:
+    neighbours = np.convolve(seen, [1, 0, 1], "same")[seen] > 0
+    if seen.any() and neighbours.mean() < 0.5:
         return Series(label, x[seen], y[seen], color, "points", width=2.2)
     return Series(label, x, y, color, width=width)
 

@@ -88,7 +88,7 @@ class FittedResponses(NamedTuple):
 
 
 def fitted_responses(
-    fit: Fit, problem: Problem, settings: Settings, asked: Sequence[HandlingPair]
+    fit: Fit, problem: Problem, settings: Settings, requested: Sequence[HandlingPair]
 ) -> FittedResponses:
     """Return the responses of a fit and of its flights, and handling qualities of both."""
     try:
@@ -110,7 +110,7 @@ def fitted_responses(
     pairs = _pairs(responses, curves, means)
     handling = tuple(
         Handling(p, _of_model(curves, p), measured_handling(responses, p))
-        for p in asked
+        for p in requested
         if p.input in responses.holds and p.output in responses.outputs
     )
     left_out = max(len(pairs) - MOST_PAIRS, 0)

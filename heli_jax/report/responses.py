@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from heli_jax.analysis.attitude_responses import Handling
-from heli_jax.analysis.flight_responses import FlightResponses, Pair, Wanted, forgets
+from heli_jax.analysis.flight_responses import FlightResponses, Pair, Wanted, decays_within
 from heli_jax.analysis.spectra import COHERENT
 from heli_jax.analysis.transfer_fit import Coefficient, TransferFit
 from heli_jax.finding import as_data
@@ -184,7 +184,7 @@ def _content(request: Wanted, fit: TransferFit | str, window: float) -> dict[str
         "status": status,
         "converged": status == "converged",
         "determined": bool(found and found.determined),
-        "windows_taken_off": bool(found and forgets(found, window)),
+        "windows_taken_off": bool(found and decays_within(found, window)),
         "sentences": fit_sentences(fit, window),
     }
 
@@ -208,18 +208,18 @@ def fit_sentences(fit: TransferFit | str, window: float) -> list[str]:
         return ["the response does not determine it: use fewer poles, or more excitation"]
     if not fit.converged:
         return ["the optimiser did not converge: these numbers are not a result"]
-    said = []
+    remarks = []
     if fit.chi_squared > _TOO_LARGE:
-        said.append(
+        remarks.append(
             f"squared errors are {number(fit.chi_squared, 2)} times their expected value: the "
             f"order is too low, the vehicle is not linear, or a window of {window:.3g} s is too "
             "short"
         )
-    if not forgets(fit, window):
+    if not decays_within(fit, window):
         last = max(fit.poles, key=lambda p: p.real)
         # A window resolves a period only if it contains two of them.
         slow = abs(last) * window < 4.0 * np.pi
-        said.append(
+        remarks.append(
             f"a pole of {number(last.real, 2)} 1/s does not decay within a window of {window:.3g} "
             "s; the windows cut off part of its response, so that intervals may be too narrow"
             + ("; it cannot be distinguished from an integrator or a slower pole" if slow else "")
@@ -227,27 +227,27 @@ def fit_sentences(fit: TransferFit | str, window: float) -> list[str]:
         )
     known = all(c.determined for c in fit.denominator)
     if known and (growing := [p.real for p in fit.poles if p.real > 0.0]):
-        said.append(
+        remarks.append(
             f"it is unstable (a pole with the real part +{number(max(growing), 3)} rad/s); if the "
             "vehicle is stable, a late stick, feedback or a wrong order can cause this"
         )
-    if known and all(c.determined for c in fit.numerator) and (beside := _cancelled(fit)):
-        said.append(
-            f"zeros lie within a tenth of {_root_words(beside)} and nearly cancel them: these "
+    if known and all(c.determined for c in fit.numerator) and (cancelled := _cancelled(fit)):
+        remarks.append(
+            f"zeros lie within a tenth of {_root_words(cancelled)} and nearly cancel them: these "
             "poles may not be modes of the vehicle; try a lower order and compare chi²"
         )
-    return said
+    return remarks
 
 
 def _cancelled(fit: TransferFit) -> list[complex]:
     """Return the poles that a zero nearly cancels."""
-    zeros, beside = list(fit.zeros), []
+    zeros, cancelled = list(fit.zeros), []
     for pole in fit.poles:
         distances = [abs(pole - zero) for zero in zeros]
         if distances and min(distances) < _NEAR_ZERO * abs(pole):
             zeros.pop(int(np.argmin(distances)))
-            beside.append(complex(pole))
-    return beside
+            cancelled.append(complex(pole))
+    return cancelled
 
 
 FIT_HEAD = ("numerator", "denominator", "poles [rad/s]", "delay [ms]", "chi² per degree", "J")

@@ -189,7 +189,7 @@ def plain_log_ticks(ax: "Axes", which: Literal["x", "y"] = "x") -> None:
     axis.set_minor_locator(NullLocator())
 
 
-def few_ticks(ax: "Axes", which: Literal["x", "y"], most: int) -> None:
+def limit_ticks(ax: "Axes", which: Literal["x", "y"], most: int) -> None:
     """Set the largest number of ticks of an axis."""
     from matplotlib.ticker import MaxNLocator
 

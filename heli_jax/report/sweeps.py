@@ -111,7 +111,7 @@ class Column:
             ax.set(**{f"{which}scale": "log"})
             style.plain_log_ticks(ax, which)
         else:
-            style.few_ticks(ax, which, _TICKS)
+            style.limit_ticks(ax, which, _TICKS)
         axis.set_label_text(style.label(style.short(self.name), self.unit))
 
 
@@ -122,7 +122,10 @@ class Table:
         self._ds = ds
         ok = ds["status"].to_numpy() == _OK
         self.size, self.n_ok = ok.size, int(np.count_nonzero(ok))
-        lots = _by_lot(np.flatnonzero(ok), DRAWN), _by_lot(np.flatnonzero(~ok), DRAWN // 2)
+        lots = (
+            _random_choice(np.flatnonzero(ok), DRAWN),
+            _random_choice(np.flatnonzero(~ok), DRAWN // 2),
+        )
         self.elements = np.sort(np.concatenate(lots))
         """Indices of the drawn elements, ascending, (n,)."""
         self.ok = ok[self.elements]
@@ -144,7 +147,7 @@ class Table:
     def failed(self, *columns: Column) -> np.ndarray:
         """Return at most `_MARKS` failed elements for which these columns are finite."""
         where = np.logical_and.reduce([~self.ok, *(c.finite for c in columns)])
-        return _by_lot(np.flatnonzero(where), _MARKS)
+        return _random_choice(np.flatnonzero(where), _MARKS)
 
     def head(self, figure: Figure, what: str, *notes: str) -> None:
         """Write the title, with the number of successful elements, and the legend."""
@@ -165,7 +168,7 @@ def write_figures(directory: Path, ds: xr.Dataset) -> list[Path]:
     table, written = Table(ds), []
     directory.mkdir(parents=True, exist_ok=True)
     # Figures are drawn one by one to save memory.
-    for result, stem in stems(table.results[:RESULTS]).items():
+    for result, stem in file_names(table.results[:RESULTS]).items():
         for draw in (slices, maps):
             path = directory / f"{draw.__name__}-{stem}"
             with matplotlib.rc_context({"savefig.dpi": _DPI}):
@@ -175,18 +178,18 @@ def write_figures(directory: Path, ds: xr.Dataset) -> list[Path]:
     return written
 
 
-def stems(names: Sequence[str]) -> dict[str, str]:
+def file_names(names: Sequence[str]) -> dict[str, str]:
     """Return a file name for each name, unique without regard to case."""
-    stems: dict[str, str] = {}
+    file_names: dict[str, str] = {}
     for name in names:
         first = stem = re.sub(r"[^\w-]", "_", name)[:50]
-        taken = {other.casefold() for other in stems.values()}
+        taken = {other.casefold() for other in file_names.values()}
         for k in itertools.count(2):
             if stem.casefold() not in taken:
                 break
             stem = f"{first}-{k}"
-        stems[name] = stem
-    return stems
+        file_names[name] = stem
+    return file_names
 
 
 def results(ds: xr.Dataset) -> list[str]:
@@ -211,7 +214,7 @@ def slices(table: Table, result: str) -> Figure | None:
     y = table.column(result)
     columns = {1: 1, 2: 2, 4: 2}.get(len(axes), 3)
     figure, panels = _panels(len(axes), columns, 2.9 if columns == 1 else 2.3)
-    shown = _by_lot(np.flatnonzero(y.used), _DOTS)
+    shown = _random_choice(np.flatnonzero(y.used), _DOTS)
     for k, (ax, x) in enumerate(zip(panels, axes, strict=True)):
         _dots(ax, x.values[shown], y.values[shown])
         if (bins := _binned(x, y)) is not None:
@@ -368,7 +371,7 @@ def _not_finite(table: Table, y: Column) -> str:
     return f"{count} not finite" if count and not y.empty else ""
 
 
-def _by_lot(elements: np.ndarray, most: int) -> np.ndarray:
+def _random_choice(elements: np.ndarray, most: int) -> np.ndarray:
     """Return at most `most` of the elements, a random choice."""
     if elements.size <= most:
         return elements
@@ -449,7 +452,7 @@ def _elements(content: dict[str, Any]) -> tables.Table:
 
 def _pictures(content: dict[str, Any], folder: Path) -> Iterator[tuple[Picture, str]]:
     """Yield the figures with their captions."""
-    for name, stem in stems(list(content["results"])).items():
+    for name, stem in file_names(list(content["results"])).items():
         result = content["results"][name]
         unit, ends = pretty(result.get("unit")), (number(result.get(k), 3) for k in ("min", "max"))
         numbers = f"{name} {' to '.join(ends)}{'' if unit == NOTHING else f' {unit}'}"

@@ -574,15 +574,15 @@ def _shown(n: Number, times: float) -> str:
 
 def handling_sentences(entries: Sequence[Handling]) -> list[str]:
     """Explain missing numbers of handling qualities, and give cautions."""
-    said = []
+    remarks = []
     for entry in entries:
         for source in _sources(entries):
             of = getattr(entry, source)
             sentences = (of,) if isinstance(of, str) else () if of is None else of.sentences
             if isinstance(of, HandlingQualities) and not all(n.known for n in of.numbers.values()):
                 sentences = (*sentences, _NO_RESULT)
-            said += [f"{entry.pair.words}, {source}: {s}" for s in sentences]
-    return said
+            remarks += [f"{entry.pair.words}, {source}: {s}" for s in sentences]
+    return remarks
 
 
 def origins(fit: Fit, problem: Problem) -> list[tuple[str, Table, list[str]]]:

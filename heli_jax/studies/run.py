@@ -126,15 +126,15 @@ def _compute(tasks: Sequence[Task], places: Sequence[Path], options: Options) ->
     if not todo:
         return
     done, pace = len(tasks) - len(todo), Pace(len(tasks), options.progress)
-    said: set[str] = set()
+    notices: set[str] = set()
     for number, outcome in _outcomes([tasks[k] for k in todo], options):
         place = places[todo[number]]
         directory.write_fit(place, outcome)
         # Fits of one log share the notes of its reader.
         for note in outcome.notes:
-            if note not in said:
+            if note not in notices:
                 options.say(Note(note))
-        said.update(outcome.notes)
+        notices.update(outcome.notes)
         if outcome.sentence is not None:
             options.say(Note(f"{place.name}: no fit: {outcome.sentence}"))
         done += 1

@@ -68,7 +68,7 @@ class Prepared(WorkerPlugin):
         for name, value in self.settings.items():
             jax.config.update(name, value)
         import_path.search(self.folders)
-        import_path.pass_over_style_of_folder()
+        import_path.ignore_folder_style()
 
 
 _SETTINGS = (
@@ -184,7 +184,7 @@ def _quiet() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _answering() -> Iterator[None]:
+def _dask_errors() -> Iterator[None]:
     """Report dask's lost schedulers and failed workers as a sentence."""
     try:
         yield
@@ -272,7 +272,7 @@ def _gathered(futures: list[Any]) -> Any:
     return as_completed(futures, with_results=True, raise_errors=False)
 
 
-def _as_they_end(client: Client, running: Any) -> Iterator[tuple[Any, Callable[[], Any]]]:
+def _as_completed(client: Client, running: Any) -> Iterator[tuple[Any, Callable[[], Any]]]:
     """Yield the futures as they end, each with a function that returns its result or raises.
 
     More futures may be added meanwhile.
@@ -289,7 +289,7 @@ def _as_they_end(client: Client, running: Any) -> Iterator[tuple[Any, Callable[[
         if now - looked < _LOOK_S:
             continue
         looked = now
-        with _answering():
+        with _dask_errors():
             there = client.scheduler_info()["workers"].values()
         seen = now if any(map(_works, there)) else seen
         if now - seen > _ALONE_S:
@@ -346,8 +346,8 @@ def mapped(
     # Submit a few tasks ahead.
     ahead = zip(range(_AHEAD * _threads(client)), waiting, strict=False)
     running = _gathered([submitted(k) for _, k in ahead])
-    for future, result in _as_they_end(client, running):
-        with _answering():
+    for future, result in _as_completed(client, running):
+        with _dask_errors():
             try:
                 value = result()
             # dask counts the workers that died over one task; the other tasks continue.

@@ -173,7 +173,7 @@ def design_point(
         trim: steady flight to begin in; None for the model's initial state.
     """
     params, special = params_of(plan, numbers, values)
-    state, inputs = _beginning(plan.model, params, numbers, special, trim)
+    state, inputs = _initial_state_and_inputs(plan.model, params, numbers, special, trim)
     if trim is not None and numbers.pilot is not None:
         # The gains are those for the given vehicle; the flight is this element's own.
         numbers = numbers._replace(pilot=numbers.pilot._replace(trimmed=trim.state))
@@ -192,7 +192,7 @@ def steps_of(
 ) -> Steps:
     """Return the run of one element in steps; arguments as in `design_point`, plan streamed."""
     params, special = params_of(plan, numbers, values)
-    state, inputs = _beginning(plan.model, params, numbers, special, trim)
+    state, inputs = _initial_state_and_inputs(plan.model, params, numbers, special, trim)
     update, start, data = _streaming(plan, numbers)
     size = len(naming.names(plan.model.State)) + len(naming.names(plan.model.Inputs))
     block = _FUSED_BLOCK if size <= _FUSED_BLOCK_FITS else 1
@@ -253,14 +253,14 @@ def _concluded(
         # NumPy computes eigenvalues and margins from these after the chunk, in float64 on any
         # device.
         params, special = params_of(plan, numbers, values)
-        state, inputs = _beginning(model, params, numbers, special, trim)
+        state, inputs = _initial_state_and_inputs(model, params, numbers, special, trim)
         at_start = jax.tree.map(lambda u: u[0], inputs)
         matrices = jacobians(model, params, state, at_start)
     results = {n: jnp.asarray(v, dtype) for n, v in results.items()}
     return ElementResults(results, kept, matrices, status.astype(np.uint8))
 
 
-def _beginning(
+def _initial_state_and_inputs(
     model: Model, params: Any, numbers: FlightNumbers, special: Scalars, trim: InitialTrim | None
 ) -> tuple[Any, Any]:
     """Return the state at the first sample and the inputs (N,) of an element."""

@@ -213,13 +213,13 @@ def _cut(job: Job, options: Options, words: dict[str, Any]) -> tuple[Split, dict
             raise ValueError(f"{name} must be at least 1, got {number}")
     # More lanes than elements would fill the memory with copies of the last one.
     lanes = None if options.lanes is None else min(options.lanes, job.design.size)
-    asked = {"chunk": options.chunk, "lanes": lanes, "backend": options.backend}
+    requested = {"chunk": options.chunk, "lanes": lanes, "backend": options.backend}
     if options.client is not None:
         from heli_jax.sweeps.cluster import split_there
 
-        split = split_there(options.client, job, **asked)
+        split = split_there(options.client, job, **requested)
     else:
-        split = split_for(job, devices=options.devices, say=options.say, **asked)
+        split = split_for(job, devices=options.devices, say=options.say, **requested)
     # Once, when the store is made, so that a resumed sweep keeps the error from its start.
     if job.precision == "float32":
         words = {**words, "float32_error": float32_error(job)}

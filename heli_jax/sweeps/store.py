@@ -255,8 +255,8 @@ def require_files(directory: Path, where: str) -> None:
         InputError: naming the file.
     """
     # Before the lock is taken: opening a pipe in its place would block forever.
-    beside = (directory / ".lock", directory / "summary.json")
-    for path in beside:
+    others = (directory / ".lock", directory / "summary.json")
+    for path in others:
         if os.path.lexists(path):
             _require_file(path, _LARGEST_METADATA, where)
     folders = [directory / "sweep.zarr"]

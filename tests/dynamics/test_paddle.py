@@ -9,7 +9,7 @@ import yaml
 
 from heli_jax import Free, Problem, fit, load_vehicle, models, naming
 from heli_jax.dynamics.flybar import flapping_rate_gain, flybar_time_constant
-from heli_jax.dynamics.model import needed_but_missing, reads
+from heli_jax.dynamics.model import missing_parameters, reads
 from heli_jax.dynamics.roll import ratios_from_denominator, roll_transfer_function
 from heli_jax.errors import InputError
 from heli_jax.identification.equation_error.rls import baseline
@@ -55,7 +55,7 @@ def test_either_may_be_given_alone(given, factor):
 
 def test_a_vehicle_need_not_give_them(tmp_path, vehicles_folder):
     v = vehicle(BENCH)
-    assert needed_but_missing(models.roll, v) == []
+    assert missing_parameters(models.roll, v) == []
     assert reads(models.roll, v, "c_paddle")
     assert reads(models.roll, v, "a_paddle")
     assert not reads(models.roll, v, "hr")

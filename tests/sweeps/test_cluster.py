@@ -82,10 +82,10 @@ def test_no_scheduler_ends_in_words(monkeypatch):
     ],
 )
 def test_what_dask_says_ends_in_one_sentence(error, words):
-    with pytest.raises(InputError, match=words) as e, cluster._answering():
+    with pytest.raises(InputError, match=words) as e, cluster._dask_errors():
         raise error
     assert "\n" not in str(e.value)
-    with pytest.raises(RuntimeError, match="another"), cluster._answering():
+    with pytest.raises(RuntimeError, match="another"), cluster._dask_errors():
         raise RuntimeError("another")
 
 
@@ -123,7 +123,7 @@ def test_a_scheduler_without_workers_is_not_waited_for_without_end(monkeypatch, 
     monkeypatch.setattr(cluster, "_LOOK_S", 0.05)
     busy = {"status": "paused", "metrics": {"task_counts": {"executing": 1}}}
     scheduler = Scheduler({}, {"tcp://a": busy}, {"tcp://a": {"status": "running"}})
-    ended = cluster._as_they_end(scheduler, Running(["a", "b"]))
+    ended = cluster._as_completed(scheduler, Running(["a", "b"]))
     assert [next(ended)[1](), next(ended)[1]()] == ["b", "a"]
     with pytest.raises(InputError, match=r"\d+ s.*--resume"):
         next(ended)
@@ -145,4 +145,4 @@ def test_a_result_whose_worker_has_died_is_not_waited_for_without_end(monkeypatc
         while client.scheduler_info()["workers"]:
             pass
         with pytest.raises(InputError):
-            list(cluster._as_they_end(client, cluster._gathered([future])))
+            list(cluster._as_completed(client, cluster._gathered([future])))

@@ -130,8 +130,8 @@ def with_motion_sensors(
     Raises:
         ValueError: the model does not know a requested quantity, or has the name already.
     """
-    asked = {"imu": imu, "angular_acceleration": angular_acceleration, "airspeed": airspeed}
-    return _with_sensors(model, tuple(name for name, on in asked.items() if on))
+    requested = {"imu": imu, "angular_acceleration": angular_acceleration, "airspeed": airspeed}
+    return _with_sensors(model, tuple(name for name, on in requested.items() if on))
 
 
 # Cached because a model is static to jit: an equal second model would be compiled again.
@@ -149,7 +149,7 @@ class _MotionSensors(Device):
     """Sensors at given positions in the body, without dynamics."""
 
     def __init__(self, model: Model, shown: tuple[str, ...]) -> None:
-        self.asked = shown
+        self.requested = shown
         self.motion = motion_of(model) if {"imu", "airspeed"} & set(shown) else None
         rates = {letter: rate_of(model, letter) for letter in "pqr"}
         self.body_rates = {letter: rate for letter, rate in rates.items() if rate is not None}
@@ -214,14 +214,14 @@ class _MotionSensors(Device):
         # Evaluate the vector field once for all sensors, since it is the expensive part.
         rates = model.vector_field(p, s, u)
         y = naming.asdict(model.output(p, s, u))
-        if "imu" in self.asked and motion is not None:
+        if "imu" in self.requested and motion is not None:
             y |= specific_force(model, motion, p, s, u, rates)
-        if "angular_acceleration" in self.asked:
+        if "angular_acceleration" in self.requested:
             y |= {
                 f"{letter}dot": angular_acceleration(model, rate, p, s, u, rates)
                 for letter, rate in self.body_rates.items()
             }
-        if "airspeed" in self.asked and motion is not None:
+        if "airspeed" in self.requested and motion is not None:
             y |= airspeed(model, motion, p, s, u, rates)
         return self.Outputs(**y)
 

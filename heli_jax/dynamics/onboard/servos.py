@@ -98,14 +98,14 @@ class _Servos(Device):
         for n in self.on:
             position, speed = f"{n}_{self.name}", f"{n}_{self.name}_rate"
             # A position loop around a speed loop gives a commanded speed, which a limit can act on.
-            asked = omega / (2.0 * zeta) * (getattr(u, n) - getattr(s, position))
+            commanded = omega / (2.0 * zeta) * (getattr(u, n) - getattr(s, position))
             # Limit the commanded speed: a clipped state would wind up behind its limit and leave it
             # late.
             if self.rate_limit:
                 most = getattr(p, f"rate_{self.name}")
-                asked = jnp.clip(asked, -most, most)
+                commanded = jnp.clip(commanded, -most, most)
             rates[position] = getattr(s, speed)
-            rates[speed] = 2.0 * zeta * omega * (asked - getattr(s, speed))
+            rates[speed] = 2.0 * zeta * omega * (commanded - getattr(s, speed))
         return rates
 
 

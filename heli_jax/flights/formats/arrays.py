@@ -274,8 +274,8 @@ def _unstacked(
     ):
         why = "runs are read only from arrays (run, sample, channel) with a time for each sample"
         shapes = listed(f"{shown(n)} {x.shape}" for n, x in cubes.items())
-        said = note(LEFT_OUT, f"left out, since {why}: {shapes}", *cubes)
-        return {n: x for n, x in arrays.items() if n not in cubes}, (said,)
+        notices = note(LEFT_OUT, f"left out, since {why}: {shapes}", *cubes)
+        return {n: x for n, x in arrays.items() if n not in cubes}, (notices,)
     made = dict(arrays)
     for name, values in arrays.items():
         if values.shape[:2] == shape:

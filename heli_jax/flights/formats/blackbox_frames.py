@@ -447,7 +447,7 @@ class _Chain:
                 return int(self.ends[last])
             i = int(self.following[last])
 
-    def next_behind(self, at: int, otherwise: int) -> int:
+    def next_after(self, at: int, otherwise: int) -> int:
         """Return the place of the next candidate after `at`."""
         i = int(np.searchsorted(self.starts, at, side="right"))
         return int(self.starts[i]) if i < self.starts.size else otherwise
@@ -506,7 +506,7 @@ class _Walk:
             self._note_damage()
             # Continue at the next candidate, not the next letter: a letter within numbers seldom
             # leads to another one.
-            self.at = chain.next_behind(self.at, last)
+            self.at = chain.next_after(self.at, last)
         # A letter within another frame's numbers is a candidate too. Only candidates reached from
         # the end of a frame are frames.
         is_frame = np.zeros(last - first, bool)

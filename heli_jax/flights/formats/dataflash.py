@@ -280,18 +280,18 @@ def _topics_of(
     """Group messages of a name into topics: one, unless a description changes clock or unit."""
     groups: list[tuple[list[Part], dict[str, str]]] = []
     for part in parts:
-        said = units.get(id(part), {})
+        stated = units.get(id(part), {})
         for group, known in groups:
             same = _clocks(group[0].form) == _clocks(part.form)
-            if same and all(known.get(c, u) == u for c, u in said.items()):
+            if same and all(known.get(c, u) == u for c, u in stated.items()):
                 group.append(part)
-                known |= said
+                known |= stated
                 break
         else:
-            groups.append(([part], dict(said)))
-    for i, (group, said) in enumerate(groups):
+            groups.append(([part], dict(stated)))
+    for i, (group, stated) in enumerate(groups):
         messages = _joined(f"{name}#{i + 1}" if i else name, group, scaled)
-        yield messages._replace(clocks=_clocks(group[0].form), units=said)
+        yield messages._replace(clocks=_clocks(group[0].form), units=stated)
 
 
 def _joined(name: str, parts: Sequence[Part], scaled: bool) -> _Messages:

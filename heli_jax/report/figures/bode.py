@@ -144,13 +144,11 @@ def match(pair: FittedPair, unit: str, note: str, baseline: Baseline | None = No
     if modelled.all():
         angle = _nearest(angle, near[known])
     data = _bars(f, gain, angle, (own, own), style.BLACK, "data, 95 % intervals")
-    beside = []
+    rls = []
     if baseline is not None:
         R = baseline_response(baseline, omega)
         turned = _nearest(np.degrees(np.angle(R)), near)
-        beside = [
-            c._replace(dashed=True) for c in _curve("RLS", omega, R, turned, style.ORANGE, 1.2)
-        ]
+        rls = [c._replace(dashed=True) for c in _curve("RLS", omega, R, turned, style.ORANGE, 1.2)]
     # Incoherent bins do not set the axes.
     mean = octave_mean(omega, pair.coherence)
     rule = (np.minimum(pair.coherence, mean) >= BEYOND_CHANCE)[known]
@@ -164,7 +162,12 @@ def match(pair: FittedPair, unit: str, note: str, baseline: Baseline | None = No
     ):
         x, v, reach = hz[modelled], value[modelled], Z95 * sd[modelled]
         fitted = Series("model", x, v, style.BLUE, width=1.4)
-        series = [band(x, v - reach, v + reach, style.SKY), fitted, *beside[k : k + 1], data[k]]
+        series = [
+            band(x, v - reach, v + reach, style.SKY),
+            fitted,
+            *rls[k : k + 1],
+            data[k],
+        ]
         limits = _room(ruling, _MARGINS[k], series)
         panels.append(panel(words, series, height, limits=limits))
     panels.append(_coherence(omega, pair.coherence))

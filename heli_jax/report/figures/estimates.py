@@ -87,11 +87,11 @@ def _label(grid: np.ndarray, names: list[str], fit: Fit) -> None:
         power = grid[-1, i].xaxis.get_offset_text()
         power.set_horizontalalignment("left")
         for ax in grid[i:, i]:
-            style.few_ticks(ax, "x", 3)
+            style.limit_ticks(ax, "x", 3)
             ax.tick_params(axis="x", rotation=30)
             _interval_lines(ax.axvline, fit.estimates[name])
         for j, ax in enumerate(grid[i, :i]):
-            style.few_ticks(ax, "y", 4)
+            style.limit_ticks(ax, "y", 4)
             ax.tick_params(axis="y", labelleft=j == 0)
         if i:
             grid[i, 0].set_ylabel(label)
