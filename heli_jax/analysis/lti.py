@@ -42,7 +42,8 @@ def d2c(
     eq. 35 from eq. 34. If "zoh" raises, its result differs from Hd.
 
     Args:
-        num, den: coefficients of Hd(z), highest power first.
+        num: numerator of Hd(z), highest power first.
+        den: denominator, likewise.
         dt: time between samples [s].
 
     Raises:
