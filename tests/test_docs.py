@@ -107,9 +107,9 @@ PAGES = sorted((ROOT / "docs").rglob("*.md"))
 
 def test_the_commands_of_the_pages_are_commands():
     """Test names and options of commands in the pages."""
-    from heli_jax import cli
+    from heli_jax.cli import commands
 
-    parser, count = cli._parser(), 0
+    parser, count = commands._parser(), 0
     for page in PAGES:
         text = page.read_text("utf-8").replace("\\\n", " ")
         lines = re.findall(r"^ *(?:\$ )?heli-jax ([^:\n]*)$|`heli-jax ([^`]*)`", text, re.MULTILINE)

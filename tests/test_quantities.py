@@ -58,7 +58,7 @@ def test_an_initial_state_and_a_disturbance_may_have_units(load):
         ),
         (
             {"disturbance": {"on": ["p", "b"], "sigma_w": {"value": 1, "unit": "deg/s^2"}}},
-            "sigma_w: expected a value for each, as {p: 1, b: 1}, got one",
+            "sigma_w: expected a value for each disturbance, as {p: 1, b: 1}, got one",
         ),
     ],
 )

@@ -262,9 +262,8 @@ _MOVES = 0.5
 """Smallest share of samples at which another output must move to show that the vehicle did."""
 _STALE = 0.02, 0.5
 """Smallest and largest share of stale samples."""
-_FINE = 20.0
-"""Smallest usual move of an output with stale samples [smallest move]; by chance fewer than 2 % of
-its samples would repeat."""
+_CHANCE = 0.02
+"""Largest share of values equal to the last but one: so many would also repeat by chance."""
 _NOISY = 0.3
 """Smallest share of moves that turn back, which shows noise."""
 
@@ -278,13 +277,15 @@ def stale(values: np.ndarray) -> np.ndarray:
     at, y = np.zeros(values.shape, bool), values[seen]
     with np.errstate(over="ignore"):
         moves = np.diff(y)
-    sizes, ways = np.abs(moves[moves != 0]), np.sign(moves[moves != 0])
+    ways = np.sign(moves[moves != 0])
     # A signal at the end of its range may be clipped.
     low, high = np.min(y, initial=np.inf), np.max(y, initial=-np.inf)
     again = (moves == 0) & (y[1:] > low) & (y[1:] < high)
-    if sizes.size < _REPEATED or not _STALE[0] <= again.mean() <= _STALE[1]:
+    if ways.size < _REPEATED or not _STALE[0] <= again.mean() <= _STALE[1]:
         return at
-    if np.median(sizes) >= _FINE * sizes.min() and np.mean(ways[1:] != ways[:-1]) >= _NOISY:
+    fresh = y[np.r_[True, moves != 0]]
+    by_chance = np.mean(fresh[2:] == fresh[:-2])
+    if by_chance < _CHANCE and np.mean(ways[1:] != ways[:-1]) >= _NOISY:
         at[seen[1:][again]] = True
     return at
 

@@ -34,4 +34,4 @@ def test_few_frequencies_are_not_called_a_low_coherence() -> None:
     H = 1.0 / (1j * OMEGA[few] + 4.0)
     said = measured_curve(OMEGA[few], H, 0.05 * np.abs(H), np.full(H.size, 0.9), 24.0)
     assert isinstance(said, str)
-    assert said.startswith("5 frequencies side by side have a coherence of 0.6")
+    assert said.startswith("5 adjacent frequencies")

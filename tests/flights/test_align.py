@@ -61,11 +61,11 @@ def test_what_cannot_be_told_is_refused():
     with pytest.raises(NotAligned, match="fit nearly equally"):
         lag_between(*waves)
     x = motion(3)(t)
-    with pytest.raises(NotAligned, match="against one another"):
+    with pytest.raises(NotAligned, match="opposite signs"):
         lag_between(signal(t, x), signal(t, -x))
     with pytest.raises(NotAligned, match="expected at least 40"):
         lag_between(signal(t, x), signal(t[:20], x[:20]))
-    with pytest.raises(NotAligned, match="too short or too still"):
+    with pytest.raises(NotAligned, match="too short, or move too little"):
         lag_between(signal(t, x), signal(t, np.zeros(t.size)))
 
 

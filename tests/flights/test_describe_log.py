@@ -62,7 +62,12 @@ def test_a_column_that_merely_increases_is_no_clock_unless_it_is_named(tmp_path)
 
 @pytest.mark.parametrize(
     ("stamps", "word"),
-    [("0 1 1", "stands still"), ("0 2 1", "backwards"), ("0 nan 1", "1 stamps"), ("0", "single")],
+    [
+        ("0 1 1", "stands still"),
+        ("0 2 1", "backwards"),
+        ("0 nan 1", "1 time stamps"),
+        ("0", "single"),
+    ],
 )
 def test_clock_with_a_problem(tmp_path, stamps, word):
     path = tmp_path / "bench.csv"

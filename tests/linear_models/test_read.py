@@ -91,7 +91,7 @@ def test_values_are_replaced_by_name(read):
     np.testing.assert_allclose(A[1, 1], -4.0)
     assert vehicle.constants["Xu"].value == -0.1
     for given, words in (
-        ({"tau": -1}, "mine.yaml: tau: expected more than zero .* got -1"),
+        ({"tau": -1}, "mine.yaml: tau: expected a value above zero .* got -1"),
         ({"taw": 1}, "mine.yaml: unknown constant 'taw'; did you mean 'tau'"),
     ):
         with pytest.raises(InputError, match=words):
@@ -150,7 +150,7 @@ def test_a_negative_delay_acts_early_unless_it_is_positive(read):
     at_once = simulate(plain, params, shifted, dt=0.1).states
     for name in naming.names(found.model.State):
         np.testing.assert_allclose(getattr(run, name), getattr(at_once, name), atol=1e-9)
-    with pytest.raises(InputError, match="lead: expected more than zero"):
+    with pytest.raises(InputError, match="lead: expected a value above zero"):
         read(early(positive=True))
 
 

@@ -95,7 +95,7 @@ def test_the_bootstrap_is_a_file_of_its_own_that_says_what_it_is(white, sampled,
     write_samples(tmp_path, white[0], alone, MADE, "bench.yaml")
     assert [p.name for p in tmp_path.iterdir()] == ["bootstrap.nc"]
     read = xr.load_dataset(tmp_path / "bootstrap.nc", engine="scipy")
-    assert "no draws from a posterior" in read.attrs["what"]
+    assert "not draws from a posterior" in read.attrs["what"]
     assert read.attrs["records_that_could_not_be_fitted"] == 10
     assert read["If"].attrs["units"] == "kg m^2"
     np.testing.assert_array_equal(read["If"].values, sampled.bootstrap.values["If"])
