@@ -87,11 +87,11 @@ def lines_of[A: (np.ndarray, Array)](v: A) -> A:
     )
 
 
-def in_time_of(lines: Complex[np.ndarray, "K c"], samples: int) -> Float[np.ndarray, "N c"]:
-    """Return signals of zero mean: the inverse of `lines_of`."""
-    whole = np.zeros((samples // 2 + 1, lines.shape[1]), complex)
-    whole[1 : 1 + len(lines)] = lines * np.sqrt(samples)
-    return np.fft.irfft(whole, samples, axis=0)
+def in_time_of[A: (np.ndarray, Array)](lines: A, samples: int) -> A:
+    """Return signals (N, *c) of zero mean from lines (K, *c): the inverse of `lines_of`."""
+    xp = jnp if isinstance(lines, jax.Array) else np
+    absent = [(1, samples // 2 - len(lines)), *((0, 0) for _ in lines.shape[1:])]
+    return xp.fft.irfft(xp.pad(lines, absent), samples, axis=0) * float(samples) ** 0.5
 
 
 def parts_of(flight: Flight) -> tuple[tuple[int, int], ...]:
@@ -255,177 +255,162 @@ def with_shared(layout: Layout, u: Unknowns, v: Float[Array, " q"]) -> Unknowns:
     )
 
 
-# Complex vectors are stored as real ones, [re, im], because products of real matrices are faster.
+# The model at the lines of a record.
 
 
-def stacked(v: Complex[Array, "K *c"]) -> Float[Array, "K 2 *c"]:
-    """Return real and imaginary parts on a second axis."""
-    return jnp.stack([jnp.real(v), jnp.imag(v)], axis=1)
+def at_lines(m: Matrices, record: Record) -> tuple[Complex[Array, " K"], Complex[Array, "K n n"]]:
+    """Return z of a record's lines and (zI - Ad)^-1 there, without a derivative."""
+    Ad = jax.lax.stop_gradient(m.Ad)
+    z = jnp.asarray(record.z, np.result_type(Ad.dtype, np.complex64))
+    unit = jnp.eye(len(Ad), dtype=z.dtype)[None]
+    return z, jnp.linalg.inv(z[:, None, None] * unit - Ad[None].astype(z.dtype))
 
 
-def real(M: Complex[Array, "K a b"]) -> Float[Array, "K 2a 2b"]:
-    """Return the real matrix that acts on stacked vectors as M does on complex ones."""
-    re, im = jnp.real(M), jnp.imag(M)
-    parts = jnp.stack([jnp.stack([re, -im], axis=2), jnp.stack([im, re], axis=2)], axis=1)
-    return parts.reshape(len(M), 2 * M.shape[1], 2 * M.shape[2])
+def modelled(
+    m: Matrices,
+    driving: Driving,
+    R: Complex[Array, "K n n"],
+    ends: Complex[Array, "K n"] | None = None,
+) -> Complex[Array, "K p"]:
+    """Return the outputs at the lines of a record.
+
+    Args:
+        driving: inputs (N, r) over the record.
+        R: (zI - Ad)^-1 at the lines.
+        ends: inputs of the states by the ends of the record; default zero.
+    """
+    B, C, D, Ad = (v.astype(R.dtype) for v in (m.B, m.C, m.D, m.Ad))
+    inputs = lines_of(driving.U) @ B.T
+    inputs = inputs if ends is None else inputs + ends
+    # Products replace the derivative of an inverse: dY = C R (dAd X + dU) + dC X. The differences
+    # are zero, but their derivatives are not.
+    X = jax.lax.stop_gradient(jnp.einsum("kij,kj->ki", R, inputs))
+    dA, dC = (v - jax.lax.stop_gradient(v) for v in (Ad, C))
+    H = jax.lax.stop_gradient(C)[None] @ R
+    passing = lines_of(driving.held) @ D.T
+    return jnp.einsum("kpn,kn->kp", H, inputs + X @ dA.T) + X @ dC.T + passing
 
 
-def times(M: Float[Array, "K 2a 2b"], v: Float[Array, "K 2 b *f"]) -> Float[Array, "K 2 a *f"]:
-    """Return the products at each line."""
-    made = M @ v.reshape(len(v), M.shape[2], -1)
-    return made.reshape(len(v), 2, -1, *v.shape[3:])
+def real_rows(v: Complex[Array, "K p *c"]) -> Float[Array, "r *c"]:
+    """Return real and imaginary parts of whitened errors as rows of variance 1."""
+    # The real part of a complex normal error has half of its variance.
+    v = 2.0**0.5 * v.reshape(-1, *v.shape[2:])
+    return jnp.concatenate([jnp.real(v), jnp.imag(v)])
 
 
 _NO_END = 1e-10
 """Effect of a state, relative to the largest one, below which it has none."""
-_ROUNDING = 1e-12
-"""Power of a direction, relative to the largest one, below which it is rounding."""
-
-
-def orthonormal(gram: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """Return S with S^T G S the identity, but zero for directions without effect.
-
-    Args:
-        gram: products G of columns; the columns times S are orthonormal.
-    """
-    sizes = jnp.sqrt(jnp.maximum(jnp.diagonal(gram), 0.0))
-    # The column of a state without effect on the outputs is rounding, and its direction changes at
-    # each step. Projecting it out would make the sum of squares rough.
-    precision = float(jnp.finfo(gram.dtype).eps)
-    seen = sizes > max(_NO_END, 10.0 * precision) * jnp.max(sizes)
-    over = jnp.where(seen, 1.0 / jnp.where(seen, sizes, 1.0), 0.0)
-    values, vectors = jnp.linalg.eigh(gram * over[:, None] * over[None, :])
-    kept = values > max(_ROUNDING, 100.0 * precision) * values[-1]
-    root = jnp.where(kept, 1.0 / jnp.sqrt(jnp.where(kept, values, 1.0)), 0.0)
-    return over[:, None] * vectors * root[None, :]
-
-
-# Errors of a record, and the effects of its ends.
-
-
-_NUMBERS = 20_000
-"""Largest product of outputs, states and lines in a block: 256 lines of a helicopter, or the whole
-record of a small vehicle."""
+_ROUNDING = 100.0
+"""Power of a direction, relative to the largest one, below which it is rounding, as a multiple of
+the floating-point precision."""
 _SPARED = 0.1
 """Largest fraction of a record's degrees of freedom for its ends and those of gusts."""
 
 
-class Resolved(NamedTuple):
-    """Model at the lines of a record, without derivatives, in b blocks of k lines that fit the
-    processor's caches."""
+def orthonormal(gram: Float[Array, "m m"], least: float = 0.0) -> Float[Array, "m m"]:
+    """Return S with S^T G S the identity, but zero for directions without effect.
 
-    record: Record
-    W: Float[Array, "b k 2p 2p"]
-    """Whitening to rows of variance 1; zero beyond the record's lines."""
-    R: Float[Array, "b k 2n 2n"]
-    """(zI - Ad)^-1."""
-    H: Float[Array, "b k 2p 2n"]
-    """W C (zI - Ad)^-1."""
-    effects: Float[Array, "b k 2 e"]
-    """Spectrum of a jump of a state between the ends and, except in a very short record, of a slow
-    gust on it."""
-    S: Float[Array, "m m"]
-    """Makes `basis_of` orthonormal; zero columns for states without effect."""
-
-    def lines(self, v: Float[Array, "f N *c"]) -> Float[Array, "b k 2 *c f"]:
-        """Return the transform of the record's part of signals over whole flights, by block."""
-        # Signals are delayed before they are cut, because an input may be logged before it acts.
-        part = jnp.moveaxis(v[:, self.record.first : self.record.last], 0, -1)
-        return by_block(stacked(lines_of(part)), len(self.W))
+    Args:
+        gram: products G of columns; the columns times S are orthonormal.
+        least: size of a column, relative to the largest one, below which it has no effect.
+    """
+    sizes = jnp.sqrt(jnp.maximum(jnp.diagonal(gram), 0.0))
+    seen = sizes > least * jnp.max(sizes)
+    # Columns are normalised to be independent of units.
+    over = jnp.where(seen, 1.0 / jnp.where(seen, sizes, 1.0), 0.0)
+    values, vectors = jnp.linalg.eigh(gram * over[:, None] * over[None, :])
+    kept = values > _ROUNDING * jnp.finfo(values.dtype).eps * values[-1]
+    root = jnp.where(kept, 1.0 / jnp.sqrt(jnp.where(kept, values, 1.0)), 0.0)
+    return over[:, None] * vectors * root[None, :]
 
 
-def by_block(v: Array, count: int) -> Array:
-    """Return lines (K, ...) in blocks (b, k, ...), the last one padded with zeros."""
-    size = -(-len(v) // count)
-    v = jnp.pad(v, [(0, count * size - len(v)), *((0, 0) for _ in v.shape[1:])])
-    return v.reshape(count, size, *v.shape[1:])
+def projection(basis: Float[Array, "r m"]) -> tuple[Float[Array, "r m"], Float[Array, "m m"]]:
+    """Return orthonormal effects Q of a record's ends, and S with Q the basis times S.
+
+    Columns of ends without effect are zero.
+    """
+    # The column of a state without effect on the outputs is rounding, and its direction changes at
+    # each step. Projecting it out would make the sum of squares rough.
+    least = max(_NO_END, 10.0 * float(jnp.finfo(basis.dtype).eps))
+    S = orthonormal(basis.T @ basis, least)
+    return basis @ S, S
 
 
-def resolved(m: Matrices, record: Record, whitening: Complex[Array, "K p p"]) -> Resolved:
-    """Evaluate a model at the lines of a record."""
-    (p, n), K = m.C.shape, record.lines
-    # The real part of a complex normal error has half of its variance.
-    W = by_block(2.0**0.5 * real(whitening).astype(m.C.dtype), -(-K * m.C.size // _NUMBERS))
-    count, size = W.shape[:2]
-    # The padding continues the lines to avoid singular matrices.
-    k = np.arange(1, count * size + 1)
-    z = np.exp(2j * np.pi * k / np.where(k <= K, record.samples, record.samples + 2 * size))
-    z = z.astype(np.result_type(m.Ad.dtype, np.complex64))
+class Ends(NamedTuple):
+    """Effects of the ends of one record of each flight of a group, and their least squares."""
+
+    R: Complex[Array, "K n n"]
+    """(zI - Ad)^-1 at the lines."""
+    Q: Float[Array, "r m"]
+    """Orthonormal effects on the whitened errors."""
+    inputs: Complex[Array, "f K n"]
+    """Inputs of the states by the ends, by flight."""
+
+
+def ends_of(
+    m: Matrices,
+    record: Record,
+    whitening: Complex[Array, "K p p"],
+    driving: Driving,
+    outputs: Float[Array, "f N p"],
+) -> Ends:
+    """Fit the ends of one record of each flight by linear least squares.
+
+    Args:
+        driving: inputs over whole flights (f, N, r), like the outputs.
+    """
+    z, R = at_lines(m, record)
     # A gust that does not end where it began has a jump, which affects all lines. Treated as
     # independent noise of each line, it would shift slow modes by several standard deviations.
     # Above its corner frequency it is an integrated push; dividing by the length keeps it
     # comparable to the states' ends.
-    effects = np.stack([z, z / (z - 1.0) / record.samples], axis=1)
+    effects = jnp.stack([z, z / (z - 1.0) / record.samples], axis=1)
+    (p, n), K = m.C.shape, record.lines
     if 2 * n > _SPARED * 2 * p * K:
         effects = effects[:, :1]
-    effects = by_block(stacked(jnp.asarray(effects)), count)
-
-    def of_block(of: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        z, W, effects = of
-        unit = jnp.eye(n, dtype=z.dtype)[None]
-        R = jnp.linalg.inv(z[:, None, None] * unit - m.Ad[None].astype(z.dtype))
-        H = W @ real(m.C[None].astype(z.dtype) @ R)
-        basis = basis_of(H, effects)
-        return real(R), H, basis.T @ basis
-
-    R, H, grams = jax.lax.map(of_block, (jnp.asarray(z).reshape(count, size), W, effects))
-    return Resolved(record, W, R, H, effects, orthonormal(jnp.sum(grams, axis=0)))
+    H = whitening.astype(z.dtype) @ m.C[None].astype(z.dtype) @ R
+    made = H[:, :, None, :] * effects[:, None, :, None]
+    Q, S = projection(real_rows(made.reshape(K, p, -1)))
+    factors = whitened(m, record, whitening, driving, outputs, R) @ Q @ S.T
+    factors = factors.reshape(len(outputs), -1, n).astype(z.dtype)
+    return Ends(R, Q, jnp.einsum("ke,fen->fkn", effects, factors))
 
 
-def basis_of(H: Float[Array, "k 2p 2n"], effects: Float[Array, "k 2 e"]) -> Float[Array, "s m"]:
-    """Return the effects of the states' ends, then of the gusts' ends, on the rows of a block."""
-    n = H.shape[2] // 2
-    re, im = H[:, :, None, :n], H[:, :, None, n:]
-    made = re * effects[:, None, 0, :, None] + im * effects[:, None, 1, :, None]
-    return made.reshape(-1, effects.shape[2] * n)
+def whitened(
+    m: Matrices,
+    record: Record,
+    whitening: Complex[Array, "K p p"],
+    driving: Driving,
+    outputs: Float[Array, "f N p"],
+    R: Complex[Array, "K n n"],
+    ends: Complex[Array, "f K n"] | None = None,
+) -> Float[Array, "f r"]:
+    """Return measured less modelled outputs of one record of each flight, in rows of variance 1.
 
-
-class Errors(NamedTuple):
-    """Errors of one record of each flight of a group, by block."""
-
-    rows: Float[Array, "b s f"]
-    """Measured less modelled, whitened, without the effects of the ends; zero in the padding."""
-    X: Float[Array, "b k 2 n f"]
-    """States."""
-    y: Float[Array, "b k 2 p f"]
-    """Measured outputs less the direct feedthrough of the inputs."""
-
-
-def errors_of_record(
-    at: Resolved, m: Matrices, driving: Driving, outputs: Float[Array, "f N p"]
-) -> Errors:
-    """Return the errors of one record of each flight of a group.
-
-    Args:
-        driving: inputs over the whole flights, like `outputs`.
+    The arguments are those of `ends_of` and `modelled`.
     """
-    inputs = jnp.einsum("nr,bkcrf->bkcnf", m.B, at.lines(driving.U))
-    y = at.lines(outputs - driving.held @ m.D.T)
+    W = whitening.astype(R.dtype)
 
-    def unprojected(of: Any) -> tuple[Array, Array]:
-        W, H, effects, inputs, y = of
-        rows = (times(W, y) - times(H, inputs)).reshape(-1, y.shape[-1])
-        return rows, basis_of(H, effects).T @ rows
+    def of_flight(driving: Driving, outputs: Array, ends: Array | None) -> Array:
+        e = lines_of(outputs) - modelled(m, driving, R, ends)
+        return real_rows(jnp.einsum("kij,kj->ki", W, e))
 
-    rows, along = jax.lax.map(unprojected, (at.W, at.H, at.effects, inputs, y))
-    # Linear least squares gives the states' ends of each flight.
-    ends = at.S @ (at.S.T @ jnp.sum(along, axis=0))
-
-    def without_ends(of: Any) -> tuple[Array, Array]:
-        R, H, effects, inputs, rows = of
-        of_ends = ends.reshape(effects.shape[2], -1, ends.shape[1])
-        X = times(R, inputs + jnp.einsum("kce,enf->kcnf", effects, of_ends))
-        return rows - basis_of(H, effects) @ ends, X
-
-    rows, X = jax.lax.map(without_ends, (at.R, at.H, at.effects, inputs, rows))
-    return Errors(rows, X, y)
+    return jax.vmap(of_flight)(*cut(record, (driving, outputs)), ends)
 
 
-def parts_of_group(layout: Layout, noise: Noise, members: list[int]) -> list[tuple[Record, Array]]:
+def records_of_group(
+    layout: Layout, noise: Noise, members: list[int]
+) -> list[tuple[Record, Complex[Array, "K p p"]]]:
     """Return the records of each flight of a group, with their whitening."""
     # Records of equal length share one spectrum (`smoothed`), that of the first flight.
     pairs = zip(records_of(layout), noise.whitening, strict=True)
     return [(record, W) for record, W in pairs if record.flight == members[0]]
+
+
+def cut[T](record: Record, signals: T) -> T:
+    """Return the record's part of signals (f, N, ...) over whole flights."""
+    # Signals are delayed before they are cut, because an input may be logged before it acts.
+    return jax.tree.map(lambda v: v[:, record.first : record.last], signals)
 
 
 def measured(layout: Layout, data: Data, members: list[int]) -> Float[Array, "f N p"]:
@@ -452,11 +437,10 @@ def errors_of_lines(layout: Layout, data: Data, noise: Noise, z: Float[Array, " 
         m, driving = discretised(layout, data, u, members)
         first = m if first is None else first
         y = measured(layout, data, members)
-        for k, (record, W) in enumerate(parts_of_group(layout, noise, members)):
-            made = errors_of_record(resolved(m, record, W), m, driving, y)
-            left = made.y - jnp.einsum("pn,bkcnf->bkcpf", m.C, made.X)
-            left = left.reshape(-1, *left.shape[2:])[: record.lines]
+        for k, (record, W) in enumerate(records_of_group(layout, noise, members)):
+            at = ends_of(m, record, W, driving, y)
             for j, i in enumerate(members):
-                errors[i, k] = jax.lax.complex(left[:, 0, :, j], left[:, 1, :, j])
+                own, outputs = jax.tree.map(lambda v, j=j: v[j], cut(record, (driving, y)))
+                errors[i, k] = lines_of(outputs) - modelled(m, own, at.R, at.inputs[j])
     assert first is not None
     return LineErrors([errors[at] for at in sorted(errors)], first)

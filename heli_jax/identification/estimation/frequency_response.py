@@ -5,11 +5,12 @@ in Hann windows, the error of the model's responses is
 
 $$\Delta H = \overline{E Z^*}\; \overline{U Z^*}^{-1}.$$
 
-The model passes through the same windows as the record, so that windows cause no bias. Its bounded
-solution replaces a simulation, so that it may be unstable. The effects of the record's ends are
-projected out. Errors are complex and linear. The spectral matrix of the noise whitens them between
-outputs and inputs; it is that of the errors' part that no response explains. Lines of a window are
-weighted by their independence.
+The model passes through the same windows as the record, so that windows cause no bias. Its response
+at the lines of the whole record replaces a simulation, so that it may be unstable. These lines lack
+mean and Nyquist frequency, which windows remove. The effects of the record's ends are projected
+out. Errors are complex and linear. The spectral matrix of the noise whitens them between outputs
+and inputs; it is that of the errors' part that no response explains. Lines of a window are weighted
+by their independence.
 
 Sources: Pintelon and Schoukens (2012), chapters 2 and 9; Bendat and Piersol (2010), chapter 9;
 Tischler and Remple (2012), chapters 7 to 12, for the approach. Their logarithmic errors and
@@ -38,10 +39,14 @@ from heli_jax.identification.estimation.evaluation import Evaluation
 from heli_jax.identification.estimation.frequency_instrument import absent_instrument
 from heli_jax.identification.estimation.frequency_lines import (
     Driving,
-    Matrices,
+    Record,
     alike,
+    at_lines,
     discretised,
-    orthonormal,
+    in_time_of,
+    modelled,
+    projection,
+    real_rows,
     shared_of,
     with_shared,
 )
@@ -74,79 +79,6 @@ from heli_jax.identification.unknowns.layout import (
     unpack,
 )
 
-# The model through the windows of the record.
-#
-# With $z = e^{i \pi (2 k + 1) / N}$ the sums $X = (zI - A_d)^{-1} B U$ are those of the solution
-# with $x_N = -x_0$. It is bounded where a simulation diverges. The response over the record is the
-# sum of this solution and of $n$ effects of the ends: those of stable modes decay from the start,
-# those of unstable ones towards the end. Lines half-way between the Fourier lines avoid the pole of
-# an integrator.
-#
-# Sources: Devasia, Chen and Paden (1996) for bounded solutions of unstable plants; Golub and
-# Pereyra (1973) and Kaufman (1975) for the projection.
-
-
-def bounded_outputs(
-    m: Matrices,
-    driving: Driving,
-    R: Complex[Array, "K n n"],
-    ends: Float[Array, " n"] | None = None,
-) -> Float[Array, "p N"]:
-    """Return the outputs over a record by the bounded solution.
-
-    Args:
-        R: result of `inverses`.
-        ends: factors of `effects_of_ends`; default zero.
-    """
-    z, turns = _lines(len(driving.U))
-    U = _at_lines(driving.U, turns) @ m.B.T.astype(z.dtype)
-    if ends is not None:
-        U = U + z[:, None] * ends.astype(z.dtype)[None]
-    # Products replace the derivative of an inverse: dY = H (dAd X + dU) + dC X. The differences are
-    # zero, but their derivatives are not.
-    X = jax.lax.stop_gradient(jnp.einsum("kij,kj->ki", R, U))
-    C = jax.lax.stop_gradient(m.C).astype(z.dtype)
-    dA, dC = ((v - jax.lax.stop_gradient(v)).astype(z.dtype) for v in (m.Ad, m.C))
-    lines = jnp.einsum("kpn,kn->pk", C[None] @ R, U + X @ dA.T) + dC @ X.T
-    return _in_time(lines, turns) + m.D @ driving.held.T
-
-
-def inverses(m: Matrices, samples: int) -> Complex[Array, "K n n"]:
-    """Return (zI - Ad)^-1 at the lines of a record, without a derivative."""
-    z, _ = _lines(samples)
-    Ad = jax.lax.stop_gradient(m.Ad).astype(z.dtype)
-    return jnp.linalg.inv(z[:, None, None] * jnp.eye(len(Ad), dtype=z.dtype)[None] - Ad[None])
-
-
-def effects_of_ends(m: Matrices, R: Complex[Array, "K n n"], samples: int) -> Array:
-    """Return the effects (p, n, N) of a record's ends on the outputs, for each state."""
-    z, turns = _lines(samples)
-    H = jax.lax.stop_gradient(m.C)[None].astype(z.dtype) @ R
-    return _in_time(jnp.moveaxis(H * z[:, None, None], 0, -1), turns)
-
-
-def _lines(N: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return half of the lines z (K,) (the rest are conjugates), and exp(i pi t / N) (N,)."""
-    # With odd N the line at the Nyquist frequency is its own conjugate.
-    k = np.arange((N + 1) // 2)
-    return np.exp(1j * np.pi * (2 * k + 1) / N), np.exp(1j * np.pi * np.arange(N) / N)
-
-
-def _at_lines(v: Float[Array, "N *c"], turns: Complex[np.ndarray, " N"]) -> Complex[Array, "K *c"]:
-    back = np.conj(turns).reshape(-1, *(1 for _ in v.shape[1:]))
-    return jnp.fft.fft(v.astype(turns.dtype) * back, axis=0)[: (turns.size + 1) // 2]
-
-
-def _in_time(
-    lines: Complex[Array, "*c K"], turns: Complex[np.ndarray, " N"]
-) -> Float[Array, "*c N"]:
-    N, K = turns.size, lines.shape[-1]
-    weights = np.full(K, 2.0, turns.dtype)
-    if N % 2:
-        weights[-1] = 1.0
-    of_lines, in_time = (v.reshape(*(1 for _ in lines.shape[1:]), -1) for v in (weights, turns))
-    return jnp.real(jnp.fft.ifft(lines * of_lines, N, axis=-1) * in_time)
-
 
 def _groups(layout: Layout, data: Data, weights: ResponseWeights) -> list[list[int]]:
     """Return groups of flights that have windows and equal layouts."""
@@ -156,7 +88,7 @@ def _groups(layout: Layout, data: Data, weights: ResponseWeights) -> list[list[i
 class _Measured(NamedTuple):
     """Windows of a flight."""
 
-    y: Float[Array, "p N"]
+    y: Float[Array, "N p"]
     """Measured outputs; zero without measurement."""
     Z: Array | np.ndarray
     """Instruments in windows (W, k, m), see `Windowed`."""
@@ -170,7 +102,7 @@ def _measured(data: Data, w: Windowed, members: list[int]) -> _Measured:
     for i in members:
         outputs, own = data.flights[i].outputs, slice(first[i], first[i + 1])
         absent = jnp.zeros_like(next(iter(outputs.values())))
-        y = jnp.stack([jnp.nan_to_num(outputs.get(n, absent)) for n in w.outputs])
+        y = jnp.stack([jnp.nan_to_num(outputs.get(n, absent)) for n in w.outputs], axis=1)
         made.append(_Measured(y, w.Z[own], w.seen[own]))
     return jax.tree.map(lambda *v: jnp.stack(v), *made)
 
@@ -196,17 +128,20 @@ def _by_flight(
     N = next(iter(data.flights[group[0]].outputs.values())).shape[0]
     of_windows = dataclasses.replace(layout, outputs=(w.outputs,) * len(data.flights))
     m, driving = discretised(of_windows, data, u, group)
+    z, R = at_lines(m, Record(group[0], 0, N))
 
-    def windows(y: Array) -> Complex[Array, "p *c W k"]:
+    def windows(y: Float[Array, "N p *c"]) -> Complex[Array, "p *c W k"]:
+        y = jnp.moveaxis(y, 0, -1)
         E = window_transforms(y.reshape(-1, N), w.starts[group[0]], w.length, w.numbers, w.dt)
         return jnp.asarray(E).reshape(*y.shape[:-1], *E.shape[1:])
 
-    R = inverses(m, N)
-    effects = windows(effects_of_ends(m, R, N))
+    H = jax.lax.stop_gradient(m.C)[None].astype(z.dtype) @ R
+    effects = windows(in_time_of(H * z[:, None, None], N))
 
     def of_one(one: tuple[Driving, _Measured, Array | None]) -> Any:
         driving, measured, ends = one
-        left = measured.y - bounded_outputs(m, driving, R, ends)
+        inputs = None if ends is None else z[:, None] * ends[None].astype(z.dtype)
+        left = measured.y - in_time_of(modelled(m, driving, R, inputs), N)
         return body(windows(left), effects, measured)
 
     # Flights are processed one at a time, because the derivatives of one fill the caches.
@@ -228,9 +163,7 @@ def _whitened(weights: ResponseWeights, S: Complex[Array, "k p m c"]) -> Float[A
     w, (k, c) = weights.windows, (S.shape[0], S.shape[3])
     S = S / jnp.sum(w.seen, axis=0).astype(S.dtype)[None, :, None, None]
     dH = jnp.einsum("pkmz,kpzc->kpmc", weights.averages.P, S)
-    rows = weights.whitening @ dH.reshape(k, -1, c)
-    # The real part of a complex normal error has half of its variance.
-    return 2.0**0.5 * jnp.concatenate([jnp.real(rows), jnp.imag(rows)]).reshape(-1, c)
+    return real_rows(weights.whitening @ dH.reshape(k, -1, c))
 
 
 def rows_of_responses(
@@ -253,8 +186,7 @@ def rows_of_responses(
     # Each state of each flight gives one column of end effects.
     columns = [jnp.moveaxis(e, 0, 3).reshape(*e.shape[1:4], -1) for _, e in made]
     basis = _whitened(weights, jnp.concatenate(columns, axis=3))
-    S = orthonormal(basis.T @ basis)
-    Q = basis @ S
+    Q, S = projection(basis)
     along = Q.T @ rows
     # Least squares gives the factors of the effects by group.
     each = jnp.split(S @ along, np.cumsum([c.shape[3] for c in columns])[:-1])
@@ -287,12 +219,11 @@ def errors_in_windows(
         scale = seen / jnp.sqrt(power).T[:, None, :].astype(E.dtype)
 
         def rows(v: Array) -> Array:
-            v = jnp.moveaxis(v * scale[:, None], 1, -1).reshape(-1, v.shape[1])
-            return jnp.concatenate([jnp.real(v), jnp.imag(v)])
+            v = jnp.moveaxis(v * scale[:, None], 1, -1)
+            return real_rows(v.reshape(-1, 1, v.shape[-1]))
 
-        basis = rows(effects)
-        S = orthonormal(basis.T @ basis)
-        ends = S @ (S.T @ (basis.T @ rows(E[:, None])[:, 0]))
+        Q, S = projection(rows(effects))
+        ends = S @ (Q.T @ rows(E[:, None])[:, 0])
         return (E - jnp.einsum("n,pnwk->pwk", ends.astype(E.dtype), effects)) * seen
 
     for group in _groups(layout, data, weights):
