@@ -81,8 +81,13 @@ from heli_jax.identification.unknowns.layout import (
 
 
 def _groups(layout: Layout, data: Data, weights: ResponseWeights) -> list[list[int]]:
-    """Return groups of flights that have windows and equal layouts."""
-    return [g for g in alike(layout, data) if weights.windows.starts[g[0]]]
+    """Return groups of flights that have equal layouts and windows."""
+    starts, groups = weights.windows.starts, dict[Any, list[int]]()
+    for number, members in enumerate(alike(layout, data)):
+        for i in members:
+            if starts[i]:
+                groups.setdefault((number, starts[i]), []).append(i)
+    return list(groups.values())
 
 
 class _Measured(NamedTuple):
@@ -92,18 +97,15 @@ class _Measured(NamedTuple):
     """Measured outputs; zero without measurement."""
     Z: Array | np.ndarray
     """Instruments in windows (W, k, m), see `Windowed`."""
-    seen: Array | np.ndarray
-    """Measured outputs of each window (W, p)."""
 
 
 def _measured(data: Data, w: Windowed, members: list[int]) -> _Measured:
     """Return the windows of some flights, with a leading axis."""
     first, made = np.cumsum([0, *(len(s) for s in w.starts)]), []
     for i in members:
-        outputs, own = data.flights[i].outputs, slice(first[i], first[i + 1])
-        absent = jnp.zeros_like(next(iter(outputs.values())))
-        y = jnp.stack([jnp.nan_to_num(outputs.get(n, absent)) for n in w.outputs], axis=1)
-        made.append(_Measured(y, w.Z[own], w.seen[own]))
+        outputs = data.flights[i].outputs
+        y = jnp.stack([jnp.nan_to_num(outputs[n]) for n in w.outputs], axis=1)
+        made.append(_Measured(y, w.Z[first[i] : first[i + 1]]))
     return jax.tree.map(lambda *v: jnp.stack(v), *made)
 
 
@@ -150,7 +152,6 @@ def _by_flight(
 
 def _cross(measured: _Measured, E: Complex[Array, "p c W k"]) -> Complex[Array, "k p m c"]:
     """Return the products with the instruments in windows, summed over a flight."""
-    E = E * measured.seen.T[:, None, :, None].astype(E.dtype)
     return jnp.einsum("wkz,pcwk->kpzc", jnp.conj(measured.Z), E)
 
 
@@ -161,8 +162,7 @@ def _summed(each: Iterable[Array]) -> Array:
 def _whitened(weights: ResponseWeights, S: Complex[Array, "k p m c"]) -> Float[Array, "r c"]:
     """Return the responses of sums over all flights, in rows of variance 1."""
     w, (k, c) = weights.windows, (S.shape[0], S.shape[3])
-    S = S / jnp.sum(w.seen, axis=0).astype(S.dtype)[None, :, None, None]
-    dH = jnp.einsum("pkmz,kpzc->kpmc", weights.averages.P, S)
+    dH = jnp.einsum("kmz,kpzc->kpmc", weights.averages.P, S / len(w.Z))
     return real_rows(weights.whitening @ dH.reshape(k, -1, c))
 
 
@@ -208,15 +208,14 @@ def rows_of_responses(
 def errors_in_windows(
     layout: Layout, data: Data, weights: ResponseWeights, z: Array
 ) -> Complex[Array, "W k p"]:
-    """Return the transforms of measured less modelled outputs; zero for unmeasured outputs."""
+    """Return the transforms of measured less modelled outputs."""
     u, of_flight = unpack(layout, data, z), dict[int, Array]()
     # The ends are fitted to all windows, each output weighted by its noise, not only to the
     # responses.
     power = jnp.real(jnp.einsum("kii->ki", weights.density))
 
     def left(E: Array, effects: Array, own: _Measured) -> Array:
-        seen = own.seen.T[:, :, None].astype(E.dtype)
-        scale = seen / jnp.sqrt(power).T[:, None, :].astype(E.dtype)
+        scale = 1.0 / jnp.sqrt(power).T[:, None, :].astype(E.dtype)
 
         def rows(v: Array) -> Array:
             v = jnp.moveaxis(v * scale[:, None], 1, -1)
@@ -224,7 +223,7 @@ def errors_in_windows(
 
         Q, S = projection(rows(effects))
         ends = S @ (Q.T @ rows(E[:, None])[:, 0])
-        return (E - jnp.einsum("n,pnwk->pwk", ends.astype(E.dtype), effects)) * seen
+        return E - jnp.einsum("n,pnwk->pwk", ends.astype(E.dtype), effects)
 
     for group in _groups(layout, data, weights):
         made = _by_flight(layout, data, weights, u, group, None, left)
@@ -303,7 +302,7 @@ class FrequencyResponse(Objective):
     def errors_in_windows(
         self, layout: Layout, data: Data, noise: Noise, z: Array
     ) -> Complex[Array, "W k p"]:
-        """Return the transforms of measured less modelled outputs; zero for unmeasured outputs."""
+        """Return the transforms of measured less modelled outputs."""
         return errors_in_windows(layout, data, noise.whitening, z)
 
     def response_agreement(
@@ -330,7 +329,7 @@ class FrequencyResponse(Objective):
             high,
             freedom,
             w.seconds,
-            tuple(zip(w.outputs, w.averages.tolist(), strict=True)),
+            tuple((n, w.averages) for n in w.outputs),
             w.instruments,
             (*left_out, *(() if w.together else (APART,))),
         )
