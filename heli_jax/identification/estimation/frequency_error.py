@@ -28,7 +28,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from heli_jax import naming
 from heli_jax.analysis.operating_point import flown
+from heli_jax.analysis.spectra import windowed
 from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.evaluation import Evaluation, deviations
@@ -62,11 +64,11 @@ from heli_jax.identification.estimation.frequency_lines import (
 )
 from heli_jax.identification.estimation.frequency_noise import (
     first_model,
+    inverse_roots,
     log_determinants,
     once_a_length,
-    whitening_alone,
+    smoothed,
     whitening_by,
-    whitening_without_model,
 )
 from heli_jax.identification.estimation.linearised_flights import (
     cannot_linearise,
@@ -76,6 +78,7 @@ from heli_jax.identification.estimation.objective import Objective, RowTags, unt
 from heli_jax.identification.estimation.output_error import OBJECTIVE as OUTPUT_ERROR
 from heli_jax.identification.estimation.output_error import in_time
 from heli_jax.identification.estimation.residual import Residuals, rows_of
+from heli_jax.identification.estimation.response_weights import averages, noise_density
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
     Data,
@@ -118,8 +121,17 @@ class FrequencyError(Objective):
         return instrumented_inputs(problem, flights)
 
     def first_noise(self, problem: Problem, noise: Noise, flights: Sequence[Flight]) -> Noise:
-        """Add the spectrum of the measured signals."""
-        return first_spectrum(noise, flights)
+        """Add the spectrum of each measured signal alone, as if all of it were noise."""
+        # White noise would give most weight to frequencies of large power, gusts included.
+        measured = []
+        for flight, sd in zip(flights, noise.sd, strict=True):
+            whole = np.stack([flight.outputs[n] for n in sorted(sd)], axis=1)
+            measured += [lines_of(whole[first:last]) for first, last in parts_of(flight)]
+
+        def whitening(S: np.ndarray) -> np.ndarray:
+            return inverse_roots(S * np.eye(S.shape[1]))
+
+        return noise._replace(whitening=tuple(once_a_length(whitening, smoothed(measured))))
 
     def data_at_start(self, data: Data) -> Data:
         """Return by instrument the parts of inputs and outputs that follow the instruments."""
@@ -131,10 +143,27 @@ class FrequencyError(Objective):
     def noise_of_check(self, layout: Layout, data: Data, noise: Noise) -> Noise:
         """Return the spectrum of the outputs' part that the inputs do not explain.
 
-        The errors at the start values would include errors of these values.
+        The errors at the start values would include errors of these values. In closed loop that
+        part is too small where feedback moves the inputs more than the excitation does.
         """
-        whitening = whitening_without_model(layout, data)
-        return noise if whitening is None else noise._replace(whitening=whitening)
+        flights = []
+        for f, names in zip(jax.device_get(data.flights), layout.outputs, strict=True):
+            outputs = {n: f.outputs[n] for n in names}
+            flights.append(Flight(dt=float(f.dt), inputs=naming.asdict(f.inputs), outputs=outputs))
+        try:
+            w = windowed(flights)
+        except ValueError:  # too few windows
+            return noise
+        if w.left_out:
+            return noise
+        # A one-sided density per Hz is twice the sample time times the power of a line.
+        S = noise_density(w, averages(w), w.Y) / (2.0 * w.dt)
+
+        def whitening(record: Record) -> np.ndarray:
+            hz = np.arange(1, record.lines + 1) / (record.samples * w.dt)
+            return inverse_roots(np.apply_along_axis(lambda v: np.interp(hz, w.hz, v), 0, S))
+
+        return noise._replace(whitening=tuple(whitening(r) for r in records_of(layout)))
 
     def relax(
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
@@ -200,19 +229,6 @@ class FrequencyError(Objective):
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
         """Return the simulated flights; the noise includes the disturbances."""
         return OUTPUT_ERROR.records(reached, u, runs, seed)
-
-
-def first_spectrum(noise: Noise, flights: Sequence[Flight]) -> Noise:
-    """Return the noise with the spectrum of the measured signals, as if all of them were noise.
-
-    White noise would give most weight to the frequencies of the largest power, gusts included.
-    """
-    measured = []
-    for flight, sd in zip(flights, noise.sd, strict=True):
-        whole = np.stack([flight.outputs[n] for n in sorted(sd)], axis=1)
-        for first, last in parts_of(flight):
-            measured.append(lines_of(whole[first:last]))
-    return noise._replace(whitening=whitening_alone(measured))
 
 
 _NOTABLE = 0.3

@@ -1,4 +1,4 @@
-"""Spectra of noise and gusts, estimated from residuals of a model or of regressions on inputs."""
+"""Spectra of noise and gusts, estimated from residuals of a model."""
 
 import functools
 from collections import Counter
@@ -6,16 +6,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from heli_jax.identification.estimation.frequency_lines import (
-    Matrices,
-    discretised,
-    lines_of,
-    records_of,
-)
+from heli_jax.identification.estimation.frequency_lines import Matrices, discretised
 from heli_jax.identification.unknowns.layout import Data, Layout, unpack
 
 # Spectra of records at their own frequencies, smoothed over frequency and records.
@@ -26,8 +20,6 @@ from heli_jax.identification.unknowns.layout import Data, Layout, unpack
 LEAST, PART = 6.0, 0.08
 """Least sd of the Gaussian that smooths the noise's spectrum, in lines and as a fraction of the
 frequency. Narrower ones overfit the noise and make intervals too narrow."""
-AVERAGES = 2.0 * np.pi**0.5 * LEAST
-"""Least number of independent lines of one record in a smoothed spectrum: (sum w)^2 / sum w^2."""
 _ROUNDING = 1e-10
 """Least spectrum, as a fraction of the mean over all frequencies."""
 _KNOTS = 4.0
@@ -81,26 +73,6 @@ def summed_powers(v: Complex[np.ndarray, "f K p"]) -> Complex[np.ndarray, "K p p
     """Return the sum of e e^H over records."""
     at_line = v.transpose(1, 2, 0)
     return at_line @ np.conj(at_line.transpose(0, 2, 1))
-
-
-def whitening_alone(
-    lines: Sequence[Complex[np.ndarray, "K p"]],
-) -> tuple[Complex[np.ndarray, "K p p"], ...]:
-    """Return, by record, the whitening of each signal alone, without correlations.
-
-    Raises:
-        numpy.linalg.LinAlgError: a signal is zero throughout.
-    """
-
-    def own(S: np.ndarray) -> np.ndarray:
-        return inverse_roots(S * np.eye(S.shape[1]))
-
-    # The records of a bootstrap may have other outputs.
-    made = {}
-    for p in {v.shape[1] for v in lines}:
-        alike = [v for v in lines if v.shape[1] == p]
-        made |= {(len(W), p): W for W in once_a_length(own, smoothed(alike))}
-    return tuple(made[v.shape] for v in lines)
 
 
 @functools.lru_cache(maxsize=32)
@@ -330,70 +302,3 @@ def _powers_of_gusts(
         shown, due = np.moveaxis((by_shape @ told).reshape(-1, 2, n + p), 1, 0)
         powers = np.maximum(powers * (shown / np.where(due > 0, due, 1.0)), least)
     return powers[:, :n].T, powers[0, n:]
-
-
-_ALONE = 1e-9
-"""Fraction of the inputs' power below which two of them are dependent, and of the outputs' power
-below which there is no residual."""
-
-
-# The noise's spectrum without a model: residual of local regressions of the outputs on inputs.
-#
-# Source: Brillinger, Time Series (1981), chapter 8, for regression of spectra; Pintelon and
-# Schoukens (2012), chapter 7, for the ends of a record as an added smooth function of the
-# frequency.
-
-
-def whitening_without_model(layout: Layout, data: Data) -> tuple[np.ndarray, ...] | None:
-    """Return, by record, the whitening (K, p, p) of the outputs' part that no response to the
-    inputs explains; None with too few lines.
-
-    In closed loop that part is too small where feedback moves the inputs more than the excitation
-    does.
-    """
-    flights = jax.device_get(data.flights)
-    lines = []
-    for record in records_of(layout):
-        flight = flights[record.flight]
-        outputs = [flight.outputs[n] for n in layout.outputs[record.flight]]
-        signals = np.stack([*outputs, *flight.inputs], axis=1)[record.first : record.last]
-        lines.append(lines_of(signals))
-    p = len(layout.outputs[0])
-    powers = np.sum([np.sum(np.abs(v) ** 2, axis=0) for v in lines], axis=0)
-    moving = p + np.flatnonzero(powers[p:] > 0)
-    # A response varies over the lines of a smoothed spectrum, strongly near a mode.
-    order = next((q for q in (2, 1) if (q + 1) * (moving.size + 1) <= 0.5 * AVERAGES), 0)
-    # The effects of a record's ends are smooth over the lines, so a constant is added to the
-    # inputs.
-    size = np.sqrt(np.mean(powers[:p]) / sum(len(v) for v in lines))
-    lines = [np.column_stack([v[:, :p], *_powers(v[:, moving], size, order)]) for v in lines]
-    counts, spectra = tuple(Counter(len(v) for v in lines).items()), smoothed(lines)
-    regressors = spectra[0].shape[1] - p
-    if min(np.min(averages(K, counts)) for K, _ in counts) <= regressors + p:
-        return None
-
-    def whitening(S: np.ndarray) -> np.ndarray:
-        n = averages(len(S), counts)
-        return inverse_roots(_left(S, p) * (n / (n - regressors))[:, None, None])
-
-    return tuple(once_a_length(whitening, spectra))
-
-
-def _powers(inputs: np.ndarray, size: float, order: int) -> list[np.ndarray]:
-    """Return inputs (K, m) and a constant, times powers of the frequency up to an order.
-
-    They are regressors of a response that is locally a polynomial.
-    """
-    beside = np.column_stack([inputs, np.full(len(inputs), size)])
-    f = np.arange(1, len(inputs) + 1)[:, None] / len(inputs)
-    return [beside * f**q for q in range(order + 1)]
-
-
-def _left(S: np.ndarray, p: int) -> np.ndarray:
-    """Return the spectra (K, p, p) of the first p signals, less the part due to the others."""
-    size = np.sqrt(np.real(np.einsum("kii->ki", S)))
-    R = S / (size[:, :, None] * size[:, None, :])
-    others = R[:, p:, p:] + _ALONE * np.eye(S.shape[1] - p)
-    rest = R[:, :p, :p] - R[:, :p, p:] @ np.linalg.solve(others, R[:, p:, :p])
-    rest = 0.5 * (rest + np.conj(np.swapaxes(rest, 1, 2))) + _ALONE * np.eye(p)
-    return rest * size[:, :p, None] * size[:, None, :p]
