@@ -59,7 +59,6 @@ from heli_jax.identification.estimation.frequency_lines import (
     records_of_group,
     shared_of,
     whitened,
-    with_shared,
     without_parts,
 )
 from heli_jax.identification.estimation.frequency_noise import (
@@ -304,14 +303,13 @@ def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Floa
     Args:
         noise: noise with the whitening of each record.
     """
-    v = shared_of(layout, u)
-    at, rest = jax.lax.stop_gradient((v, u))
+    v, unknowns = shared_of(u)
+    at = jax.lax.stop_gradient(v)
     instruments, products = data.flights[0].by_instrument is not None, []
     for members in alike(layout, data):
 
         def model(v: Array, by_instrument: bool, members: list[int] = members) -> Any:
-            here = with_shared(layout, rest, v)
-            return discretised(layout, data, here, members, by_instrument=by_instrument)
+            return discretised(layout, data, unknowns(v), members, by_instrument=by_instrument)
 
         y = measured(layout, data, members)
         for record, W in records_of_group(layout, noise, members):

@@ -8,12 +8,13 @@ Sources: Pintelon and Schoukens (2012), chapters 6 and 10; Golub and Pereyra (19
 (1975) for the projection.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float
 
 from heli_jax import naming
@@ -237,22 +238,17 @@ def _with(values: tuple[Any, ...], i: int, value: Any) -> tuple[Any, ...]:
     return (*values[:i], value, *values[i + 1 :])
 
 
-def shared_of(layout: Layout, u: Unknowns) -> Float[Array, " q"]:
-    """Return the unknowns that all flights share: parameters, gains and the time shift."""
-    params, gains = [u.params[n] for n in layout.free], [u.gains[n] for n in layout.gains]
-    shift = [] if u.shift is None else [u.shift]
-    return jnp.stack([jnp.asarray(v) for v in (*params, *gains, *shift)])
+def shared_of(u: Unknowns) -> tuple[Float[Array, " q"], Callable[[Array], Unknowns]]:
+    """Return the unknowns that all flights share (parameters, gains, time shift), and a function
+    that returns all unknowns with others in their place."""
+    rest = jax.lax.stop_gradient(u)
+    v, restored = ravel_pytree((u.params, u.gains, u.shift))
 
+    def unknowns(v: Array) -> Unknowns:
+        params, gains, shift = restored(v)
+        return rest._replace(params=params, gains=gains, shift=shift)
 
-def with_shared(layout: Layout, u: Unknowns, v: Float[Array, " q"]) -> Unknowns:
-    """Return the unknowns with the shared ones replaced, in the order of `shared_of`."""
-    # The layout's order is used because JAX sorts the keys of dictionaries.
-    values = dict(zip((*layout.free, *layout.gains), v, strict=False))
-    return u._replace(
-        params={n: values[n] for n in layout.free},
-        gains={n: values[n] for n in layout.gains},
-        shift=None if u.shift is None else v[-1],
-    )
+    return v, unknowns
 
 
 # The model at the lines of a record.

@@ -48,7 +48,6 @@ from heli_jax.identification.estimation.frequency_lines import (
     projection,
     real_rows,
     shared_of,
-    with_shared,
 )
 from heli_jax.identification.estimation.objective import Objective, RowTags, untagged
 from heli_jax.identification.estimation.output_error import OBJECTIVE as OUTPUT_ERROR
@@ -56,7 +55,6 @@ from heli_jax.identification.estimation.output_error import in_time
 from heli_jax.identification.estimation.residual import Residuals
 from heli_jax.identification.estimation.response_weights import (
     ResponseWeights,
-    back,
     first_weights,
     noise_density,
     on_device,
@@ -170,13 +168,12 @@ def rows_of_responses(
     layout: Layout, data: Data, weights: ResponseWeights, u: Unknowns
 ) -> Float[Array, " r"]:
     """Return the whitened errors of all responses, with the effects of the ends projected out."""
-    v, groups = shared_of(layout, u), _groups(layout, data, weights)
-    at, rest = jax.lax.stop_gradient((v, u))
+    groups, (v, unknowns) = _groups(layout, data, weights), shared_of(u)
+    at = jax.lax.stop_gradient(v)
 
     def sums(v: Array, ends: Sequence[Array | None], body: Callable[..., Any]) -> list[Any]:
-        here = with_shared(layout, rest, v)
         each = zip(groups, ends, strict=True)
-        return [_by_flight(layout, data, weights, here, g, end, body) for g, end in each]
+        return [_by_flight(layout, data, weights, unknowns(v), g, end, body) for g, end in each]
 
     def with_effects(E: Array, effects: Array, own: _Measured) -> Any:
         return _cross(own, E[:, None]), _cross(own, effects)
@@ -270,7 +267,7 @@ class FrequencyResponse(Objective):
     ) -> tuple[Float[Array, " q"], Noise]:
         """Estimate the spectrum of the errors' part that no response explains."""
         z = in_time(layout, data, noise, z)
-        weights = back(noise.whitening)
+        weights = jax.device_get(noise.whitening)
         errors = np.asarray(errors_in_windows(layout, data, noise.whitening, z))
         density = noise_density(weights.windows, weights.averages, errors)
         weights = weighed(weights, density)
@@ -299,17 +296,11 @@ class FrequencyResponse(Objective):
         """Return the simulated flights; the noise includes the disturbances."""
         return OUTPUT_ERROR.records(reached, u, runs, seed)
 
-    def errors_in_windows(
-        self, layout: Layout, data: Data, noise: Noise, z: Array
-    ) -> Complex[Array, "W k p"]:
-        """Return the transforms of measured less modelled outputs."""
-        return errors_in_windows(layout, data, noise.whitening, z)
-
     def response_agreement(
         self, layout: Layout, data: Data, noise: Noise, z: Array
     ) -> ResponseAgreement | None:
         """Return chi-squared and Tischler's J of every response."""
-        weights = back(noise.whitening)
+        weights = jax.device_get(noise.whitening)
         w, used = weights.windows, weights.used
         E = response_of(
             w, weights.averages, np.asarray(errors_in_windows(layout, data, noise.whitening, z))

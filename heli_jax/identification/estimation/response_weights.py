@@ -369,8 +369,3 @@ def _require_numbers(problem: Problem, weights: ResponseWeights) -> None:
 def on_device(weights: ResponseWeights) -> ResponseWeights:
     """Return the weights as JAX arrays, copied once instead of with every call."""
     return jax.tree.map(lambda v: jax.device_put(v) if isinstance(v, np.ndarray) else v, weights)
-
-
-def back(weights: ResponseWeights) -> ResponseWeights:
-    """Return the weights as NumPy arrays."""
-    return jax.tree.map(lambda v: np.asarray(v) if isinstance(v, jax.Array) else v, weights)
