@@ -154,7 +154,8 @@ def noise_density(
     kernel = np.exp(-0.5 * ((w.lines[:, None] - w.lines[None, :]) / width[:, None]) ** 2)
     kernel = kernel / np.sum(kernel, axis=1, keepdims=True)
     # The regression is on the instruments, because the response is unbounded without excitation.
-    left = E - w.Z @ (_inverse_power(w) @ _cross(w.Z, E))
+    explained = _inverse_power(w) @ _cross(w.Z, E)
+    left = E - np.einsum("wkm,kmp->wkp", w.Z, explained, optimize=True)
     own = np.sum(np.abs(left) ** 2, axis=0) / at.freedom[:, None]
     own = np.maximum(own, floor)
     # The mean over lines of a steep spectrum is too large. So it is taken of the spectrum over its
@@ -213,7 +214,7 @@ def whitening(
 def partial_coherence(w: Windowed, at: Averages) -> Float[np.ndarray, "k p m"]:
     """Return the partial coherence of each output with each input; 0 if inputs are dependent."""
     H = response_of(w, at, w.Y)
-    left = w.Y - w.U @ np.swapaxes(H, 1, 2)
+    left = w.Y - np.einsum("wkm,kpm->wkp", w.U, H, optimize=True)
     density = np.mean(np.abs(left) ** 2, axis=0)
     spread = np.einsum("kxa,kab,kxb->kx", at.P, _cross(w.Z, w.Z), np.conj(at.P), optimize=True)
     error = density[:, :, None] * np.real(spread)[:, None, :]
