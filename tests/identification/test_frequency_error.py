@@ -23,9 +23,12 @@ from heli_jax import (
 )
 from heli_jax.dynamics.jacobians import point
 from heli_jax.identification.estimation.data import data_of, start_vector
-from heli_jax.identification.estimation.frequency_lines import cut_notes, errors_of_lines
+from heli_jax.identification.estimation.frequency_lines import (
+    cut_notes,
+    errors_of_lines,
+    linear_drive,
+)
 from heli_jax.identification.estimation.frequency_noise import smoothed
-from heli_jax.identification.estimation.linearised_flights import linear_drive
 from heli_jax.identification.estimation.noise_covariance import first_noise
 from heli_jax.identification.estimation.simulated_flights import Drive
 from heli_jax.identification.select import MethodComparison, MethodResult

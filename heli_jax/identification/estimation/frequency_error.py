@@ -46,6 +46,8 @@ from heli_jax.identification.estimation.frequency_lines import (
     Matrices,
     Record,
     alike,
+    cannot_linearise,
+    condition_of,
     cut_notes,
     discretised,
     ends_of,
@@ -68,10 +70,6 @@ from heli_jax.identification.estimation.frequency_noise import (
     once_a_length,
     smoothed,
     whitening_by,
-)
-from heli_jax.identification.estimation.linearised_flights import (
-    cannot_linearise,
-    condition_of,
 )
 from heli_jax.identification.estimation.objective import Objective, RowTags, untagged
 from heli_jax.identification.estimation.output_error import OBJECTIVE as OUTPUT_ERROR
