@@ -37,22 +37,19 @@ def smoothed(
         least: least sd in lines.
     """
     p, counts = lines[0].shape[1], Counter(len(v) for v in lines)
-    # Records of equal length share spectrum and kernel, so their powers are added first. A spectrum
-    # is Hermitian, so the lower half is enough.
-    below = np.tril_indices(p)
+    # Records of equal length share spectrum and kernel, so their powers are added first.
     sums = {}
     for K in counts:
-        power = summed_powers(np.stack([v for v in lines if len(v) == K]))[:, below[0], below[1]]
-        # The view as doubles needs complex numbers in double precision.
-        sums[K] = np.ascontiguousarray(power, dtype=complex).view(float)
+        power = summed_powers(np.stack([v for v in lines if len(v) == K]))
+        # Products of real matrices are faster than those with complex ones.
+        sums[K] = np.ascontiguousarray(power.reshape(K, -1), dtype=complex).view(float)
     spectra = {}
     for K in counts:
         kernels = {other: _kernel(K, other, part, least) for other in counts}
-        total = sum(kernels[other][0] @ power for other, power in sums.items())
-        weight = sum(counts[other] * of_one for other, (_, of_one) in kernels.items())
-        half = _between_knots(total / np.asarray(weight)[:, None], K, part, least).view(complex)
-        S = np.empty((K, p, p), complex)
-        S[:, below[1], below[0]], S[:, below[0], below[1]] = np.conj(half), half
+        total = sum(kernels[other] @ power for other, power in sums.items())
+        weight = sum(n * np.sum(kernels[other], axis=1) for other, n in counts.items())
+        S = _between_knots(total / np.asarray(weight)[:, None], K, part, least)
+        S = S.view(complex).reshape(K, p, p)
         own = np.einsum("kii->ki", S)
         own += _ROUNDING * np.mean(np.real(own), axis=0)
         spectra[K] = S
@@ -76,58 +73,32 @@ def summed_powers(v: Complex[np.ndarray, "f K p"]) -> Complex[np.ndarray, "K p p
 
 
 @functools.lru_cache(maxsize=32)
-def knots_of(
-    K: int, part: float = PART, least: float = LEAST
-) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Return the knots for K lines, and their weights for interpolation.
-
-    A spectrum is computed at the knots (lines from 0). Each line gets the knot below and the weight
-    of the next one.
-    """
+def _knots(K: int, part: float, least: float) -> np.ndarray:
+    """Return the lines, counted from 0 to K - 1, at which a spectrum is computed."""
     knots = [0]
     while knots[-1] < K - 1:
         width = max(least, part * (knots[-1] + 1))
         knots.append(min(knots[-1] + max(1, int(width / _KNOTS)), K - 1))
-    at = np.array(knots if K > 1 else [0, 0])
+    return np.array(knots if K > 1 else [0, 0])
+
+
+def _between_knots(values: np.ndarray, K: int, part: float, least: float) -> np.ndarray:
+    """Interpolate values at the knots (knots, ...) to all lines (K, ...)."""
+    at = _knots(K, part, least)
     low = np.clip(np.searchsorted(at, np.arange(K), side="right") - 1, 0, len(at) - 2)
     share = (np.arange(K) - at[low]) / np.maximum(at[low + 1] - at[low], 1)
-    return at, (low, share)
-
-
-def _between_knots(at_knots: np.ndarray, K: int, part: float, least: float) -> np.ndarray:
-    """Interpolate values at the knots (knots, ...) to all lines (K, ...)."""
-    _, (low, share) = knots_of(K, part, least)
-    share = share.reshape(-1, *(1 for _ in at_knots.shape[1:]))
-    return at_knots[low] + share * np.diff(at_knots, axis=0)[low]
+    share = share.reshape(-1, *(1 for _ in values.shape[1:]))
+    return values[low] + share * np.diff(values, axis=0)[low]
 
 
 @functools.lru_cache(maxsize=32)
-def _kernel(
-    K: int, other: int, part: float, least: float
-) -> tuple[Float[np.ndarray, "knots other"], Float[np.ndarray, " knots"]]:
-    """Return the weights of a record of `other` lines at the knots of K lines, and their sums."""
+def _kernel(K: int, other: int, part: float, least: float) -> Float[np.ndarray, "knots other"]:
+    """Return the weights of a record of `other` lines at the knots of K lines."""
     # Frequencies are relative to the sampling rate, which all records share.
-    f, first = (knots_of(K, part, least)[0] + 1) / (2 * K + 1), 1 / (2 * other + 1)
+    f, first = (_knots(K, part, least) + 1) / (2 * K + 1), 1 / (2 * other + 1)
     g = first * np.arange(1, other + 1)
     width = np.maximum(least * first, part * f)
-    kernel = np.exp(-0.5 * ((f[:, None] - g[None, :]) / width[:, None]) ** 2)
-    return kernel, kernel.sum(axis=1)
-
-
-@functools.lru_cache(maxsize=32)
-def averages(
-    K: int, counts: tuple[tuple[int, int], ...], part: float = PART, least: float = LEAST
-) -> Float[np.ndarray, " K"]:
-    """Return the number of independent lines (K,) in a smoothed spectrum, (sum w)^2 / sum w^2.
-
-    Args:
-        counts: for each length, the lines of a record and the number of records.
-    """
-    at, _ = knots_of(K, part, least)
-    kernels = [(n, *_kernel(K, other, part, least)) for other, n in counts]
-    total = sum(n * of_one for n, _, of_one in kernels)
-    squares = sum(n * np.sum(w**2, axis=1) for n, w, _ in kernels)
-    return np.interp(np.arange(K), at, total**2 / squares)
+    return np.exp(-0.5 * ((f[:, None] - g[None, :]) / width[:, None]) ** 2)
 
 
 def inverse_roots(S: Complex[np.ndarray, "K p p"]) -> Complex[np.ndarray, "K p p"]:
@@ -167,7 +138,7 @@ def log_determinants(W: Complex[np.ndarray, "K p p"]) -> Float[np.ndarray, " K"]
 GUST_LEAST, GUST_PART = 12.0, 0.12
 """Least sd of the Gaussian that smooths the rest, in lines and as a fraction of the frequency."""
 _CELLS = 0.16, 6.0
-"""`part` and `least` of the spectral cells, see `knots_of`. Up to the fiftieth line cells are
+"""`part` and `least` of the spectral cells, see `_knots`. Up to the fiftieth line cells are
 single lines, because slow modes are narrow; above they span 4 % of the frequency."""
 _OCTAVES = 2
 """Octaves between the corners of the gusts' spectra."""
@@ -189,15 +160,17 @@ def whitening_by(
     vehicle: Matrices, errors: Sequence[Complex[np.ndarray, "K p"]]
 ) -> tuple[Complex[np.ndarray, "K p p"], ...]:
     """Return the whitening of each record's errors; records of equal length share an array."""
-    counts = Counter(len(e) for e in errors)
+    counts, p = Counter(len(e) for e in errors), errors[0].shape[1]
     before = _prewhitening(vehicle, errors, list(counts))
     left = smoothed(
         [np.einsum("kij,kj->ki", before[len(e)], e) for e in errors], GUST_PART, least=GUST_LEAST
     )
-    p = errors[0].shape[1]
 
     def whitening(S: np.ndarray) -> np.ndarray:
-        n = averages(len(S), tuple(counts.items()), GUST_PART, GUST_LEAST)
+        # Number of independent lines in the smoothed spectrum, (sum w)^2 / sum w^2.
+        kernels = [(n, _kernel(len(S), K, GUST_PART, GUST_LEAST)) for K, n in counts.items()]
+        total, squares = (sum(n * np.sum(w**k, axis=1) for n, w in kernels) for k in (1, 2))
+        n = _between_knots(total**2 / np.asarray(squares), len(S), GUST_PART, GUST_LEAST)
         n = np.maximum(n, p + 1.0)
         return ((n - p) / n)[:, None, None] * (inverse_roots(S) @ before[len(S)])
 
@@ -212,7 +185,7 @@ def _prewhitening(
     cells = []
     for K in lengths:
         of_length = np.stack([e for e in errors if len(e) == K])
-        at, _ = knots_of(K, *_CELLS)
+        at = _knots(K, *_CELLS)
         edges = np.concatenate([[0], (at[1:] + at[:-1] + 1) // 2])
         count = np.diff(np.append(edges, K)).astype(float)
         power = np.add.reduceat(summed_powers(of_length), edges, axis=0)
