@@ -121,9 +121,10 @@ def test_what_follows_an_excitation_is_found():
         y = rng.standard_normal(n)
         flights.append(Flight(dt=DT, inputs={"lat": u}, outputs={"p": y}, instruments={"lat": r}))
         answers.append(answer)
-    made = following(flights, ["lat"], [f.instruments["lat"][:, None] for f in flights])
+    inputs = [f.inputs["lat"][:, None] for f in flights]
+    made = following(inputs, [f.instruments["lat"][:, None] for f in flights])
     for found, answer in zip(made, answers, strict=True):
-        left = found["lat"] - found["lat"].mean() - (answer - answer.mean())
+        left = found[:, 0] - found.mean() - (answer - answer.mean())
         assert np.std(left) < 0.25 * np.std(answer)
 
 
