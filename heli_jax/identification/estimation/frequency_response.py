@@ -18,7 +18,7 @@ coherence weights are not used, because they lose a factor of 2 to 10 in precisi
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -88,73 +88,54 @@ def _groups(layout: Layout, data: Data, weights: ResponseWeights) -> list[list[i
     return list(groups.values())
 
 
-class _Measured(NamedTuple):
-    """Windows of a flight."""
+class _InWindows(NamedTuple):
+    """A group of flights in windows."""
 
-    y: Float[Array, "N p"]
-    """Measured outputs; zero without measurement."""
-    Z: Array | np.ndarray
-    """Instruments in windows (W, k, m), see `Windowed`."""
-
-
-def _measured(data: Data, w: Windowed, members: list[int]) -> _Measured:
-    """Return the windows of some flights, with a leading axis."""
-    first, made = np.cumsum([0, *(len(s) for s in w.starts)]), []
-    for i in members:
-        outputs = data.flights[i].outputs
-        y = jnp.stack([jnp.nan_to_num(outputs[n]) for n in w.outputs], axis=1)
-        made.append(_Measured(y, w.Z[first[i] : first[i + 1]]))
-    return jax.tree.map(lambda *v: jnp.stack(v), *made)
+    E: Complex[Array, "f W k p"]
+    """Transforms of measured less modelled outputs."""
+    effects: Complex[Array, "W k p n"]
+    """Those of the effects of a record's ends, by state."""
+    Z: Complex[Array, "f W k m"]
+    """Transforms of the instruments, see `Windowed`."""
 
 
-def _by_flight(
+def _in_windows(
     layout: Layout,
     data: Data,
-    weights: ResponseWeights,
+    w: Windowed,
     u: Unknowns,
     group: list[int],
-    ends: Float[Array, "f n"] | None,
-    body: Callable[[Array, Array, _Measured], Any],
-) -> Any:
-    """Return `body(E, effects, measured)` of each flight of a group, with a leading axis.
-
-    E (p, W, k) are the errors of the outputs in windows, effects (p, n, W, k) those of the record's
-    ends.
+    ends: Float[Array, "f n"] | None = None,
+) -> _InWindows:
+    """Send records and model of a group through the windows.
 
     Args:
         ends: factors of the effects, by flight; default zero.
     """
-    w = weights.windows
-    N = next(iter(data.flights[group[0]].outputs.values())).shape[0]
+    outputs = [data.flights[i].outputs for i in group]
+    # Zeros stand for samples outside of the windows.
+    y = jnp.stack([jnp.stack([jnp.nan_to_num(o[n]) for n in w.outputs], axis=1) for o in outputs])
+    N = y.shape[1]
     of_windows = dataclasses.replace(layout, outputs=(w.outputs,) * len(data.flights))
     m, driving = discretised(of_windows, data, u, group)
     z, R = at_lines(m, Record(group[0], 0, N))
 
-    def windows(y: Float[Array, "N p *c"]) -> Complex[Array, "p *c W k"]:
-        y = jnp.moveaxis(y, 0, -1)
-        E = window_transforms(y.reshape(-1, N), w.starts[group[0]], w.length, w.numbers, w.dt)
-        return jnp.asarray(E).reshape(*y.shape[:-1], *E.shape[1:])
+    def windows(y: Float[Array, "N p *c"]) -> Complex[Array, "W k p *c"]:
+        signals, starts = y.reshape(N, -1).T, w.starts[group[0]]
+        X = jnp.asarray(window_transforms(signals, starts, w.length, w.numbers, w.dt))
+        return jnp.moveaxis(X, 0, -1).reshape(*X.shape[1:], *y.shape[1:])
+
+    def errors(driving: Driving, y: Array, ends: Array | None) -> Complex[Array, "W k p"]:
+        inputs = None if ends is None else z[:, None] * ends[None].astype(z.dtype)
+        return windows(y - in_time_of(modelled(m, driving, R, inputs), N))
 
     H = jax.lax.stop_gradient(m.C)[None].astype(z.dtype) @ R
-    effects = windows(in_time_of(H * z[:, None, None], N))
-
-    def of_one(one: tuple[Driving, _Measured, Array | None]) -> Any:
-        driving, measured, ends = one
-        inputs = None if ends is None else z[:, None] * ends[None].astype(z.dtype)
-        left = measured.y - in_time_of(modelled(m, driving, R, inputs), N)
-        return body(windows(left), effects, measured)
-
-    # Flights are processed one at a time, because the derivatives of one fill the caches.
-    return jax.lax.map(of_one, (driving, _measured(data, w, group), ends))
-
-
-def _cross(measured: _Measured, E: Complex[Array, "p c W k"]) -> Complex[Array, "k p m c"]:
-    """Return the products with the instruments in windows, summed over a flight."""
-    return jnp.einsum("wkz,pcwk->kpzc", jnp.conj(measured.Z), E)
-
-
-def _summed(each: Iterable[Array]) -> Array:
-    return jnp.sum(jnp.concatenate(list(each)), axis=0)
+    first = np.cumsum([0, *(len(s) for s in w.starts)])
+    return _InWindows(
+        jax.vmap(errors)(driving, y, ends),
+        windows(in_time_of(H * z[:, None, None], N)),
+        jnp.stack([w.Z[first[i] : first[i + 1]] for i in group]),
+    )
 
 
 def _whitened(weights: ResponseWeights, S: Complex[Array, "k p m c"]) -> Float[Array, "r c"]:
@@ -171,33 +152,28 @@ def rows_of_responses(
     groups, (v, unknowns) = _groups(layout, data, weights), shared_of(u)
     at = jax.lax.stop_gradient(v)
 
-    def sums(v: Array, ends: Sequence[Array | None], body: Callable[..., Any]) -> list[Any]:
-        each = zip(groups, ends, strict=True)
-        return [_by_flight(layout, data, weights, unknowns(v), g, end, body) for g, end in each]
+    def errors(v: Array, ends: Sequence[Array | None]) -> Float[Array, " r"]:
+        sums = []
+        for group, factors in zip(groups, ends, strict=True):
+            E, _, Z = _in_windows(layout, data, weights.windows, unknowns(v), group, factors)
+            sums.append(jnp.einsum("fwkz,fwkp->kpz", jnp.conj(Z), E))
+        return _whitened(weights, jnp.sum(jnp.stack(sums), axis=0)[..., None])[:, 0]
 
-    def with_effects(E: Array, effects: Array, own: _Measured) -> Any:
-        return _cross(own, E[:, None]), _cross(own, effects)
-
-    made = sums(at, [None] * len(groups), with_effects)
-    rows = _whitened(weights, _summed(S for S, _ in made))[:, 0]
     # Each state of each flight gives one column of end effects.
-    columns = [jnp.moveaxis(e, 0, 3).reshape(*e.shape[1:4], -1) for _, e in made]
-    basis = _whitened(weights, jnp.concatenate(columns, axis=3))
-    Q, S = projection(basis)
-    along = Q.T @ rows
+    columns = []
+    for group in groups:
+        _, effects, Z = _in_windows(layout, data, weights.windows, unknowns(at), group)
+        made = jnp.einsum("fwkz,wkpn->kpzfn", jnp.conj(Z), effects)
+        columns.append(made.reshape(*made.shape[:3], -1))
+    Q, S = projection(_whitened(weights, jnp.concatenate(columns, axis=3)))
     # Least squares gives the factors of the effects by group.
-    each = jnp.split(S @ along, np.cumsum([c.shape[3] for c in columns])[:-1])
-    ends = [v.reshape(len(e), -1) for v, (_, e) in zip(each, made, strict=True)]
-
-    def errors(v: Array) -> Array:
-        return _whitened(
-            weights, _summed(sums(v, ends, lambda E, _, own: _cross(own, E[:, None])))
-        )[:, 0]
-
+    factors = S @ (Q.T @ errors(at, [None] * len(groups)))
+    each = jnp.split(factors, np.cumsum([c.shape[3] for c in columns])[:-1])
+    ends = [v.reshape(len(group), -1) for v, group in zip(each, groups, strict=True)]
     # Variable projection (Kaufman): derivatives keep these factors fixed. Only unknowns shared by
     # all flights count, because nuisances have no effect here.
-    J = jax.jacfwd(errors)(at)
-    rows, J = jax.lax.stop_gradient((rows - Q @ along, J - Q @ (Q.T @ J)))
+    J = jax.jacfwd(errors)(at, ends)
+    rows, J = jax.lax.stop_gradient((errors(at, ends), J - Q @ (Q.T @ J)))
     return rows + J @ (v - at)
 
 
@@ -211,20 +187,16 @@ def errors_in_windows(
     # responses.
     power = jnp.real(jnp.einsum("kii->ki", weights.density))
 
-    def left(E: Array, effects: Array, own: _Measured) -> Array:
-        scale = 1.0 / jnp.sqrt(power).T[:, None, :].astype(E.dtype)
-
-        def rows(v: Array) -> Array:
-            v = jnp.moveaxis(v * scale[:, None], 1, -1)
-            return real_rows(v.reshape(-1, 1, v.shape[-1]))
-
-        Q, S = projection(rows(effects))
-        ends = S @ (Q.T @ rows(E[:, None])[:, 0])
-        return E - jnp.einsum("n,pnwk->pwk", ends.astype(E.dtype), effects)
+    def rows(v: Complex[Array, "W k p c"]) -> Float[Array, "r c"]:
+        v = v / jnp.sqrt(power)[None, :, :, None].astype(v.dtype)
+        return real_rows(v.reshape(-1, *v.shape[2:]))
 
     for group in _groups(layout, data, weights):
-        made = _by_flight(layout, data, weights, u, group, None, left)
-        of_flight |= {i: jnp.moveaxis(made[j], 0, -1) for j, i in enumerate(group)}
+        E, effects, _ = _in_windows(layout, data, weights.windows, u, group)
+        Q, S = projection(rows(effects))
+        factors = (S @ (Q.T @ rows(jnp.moveaxis(E, 0, -1)))).astype(E.dtype)
+        left = E - jnp.einsum("nf,wkpn->fwkp", factors, effects)
+        of_flight |= dict(zip(group, left, strict=True))
     return jnp.concatenate([of_flight[i] for i in sorted(of_flight)])
 
 
