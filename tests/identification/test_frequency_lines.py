@@ -13,9 +13,9 @@ from heli_jax.identification.estimation.frequency_lines import (
     Record,
     at_lines,
     ends_of,
+    errors_of_record,
     modelled,
     projection,
-    whitened,
 )
 
 
@@ -43,7 +43,7 @@ def test_every_run_of_a_model_is_its_response_at_the_lines_and_the_effects_of_th
     W = jnp.broadcast_to(jnp.eye(2, dtype=complex), (len(z), 2, 2))
     record, one = Record(0, 0, samples), jax.tree.map(lambda v: v[None], signals)
     at = ends_of(machine, record, W, one, jnp.asarray(y)[None])
-    left = whitened(machine, record, W, one, jnp.asarray(y)[None], at.R, at.inputs)
+    left = errors_of_record(machine, record, one, jnp.asarray(y)[None], at.R, at.inputs)
     np.testing.assert_allclose(left, 0.0, atol=1e-8 * np.max(np.abs(lines)))
 
 

@@ -52,6 +52,7 @@ from heli_jax.identification.estimation.frequency_lines import (
     discretised,
     ends_of,
     errors_of_lines,
+    errors_of_record,
     lines_of,
     measured,
     orthonormal,
@@ -343,7 +344,7 @@ def _errors_of_record(
         m, driving = model(v, by_instrument)
         # Inputs by instrument have no effects of ends.
         ends = None if by_instrument else at.inputs
-        return whitened(m, record, W, driving, outputs, at.R, ends)
+        return whitened(W, errors_of_record(m, record, driving, outputs, at.R, ends))
 
     def slopes(by_instrument: bool) -> Float[Array, "r q"]:
         # Variable projection (Kaufman): derivatives keep the ends fixed.

@@ -450,31 +450,37 @@ def ends_of(
     H = whitening.astype(z.dtype) @ m.C[None].astype(z.dtype) @ R
     made = H[:, :, None, :] * effects[:, None, :, None]
     Q, S = projection(real_rows(made.reshape(K, p, -1)))
-    factors = whitened(m, record, whitening, driving, outputs, R) @ Q @ S.T
-    factors = factors.reshape(len(outputs), -1, n).astype(z.dtype)
+    e = whitened(whitening, errors_of_record(m, record, driving, outputs, R))
+    factors = (e @ Q @ S.T).reshape(len(outputs), -1, n).astype(z.dtype)
     return Ends(R, Q, jnp.einsum("ke,fen->fkn", effects, factors))
 
 
-def whitened(
+def errors_of_record(
     m: Matrices,
     record: Record,
-    whitening: Complex[Array, "K p p"],
     driving: Driving,
     outputs: Float[Array, "f N p"],
     R: Complex[Array, "K n n"],
     ends: Complex[Array, "f K n"] | None = None,
-) -> Float[Array, "f r"]:
-    """Return measured less modelled outputs of one record of each flight, in rows of variance 1.
+) -> Complex[Array, "f K p"]:
+    """Return measured less modelled outputs at the lines of one record of each flight.
 
     The arguments are those of `ends_of` and `modelled`.
     """
-    W = whitening.astype(R.dtype)
 
-    def of_flight(driving: Driving, outputs: Array, ends: Array | None) -> Array:
-        e = lines_of(outputs) - modelled(m, driving, R, ends)
-        return real_rows(jnp.einsum("kij,kj->ki", W, e))
+    def of_flight(driving: Driving, outputs: Array, ends: Array | None) -> Complex[Array, "K p"]:
+        return lines_of(outputs) - modelled(m, driving, R, ends)
 
-    return jax.vmap(of_flight)(*cut(record, (driving, outputs)), ends)
+    # Signals are delayed before they are cut, because an input may be logged before it acts.
+    whole = (driving, outputs)
+    return jax.vmap(of_flight)(
+        *jax.tree.map(lambda v: v[:, record.first : record.last], whole), ends
+    )
+
+
+def whitened(W: Complex[Array, "K p p"], errors: Complex[Array, "f K p"]) -> Float[Array, "f r"]:
+    """Return the errors of each flight in rows of variance 1."""
+    return jax.vmap(real_rows)(jnp.einsum("kij,fkj->fki", W.astype(errors.dtype), errors))
 
 
 def records_of_group(
@@ -484,12 +490,6 @@ def records_of_group(
     # Records of equal length share one spectrum (`smoothed`), that of the first flight.
     pairs = zip(records_of(layout), noise.whitening, strict=True)
     return [(record, W) for record, W in pairs if record.flight == members[0]]
-
-
-def cut[T](record: Record, signals: T) -> T:
-    """Return the record's part of signals (f, N, ...) over whole flights."""
-    # Signals are delayed before they are cut, because an input may be logged before it acts.
-    return jax.tree.map(lambda v: v[:, record.first : record.last], signals)
 
 
 def measured(layout: Layout, data: Data, members: list[int]) -> Float[Array, "f N p"]:
@@ -518,8 +518,7 @@ def errors_of_lines(layout: Layout, data: Data, noise: Noise, z: Float[Array, " 
         y = measured(layout, data, members)
         for k, (record, W) in enumerate(records_of_group(layout, noise, members)):
             at = ends_of(m, record, W, driving, y)
-            for j, i in enumerate(members):
-                own, outputs = jax.tree.map(lambda v, j=j: v[j], cut(record, (driving, y)))
-                errors[i, k] = lines_of(outputs) - modelled(m, own, at.R, at.inputs[j])
+            made = errors_of_record(m, record, driving, y, at.R, at.inputs)
+            errors |= {(i, k): e for i, e in zip(members, made, strict=True)}
     assert first is not None
     return LineErrors([errors[at] for at in sorted(errors)], first)
