@@ -304,15 +304,13 @@ class Windowed(NamedTuple):
     numbers: tuple[int, ...]
     """Numbers of the k lines [periods in a window]."""
     starts: tuple[tuple[int, ...], ...]
-    """First sample of each window, by flight."""
+    """First sample of each window in which no output lacks a sample, by flight."""
     Z: np.ndarray
     """Transforms (W, k, m) of the instruments, or of the inputs themselves."""
     U: np.ndarray
     """Transforms (W, k, m) of the inputs."""
     Y: np.ndarray
-    """Transforms (W, k, p) of the outputs; zero where a sample is missing."""
-    seen: np.ndarray
-    """Mask (W, p): 1 if all samples of an output exist, else 0."""
+    """Transforms (W, k, p) of the outputs."""
     left_out: dict[str, str]
     """Reasons why outputs are left out, by output."""
 
@@ -336,15 +334,19 @@ class Windowed(NamedTuple):
         """Distance between the starts of consecutive windows [samples]."""
         return _step(self.length)
 
-    def later(self, steps: int) -> np.ndarray:
-        """True (W - steps,) where the window `steps` later belongs to the same flight."""
-        flight = np.repeat(np.arange(len(self.starts)), [len(s) for s in self.starts])
-        return flight[steps:] == flight[: len(flight) - steps]
+    def pairs(self, steps: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the indices of windows that are `steps` steps apart in one flight."""
+        at = np.concatenate(
+            [[(i, s // self.step) for s in v] for i, v in enumerate(self.starts) if v]
+        )
+        return np.nonzero(
+            (at[:, None, 0] == at[None, :, 0]) & (at[:, None, 1] + steps == at[None, :, 1])
+        )
 
     @property
-    def common(self) -> np.ndarray:
-        """Mask (W,): 1 if a window has every sample of all outputs, else 0."""
-        return np.min(np.asarray(self.seen), axis=1)
+    def averages(self) -> float:
+        """Number of independent averages."""
+        return len(self.Z) / PER_AVERAGE
 
     @property
     def together(self) -> bool:
@@ -352,13 +354,8 @@ class Windowed(NamedTuple):
 
         The inverse of a spectral matrix from few averages is too large.
         """
-        left = np.sum(self.common) / PER_AVERAGE - len(self.inputs)
+        left = self.averages - len(self.inputs)
         return len(self.outputs) == 1 or bool(left * _SMOOTHED >= _FOR_MATRIX * len(self.outputs))
-
-    @property
-    def averages(self) -> np.ndarray:
-        """Independent averages (p,) of each output."""
-        return np.sum(self.seen, axis=0) / PER_AVERAGE
 
 
 def window_transforms(
@@ -401,7 +398,7 @@ def windowed(
 
     Raises:
         ValueError: rates differ, nothing moves, the band does not fit the window or the rate, or
-            every output has too few windows.
+            every output has too few windows without a missing sample.
     """
     dt, seconds, inputs = chosen(flights, options.window)
     # An even length makes half a window a whole number of samples.
@@ -410,8 +407,7 @@ def windowed(
     instruments = tuple(
         n for n in inputs if all(n in f.instruments for f in flights) and (by is None or n in by)
     )
-    starts = tuple(_starts(f, length) for f in flights)
-    outputs, seen, left_out = _complete(flights, starts, length, (length * dt, len(inputs)))
+    outputs, starts, left_out = _complete(flights, length, len(inputs))
 
     def transforms(signals: list[np.ndarray]) -> np.ndarray:
         """Return transforms (W, k, c) of signals (c, N) by flight."""
@@ -425,40 +421,55 @@ def windowed(
         kinds = [[f.instruments if n in instruments else f.inputs for n in inputs] for f in flights]
         signals = [[s[n] for n, s in zip(inputs, each, strict=True)] for each in kinds]
         Z = transforms([np.stack(s) for s in signals])
-    Y = transforms([_filled(f, outputs) for f in flights]) * seen[:, None, :]
+    # Zeros stand for samples outside of the windows.
+    absent = [np.zeros(f.n_samples) for f in flights]
+    measured = [
+        np.stack([np.nan_to_num(f.outputs.get(n, none)) for n in outputs])
+        for f, none in zip(flights, absent, strict=True)
+    ]
+    Y = transforms(measured)
     names, numbers = (inputs, instruments, outputs), tuple(lines.tolist())
-    return Windowed(*names, dt, length, numbers, starts, Z, U, Y, seen, left_out)
+    return Windowed(*names, dt, length, numbers, starts, Z, U, Y, left_out)
 
 
 def _complete(
-    flights: Sequence[Flight],
-    starts: tuple[tuple[int, ...], ...],
-    length: int,
-    requested: tuple[float, int],
-) -> tuple[tuple[str, ...], np.ndarray, dict[str, str]]:
-    """Return the outputs with enough windows, their mask (W, p), and the reasons for the others.
+    flights: Sequence[Flight], length: int, inputs: int
+) -> tuple[tuple[str, ...], tuple[tuple[int, ...], ...], dict[str, str]]:
+    """Return outputs, the starts of windows in which all of them are complete, and left-out outputs
+    with reasons.
 
-    Args:
-        requested: length of a window [s], and number of inputs that move.
+    The output with the fewest complete windows is left out until enough windows remain.
     """
-    outputs = tuple(dict.fromkeys(n for f in flights for n in f.outputs))
-    seen = np.concatenate(
-        [_seen(f, s, length, outputs) for f, s in zip(flights, starts, strict=True)]
-    )
-    seconds, inputs = requested
-    averages = np.sum(seen, axis=0) / PER_AVERAGE
-    kept = averages >= inputs + 1
+    kept = list(dict.fromkeys(n for f in flights for n in f.outputs))
+    begins = [range(0, f.n_samples - length + 1, _step(length)) for f in flights]
+    seen = {
+        n: [_complete_windows(f, n, s, length) for f, s in zip(flights, begins, strict=True)]
+        for n in kept
+    }
     many = "1 input" if inputs == 1 else f"{inputs} inputs"
-    need = f"expected at least {inputs + 1} independent averages for {many}, got"
-    windows = f"from windows of {seconds:g} s without a missing sample"
-    if not kept.any():
-        raise ValueError(
-            f"{need} {np.max(averages, initial=0.0):.2g} {windows}; a shorter window, or longer "
-            "flights"
+    left_out = {}
+    while True:
+        masks = [np.all([seen[n][i] for n in kept], axis=0) for i in range(len(flights))]
+        averages = sum(int(np.sum(v)) for v in masks) / PER_AVERAGE
+        if averages >= inputs + 1:
+            starts = (np.asarray(s)[v] for s, v in zip(begins, masks, strict=True))
+            return tuple(kept), tuple(tuple(v.tolist()) for v in starts), left_out
+        worst = min(kept, key=lambda n: sum(int(np.sum(v)) for v in seen[n]))
+        left_out[worst] = (
+            f"expected at least {inputs + 1} independent averages for {many}, got {averages:.2g} "
+            f"from windows of {length * flights[0].dt:g} s without a missing sample"
         )
-    each = list(zip(outputs, averages, kept, strict=True))
-    left_out = {n: f"{need} {count:.2g} {windows}" for n, count, fine in each if not fine}
-    return tuple(n for n, _, fine in each if fine), seen[:, kept], left_out
+        kept.remove(worst)
+        if not kept:
+            raise ValueError(f"{left_out[worst]}; a shorter window, or longer flights")
+
+
+def _complete_windows(flight: Flight, output: str, starts: range, length: int) -> np.ndarray:
+    """Return a mask of the windows that have every sample of an output."""
+    if output not in flight.outputs:
+        return np.zeros(len(starts), bool)
+    missing = np.concatenate([[0], np.cumsum(~np.isfinite(flight.outputs[output]))])
+    return np.array([missing[s + length] == missing[s] for s in starts], bool)
 
 
 def _lines(options: ResponseOptions, length: int, dt: float) -> np.ndarray:
@@ -488,28 +499,6 @@ def _lines(options: ResponseOptions, length: int, dt: float) -> np.ndarray:
     return lines[np.unique(np.argmin(np.abs(lines[:, None] - spaced), axis=0))]
 
 
-def _starts(flight: Flight, length: int) -> tuple[int, ...]:
-    return tuple(range(0, flight.n_samples - length + 1, _step(length)))
-
-
 def _step(length: int) -> int:
     # Rounded up, so that windows this many steps apart share no sample.
     return -(-length // STEPS)
-
-
-def _seen(
-    flight: Flight, starts: tuple[int, ...], length: int, outputs: tuple[str, ...]
-) -> np.ndarray:
-    """Return a mask (windows, p): 1 if a window has every sample of an output."""
-    seen = np.zeros((len(starts), len(outputs)))
-    for j, name in enumerate(outputs):
-        if name in flight.outputs:
-            missing = np.concatenate([[0], np.cumsum(~np.isfinite(flight.outputs[name]))])
-            seen[:, j] = [missing[s + length] == missing[s] for s in starts]
-    return seen
-
-
-def _filled(flight: Flight, outputs: tuple[str, ...]) -> np.ndarray:
-    """Return the outputs (p, N), zero where nothing is measured."""
-    absent = np.zeros(flight.n_samples)
-    return np.stack([np.nan_to_num(flight.outputs.get(n, absent), nan=0.0) for n in outputs])

@@ -24,14 +24,11 @@ from heli_jax import (
 from heli_jax.dynamics.jacobians import point
 from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.frequency_lines import (
-    Matrices,
-    Record,
     cut_notes,
     errors_of_lines,
-    resolved,
+    linear_drive,
 )
 from heli_jax.identification.estimation.frequency_noise import smoothed
-from heli_jax.identification.estimation.linearised_flights import linear_drive
 from heli_jax.identification.estimation.noise_covariance import first_noise
 from heli_jax.identification.estimation.simulated_flights import Drive
 from heli_jax.identification.select import MethodComparison, MethodResult
@@ -53,17 +50,6 @@ A: {p: {p: Lp, phi: Lphi}, phi: {p: 1}}
 B: {p: {lat: Llat}}
 C: {p: {p: 1}, phi: {phi: 1}}
 """
-
-
-def test_the_states_at_the_lines_of_a_record_are_those_of_numpy():
-    A = jnp.array([[0.9, 0.2, 0.0], [-0.3, 0.8, 0.1], [0.0, 0.4, 0.7]])
-    record = Record(0, 0, 40)
-    m = Matrices(A, jnp.ones((3, 1)), jnp.eye(3)[:2], jnp.zeros((2, 1)))
-    at = resolved(m, record, jnp.broadcast_to(jnp.eye(2, dtype=complex), (record.lines, 2, 2)))
-    z = np.exp(2j * np.pi * np.arange(1, 20) / 40)
-    R = np.linalg.inv(z[:, None, None] * np.eye(3) - np.asarray(A))
-    R = np.block([[R.real, -R.imag], [R.imag, R.real]])
-    np.testing.assert_allclose(at.R[0], R, rtol=1e-11, atol=1e-12)
 
 
 @pytest.fixture(scope="module")

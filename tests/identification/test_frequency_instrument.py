@@ -10,11 +10,11 @@ from heli_jax.analysis.spectra import ResponseOptions
 from heli_jax.identification.diagnostics.loop import inputs_follow_response
 from heli_jax.identification.diagnostics.search import band_unused
 from heli_jax.identification.estimation.data import data_of
-from heli_jax.identification.estimation.frequency_error import _weighed, products, projected
 from heli_jax.identification.estimation.frequency_instrument import (
     as_instruments_have_it,
     following,
 )
+from heli_jax.identification.estimation.frequency_lines import orthonormal, projection
 from heli_jax.identification.estimation.frequency_noise import smoothed
 from heli_jax.identification.estimation.levenberg_marquardt import (
     optimise,
@@ -78,19 +78,20 @@ def test_the_rows_solve_the_equations_and_have_their_covariance():
     J, Z = rng.standard_normal((2, 3, 50)) * np.array([1.0, 1e6, 1e-4])[None, :, None]
     e, Q = rng.standard_normal(50), np.linalg.qr(rng.standard_normal((50, 4)))[0]
 
-    def weighed(Z):
-        columns = (jnp.asarray(v.T) for v in (-Z, -J, e - Q @ Q.T @ e, Q.T))
-        return [np.asarray(v) for v in _weighed(projected(products(*columns), jnp.eye(4)))]
+    Q, _ = projection(jnp.asarray(Q * np.array([1.0, 1e3, 1e-3, 1.0])))
+    e, J, F = (v - v @ np.asarray(Q @ Q.T) for v in (e, J, Z))
 
-    r, M = weighed(Z)
-    # The same with the ends' effects projected out by hand.
-    e, J, F = (v - v @ Q @ Q.T for v in (e, J, Z))
+    def weighed(F):
+        S = np.asarray(orthonormal(jnp.asarray(F @ F.T)))
+        return S.T @ F @ e, S.T @ F @ J.T
+
+    r, M = weighed(F)
     np.testing.assert_allclose(np.linalg.solve(M, r), np.linalg.solve(F @ J.T, F @ e), rtol=1e-8)
     inverse = np.linalg.inv(F @ J.T)
     covariance = inverse @ (F @ F.T) @ inverse.T
     np.testing.assert_allclose(np.linalg.inv(M.T @ M), covariance, rtol=1e-8)
-    # An instrument that depends on others gives no row, not a row of rounding.
-    r, M = weighed(np.stack([Z[0], Z[1], 2.0 * Z[0]]))
+    # An instrument that says what another says already makes no row, and not one of rounding.
+    r, M = weighed(np.stack([F[0], F[1], 2.0 * F[0]]))
     assert np.linalg.matrix_rank(M) == 2
     assert np.count_nonzero(r) == 2
 
@@ -120,9 +121,10 @@ def test_what_follows_an_excitation_is_found():
         y = rng.standard_normal(n)
         flights.append(Flight(dt=DT, inputs={"lat": u}, outputs={"p": y}, instruments={"lat": r}))
         answers.append(answer)
-    made = following(flights, ["lat"], [f.instruments["lat"][:, None] for f in flights])
+    inputs = [f.inputs["lat"][:, None] for f in flights]
+    made = following(inputs, [f.instruments["lat"][:, None] for f in flights])
     for found, answer in zip(made, answers, strict=True):
-        left = found["lat"] - found["lat"].mean() - (answer - answer.mean())
+        left = found[:, 0] - found.mean() - (answer - answer.mean())
         assert np.std(left) < 0.25 * np.std(answer)
 
 

@@ -20,15 +20,17 @@ Sources: Pintelon and Schoukens (2012), chapters 6, 9 and 10; Klein and Morelli 
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 
+from heli_jax import naming
 from heli_jax.analysis.operating_point import flown
+from heli_jax.analysis.spectra import windowed
 from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.evaluation import Evaluation, deviations
@@ -40,44 +42,41 @@ from heli_jax.identification.estimation.frequency_instrument import (
 )
 from heli_jax.identification.estimation.frequency_lines import (
     Driving,
-    Errors,
     FlightFacts,
     Matrices,
-    Resolved,
+    Record,
     alike,
-    basis_of,
+    cannot_linearise,
+    condition_of,
     cut_notes,
     discretised,
+    ends_of,
     errors_of_lines,
     errors_of_record,
     lines_of,
     measured,
+    orthonormal,
     other_outputs,
     parts_of,
-    parts_of_group,
     records_of,
-    resolved,
+    records_of_group,
     shared_of,
-    times,
-    with_shared,
+    whitened,
     without_parts,
 )
 from heli_jax.identification.estimation.frequency_noise import (
     first_model,
+    inverse_roots,
     log_determinants,
     once_a_length,
-    whitening_alone,
+    smoothed,
     whitening_by,
-    whitening_without_model,
-)
-from heli_jax.identification.estimation.linearised_flights import (
-    cannot_linearise,
-    condition_of,
 )
 from heli_jax.identification.estimation.objective import Objective, RowTags, untagged
 from heli_jax.identification.estimation.output_error import OBJECTIVE as OUTPUT_ERROR
 from heli_jax.identification.estimation.output_error import in_time
 from heli_jax.identification.estimation.residual import Residuals, rows_of
+from heli_jax.identification.estimation.response_weights import averages, noise_density
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
     Data,
@@ -120,8 +119,17 @@ class FrequencyError(Objective):
         return instrumented_inputs(problem, flights)
 
     def first_noise(self, problem: Problem, noise: Noise, flights: Sequence[Flight]) -> Noise:
-        """Add the spectrum of the measured signals."""
-        return first_spectrum(noise, flights)
+        """Add the spectrum of each measured signal alone, as if all of it were noise."""
+        # White noise would give most weight to frequencies of large power, gusts included.
+        measured = []
+        for flight, sd in zip(flights, noise.sd, strict=True):
+            whole = np.stack([flight.outputs[n] for n in sorted(sd)], axis=1)
+            measured += [lines_of(whole[first:last]) for first, last in parts_of(flight)]
+
+        def whitening(S: np.ndarray) -> np.ndarray:
+            return inverse_roots(S * np.eye(S.shape[1]))
+
+        return noise._replace(whitening=tuple(once_a_length(whitening, smoothed(measured))))
 
     def data_at_start(self, data: Data) -> Data:
         """Return by instrument the parts of inputs and outputs that follow the instruments."""
@@ -133,10 +141,27 @@ class FrequencyError(Objective):
     def noise_of_check(self, layout: Layout, data: Data, noise: Noise) -> Noise:
         """Return the spectrum of the outputs' part that the inputs do not explain.
 
-        The errors at the start values would include errors of these values.
+        The errors at the start values would include errors of these values. In closed loop that
+        part is too small where feedback moves the inputs more than the excitation does.
         """
-        whitening = whitening_without_model(layout, data)
-        return noise if whitening is None else noise._replace(whitening=whitening)
+        flights = []
+        for f, names in zip(jax.device_get(data.flights), layout.outputs, strict=True):
+            outputs = {n: f.outputs[n] for n in names}
+            flights.append(Flight(dt=float(f.dt), inputs=naming.asdict(f.inputs), outputs=outputs))
+        try:
+            w = windowed(flights)
+        except ValueError:  # too few windows
+            return noise
+        if w.left_out:
+            return noise
+        # A one-sided density per Hz is twice the sample time times the power of a line.
+        S = noise_density(w, averages(w), w.Y) / (2.0 * w.dt)
+
+        def whitening(record: Record) -> np.ndarray:
+            hz = np.arange(1, record.lines + 1) / (record.samples * w.dt)
+            return inverse_roots(np.apply_along_axis(lambda v: np.interp(hz, w.hz, v), 0, S))
+
+        return noise._replace(whitening=tuple(whitening(r) for r in records_of(layout)))
 
     def relax(
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
@@ -204,19 +229,6 @@ class FrequencyError(Objective):
         return OUTPUT_ERROR.records(reached, u, runs, seed)
 
 
-def first_spectrum(noise: Noise, flights: Sequence[Flight]) -> Noise:
-    """Return the noise with the spectrum of the measured signals, as if all of them were noise.
-
-    White noise would give most weight to the frequencies of the largest power, gusts included.
-    """
-    measured = []
-    for flight, sd in zip(flights, noise.sd, strict=True):
-        whole = np.stack([flight.outputs[n] for n in sorted(sd)], axis=1)
-        for first, last in parts_of(flight):
-            measured.append(lines_of(whole[first:last]))
-    return noise._replace(whitening=whitening_alone(measured))
-
-
 _NOTABLE = 0.3
 """Shift above which an estimate is reported [standard deviations]."""
 _GROWS = 3.0
@@ -278,48 +290,10 @@ OBJECTIVE = FrequencyError()
 # derivative $R^{-T} Z^T J$ contains the information of the estimate, $M^T (Z^T Z)^{-1} M$ with $M =
 # Z^T J$. Without instruments $Z = J$; with the additional row $|e - J J^+ e|$ the sum of squares is
 # that of all errors: maximum likelihood with few rows. By instrument, $Z$ are the derivatives of
-# the response to the part of the inputs that follows the instruments.
+# the errors' response to the part of the inputs that follows the instruments.
 #
 # Sources: Söderström and Stoica (1983) for estimates by instrument and their covariance; Pintelon
 # and Schoukens (2012), chapter 9.
-
-
-_NOTHING = 100.0
-"""Eigenvalues of the normalised information that are rounding, as a multiple of the floating-point
-precision."""
-
-
-class Products(NamedTuple):
-    """Products of columns e, J, Z and Q.
-
-    e are the whitened errors without the effects of the records' ends, J the derivatives of the
-    response by the unknowns, Z instruments, and Q effects of the ends.
-    """
-
-    ee: Float[Array, ""]
-    Ze: Float[Array, " q"]
-    """Negative product, because the derivatives of e are -J."""
-    ZZ: Float[Array, "q q"]
-    ZJ: Float[Array, "q q"]
-    QZ: Float[Array, "m q"]
-    """Zero after `projected`."""
-    QJ: Float[Array, "m q"]
-
-
-def products(Z: Array, J: Array, e: Array, Q: Array) -> Products:
-    """Return the products of columns Z, J, Q and one column e."""
-    return Products(e @ e, -Z.T @ e, Z.T @ Z, Z.T @ J, Q.T @ Z, Q.T @ J)
-
-
-def projected(of: Products, S: Float[Array, "m m"]) -> Products:
-    """Return the products of Z and J with Q projected out.
-
-    Args:
-        S: makes the columns of Q orthonormal.
-    """
-    Z, J = S.T @ of.QZ, S.T @ of.QJ
-    none = jnp.zeros_like(of.QZ)
-    return Products(of.ee, of.Ze, of.ZZ - Z.T @ Z, of.ZJ - Z.T @ J, none, none)
 
 
 def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Float[Array, " r"]:
@@ -328,175 +302,54 @@ def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Floa
     Args:
         noise: noise with the whitening of each record.
     """
-    v = shared_of(layout, u)
-    at, rest = jax.lax.stop_gradient((v, u))
-    made = products_of_lines(layout, data, noise, at, lambda v: with_shared(layout, rest, v))
-    r, M = _weighed(made)
-    left = jnp.sqrt(jnp.maximum(made.ee - jnp.sum(r**2), 0.0))
-    if data.flights[0].by_instrument is not None:
-        left = jnp.zeros_like(left)
+    v, unknowns = shared_of(u)
+    at = jax.lax.stop_gradient(v)
+    instruments, products = data.flights[0].by_instrument is not None, []
+    for members in alike(layout, data):
+
+        def model(v: Array, by_instrument: bool, members: list[int] = members) -> Any:
+            return discretised(layout, data, unknowns(v), members, by_instrument=by_instrument)
+
+        y = measured(layout, data, members)
+        for record, W in records_of_group(layout, noise, members):
+            e, J, Z = _errors_of_record(model, at, record, W, y, instruments)
+            products.append((e @ e, Z.T @ e, Z.T @ Z, Z.T @ J))
+    ee, Ze, ZZ, ZJ = (sum(each) for each in zip(*products, strict=True))
+    S = orthonormal(ZZ)
+    r, M = S.T @ Ze, S.T @ ZJ
+    left = jnp.zeros_like(ee) if instruments else jnp.sqrt(jnp.maximum(ee - r @ r, 0.0))
     r, M, left = jax.lax.stop_gradient((r, M, left))
     # This makes the derivative M by definition.
     return jnp.append(r + M @ (v - at), left)
 
 
-def _weighed(of: Products) -> tuple[Float[Array, " q"], Float[Array, "q q"]]:
-    """Return R^-T Z^T e and R^-T Z^T J, with R^T R = Z^T Z; zero for directions without effect."""
-    sizes = jnp.sqrt(jnp.maximum(jnp.diagonal(of.ZZ), 0.0))
-    # Columns are normalised to be independent of units.
-    over = jnp.where(sizes > 0, 1.0 / jnp.where(sizes > 0, sizes, 1.0), 0.0)
-    values, vectors = jnp.linalg.eigh(of.ZZ * over[:, None] * over[None, :])
-    kept = values > _NOTHING * jnp.finfo(values.dtype).eps * values[-1]
-    root = jnp.where(kept, 1.0 / jnp.sqrt(jnp.where(kept, values, 1.0)), 0.0)
-    along = root[:, None] * vectors.T * over[None, :]
-    return along @ of.Ze, along @ of.ZJ
-
-
-def products_of_lines(
-    layout: Layout,
-    data: Data,
-    noise: Noise,
+def _errors_of_record(
+    model: Callable[[Array, bool], tuple[Matrices, Driving]],
     v: Float[Array, " q"],
-    unknowns: Callable[[Array], Unknowns],
-) -> Products:
-    """Return the products over all records.
-
-    Z is J, or by instrument the derivatives of the response to the inputs by instrument.
-
-    Args:
-        noise: noise with the whitening of each record.
-        v: unknowns that all flights share.
-    """
-    total, with_instruments = [], data.flights[0].by_instrument is not None
-    for members in alike(layout, data):
-
-        def model(v: Array, members: Any = members, **by: bool) -> tuple[Matrices, Driving]:
-            return discretised(layout, data, unknowns(v), members, **by)
-
-        (m, driving), slopes = differentiated(model, v)
-        by = None
-        if with_instruments:
-            by = differentiated(functools.partial(model, by_instrument=True), v)
-        y = measured(layout, data, members)
-        for record, W in parts_of_group(layout, noise, members):
-            at = resolved(m, record, W)
-            e = errors_of_record(at, m, driving, y)
-            total.append(_of_record(at, e, ((m, driving), slopes), by))
-    return jax.tree.map(lambda *p: sum(p), *total)
-
-
-type _Differentiated = tuple[tuple[Matrices, Driving], tuple[Matrices, Driving]]
-"""A model with its inputs, and their derivatives by the unknowns in a last axis; None replaces zero
-derivatives."""
-
-
-def _of_record(
-    at: Resolved,
-    e: Errors,
-    direct: _Differentiated,
-    by: _Differentiated | None,
-) -> Products:
-    """Return the products over one record of all flights of a group."""
-
-    def at_lines(of: _Differentiated) -> Any:
-        # The axis of flights follows that of blocks (b, f, k, ...).
-        signals = (of[0][1], of[1][1])
-        return jax.tree.map(lambda v: jnp.moveaxis(at.lines(v), -1, 1), signals)
-
-    # Blocks are processed in turn, because the derivatives at all lines exceed the caches.
-    def of_block(of: Any) -> Products:
-        (W, R, H, effects), own = of
-        Q = basis_of(H, effects)
-
-        def of_flight(one: Any) -> Products:
-            e, X, direct_lines, by_lines = one
-            J = _slopes(H, W, X, direct, direct_lines)
-            if by is None:
-                return products(J, J, e, Q)
-            # Inputs by instrument have no effects of ends.
-            of_inputs = times(R, by_lines[0].U @ by[0][0].B.T)
-            return products(_slopes(H, W, of_inputs, by, by_lines), J, e, Q)
-
-        return jax.lax.map(of_flight, own)
-
-    rows, X = (jnp.moveaxis(v, -1, 1) for v in (e.rows, e.X))
-    own = (rows, X, at_lines(direct), None if by is None else at_lines(by))
-    made = jax.lax.map(of_block, ((at.W, at.R, at.H, at.effects), own))
-    by_flight = jax.vmap(projected, (0, None))(_summed(made), at.S)
-    return _summed(by_flight)
-
-
-def _summed(of: Products) -> Products:
-    return jax.tree.map(lambda p: jnp.sum(p, axis=0), of)
-
-
-def _slopes(
-    H: Float[Array, "k 2p 2n"],
-    W: Float[Array, "k 2p 2p"],
-    X: Float[Array, "k 2 n"],
-    of: _Differentiated,
-    signals: tuple[Driving, Driving],
-) -> Float[Array, "s q"]:
-    """Return the derivatives of the whitened response at the lines of a block, with states X.
-
-    They are H (dAd X + dB U + B dU) + W (dC X + dD held + D dheld).
+    record: Record,
+    W: Complex[Array, "K p p"],
+    outputs: Float[Array, "f N p"],
+    instruments: bool,
+) -> tuple[Float[Array, " r"], Float[Array, "r q"], Float[Array, "r q"]]:
+    """Return e, J and Z of one record of each flight of a group, with its ends projected out.
 
     Args:
-        signals: inputs of the model at the lines, and their derivatives.
+        model: model and inputs of the group by the shared unknowns v, directly or by instrument.
+        instruments: take the derivatives Z by instrument; else they are J.
     """
+    m, driving = model(v, False)
+    at = ends_of(m, record, W, driving, outputs)
 
-    value, slopes = (of[0][0], signals[0]), (of[1][0], signals[1])
+    def errors(v: Array, by_instrument: bool) -> Float[Array, "f r"]:
+        m, driving = model(v, by_instrument)
+        # Inputs by instrument have no effects of ends.
+        ends = None if by_instrument else at.inputs
+        return whitened(W, errors_of_record(m, record, driving, outputs, at.R, ends))
 
-    def response(moving: tuple[Matrices, Driving]) -> Float[Array, " s"]:
-        m, signals = eqx.combine(moving, value)
-        # X @ Ad.T would be slower: XLA lays out its derivatives so that the next product transposes
-        # them.
-        driving, passing = (
-            jnp.einsum("kcj,ij->kci", X, A) + jnp.einsum("kcj,ij->kci", v, B)
-            for A, v, B in ((m.Ad, signals.U, m.B), (m.C, signals.held, m.D))
-        )
-        return (times(H, driving) + times(W, passing)).reshape(-1)
+    def slopes(by_instrument: bool) -> Float[Array, "r q"]:
+        # Variable projection (Kaufman): derivatives keep the ends fixed.
+        J = jax.jacfwd(functools.partial(errors, by_instrument=by_instrument))(v)
+        return (J - jnp.einsum("rm,sm,fsq->frq", at.Q, at.Q, J)).reshape(-1, v.size)
 
-    # Only arrays that depend on the unknowns are kept; long signals usually do not.
-    moving = jax.tree.map(
-        lambda d, v: None if d is None else v, slopes, value, is_leaf=lambda d: d is None
-    )
-
-    def along(direction: tuple[Matrices, Driving]) -> Float[Array, " s"]:
-        return jax.jvp(response, (moving,), (direction,))[1]
-
-    return jax.vmap(along, in_axes=-1, out_axes=-1)(slopes)
-
-
-def differentiated[T](make: Callable[[Array], T], v: Float[Array, " q"]) -> tuple[T, T]:
-    """Return arrays in tuples and their derivatives by v in a last axis.
-
-    None replaces zero derivatives.
-    """
-    moving: list[bool] = []
-
-    # It runs together with `make` and records which derivatives are zero. A separate trace of the
-    # model would take as long as differentiating it.
-    @jax.custom_jvp
-    def look(*leaves: Array) -> Array:
-        return jnp.zeros((), v.dtype)
-
-    def rule(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Array, Array]:
-        zero = jax.custom_derivatives.SymbolicZero
-        moving[:] = [not isinstance(t, zero) for t in tangents]
-        return jnp.zeros((), v.dtype), jnp.zeros((), v.dtype)
-
-    look.defjvp(rule, symbolic_zeros=True)
-
-    def looked_at(v: Array) -> T:
-        made = make(v)
-        look(*jax.tree.leaves(made))
-        return made
-
-    def along(direction: Array) -> tuple[T, T]:
-        return jax.jvp(looked_at, (v,), (direction,))
-
-    value, slopes = jax.vmap(along, out_axes=(None, -1))(jnp.eye(v.size, dtype=v.dtype))
-    leaves, structure = jax.tree.flatten(slopes)
-    kept = [d if moves else None for d, moves in zip(leaves, moving, strict=True)]
-    return value, jax.tree.unflatten(structure, kept)
+    J = slopes(False)
+    return errors(v, False).reshape(-1), J, slopes(True) if instruments else J

@@ -76,18 +76,11 @@ def instrumented_inputs(
     names = instruments_of(problem)
     if not names or any(n not in f.instruments for f in flights for n in names):
         return None
+    inputs = [np.stack([f.inputs[n] for n in names], axis=1) for f in flights]
     r = [np.stack([f.instruments[n] for n in names], axis=1) for f in flights]
-    return following(flights, names, r)
-
-
-def following(
-    flights: Sequence[Flight], names: Sequence[str], signals: Sequence[Float[np.ndarray, "N r"]]
-) -> tuple[dict[str, np.ndarray], ...]:
-    """Return the inputs by flight, with named ones reduced to the part that follows the signals."""
-    made = _parts([np.stack([f.inputs[n] for n in names], axis=1) for f in flights], signals)
     return tuple(
         {**f.inputs, **dict(zip(names, columns.T, strict=True))}
-        for f, columns in zip(flights, made, strict=True)
+        for f, columns in zip(flights, following(inputs, r), strict=True)
     )
 
 
@@ -104,7 +97,9 @@ def as_instruments_have_it(data: Data) -> Data:
     if not moving or any(list(f.outputs) != names for f in data.flights):
         return data._replace(flights=direct)
     outputs = [np.stack([_filled(f.outputs[n]) for n in names], axis=1) for f in data.flights]
-    made = _parts(outputs, [np.stack([np.asarray(u[n]) for n in moving], axis=1) for u in inputs])
+    made = following(
+        outputs, [np.stack([np.asarray(u[n]) for n in moving], axis=1) for u in inputs]
+    )
     flights = []
     for f, columns in zip(data.flights, made, strict=True):
         columns = columns.astype(f.outputs[names[0]].dtype)
@@ -120,7 +115,7 @@ def _filled(y: Any) -> Float[np.ndarray, " N"]:
     return np.interp(at, at[seen], y[seen])
 
 
-def _parts(
+def following(
     of: Sequence[Float[np.ndarray, "N u"]], signals: Sequence[Float[np.ndarray, "N r"]]
 ) -> list[Float[np.ndarray, "N u"]]:
     """Return, by flight, the part of the columns that follows the signals, around their means."""
@@ -132,10 +127,8 @@ def _parts(
         size = np.sqrt(np.real(np.einsum("kii->ki", S)))
         size = np.where(size > 0, size, 1.0)[:, None, :]
         # Coherences are independent of units; two dependent signals share their effect.
-        shared = S / (size.swapaxes(1, 2) * size) + _ALONE * np.eye(S.shape[1])
-        # The transposes turn a multiplication from the right into a solve.
-        turned = np.linalg.solve(shared.swapaxes(1, 2), (with_them / size).swapaxes(1, 2))
-        return turned.swapaxes(1, 2) / size
+        coherence = S / (size.swapaxes(1, 2) * size)
+        return with_them / size @ np.linalg.pinv(coherence, rcond=_ALONE, hermitian=True) / size
 
     spectra = smoothed([np.concatenate(v, axis=1) for v in zip(U, R, strict=True)], PART)
     each = zip(once_a_length(response, spectra), R, strict=True)

@@ -8,22 +8,26 @@ Sources: Pintelon and Schoukens (2012), chapters 6 and 10; Golub and Pereyra (19
 (1975) for the projection.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float
 
 from heli_jax import naming
-from heli_jax.analysis.trim import Condition
-from heli_jax.dynamics.jacobians import jacobians
+from heli_jax.analysis.operating_point import mean_condition, mean_heading
+from heli_jax.analysis.trim import Condition, equilibrium, is_full_nonlinear, trim
+from heli_jax.dynamics.jacobians import about, jacobians, linearised
+from heli_jax.dynamics.model import Model
 from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.parts import FEWEST, SHORTEST, spans
-from heli_jax.identification.estimation.linearised_flights import linear_drive
-from heli_jax.identification.estimation.simulated_flights import driven
+from heli_jax.identification.estimation.simulated_flights import Drive, driven
+from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
     Data,
     FlightData,
@@ -87,11 +91,11 @@ def lines_of[A: (np.ndarray, Array)](v: A) -> A:
     )
 
 
-def in_time_of(lines: Complex[np.ndarray, "K c"], samples: int) -> Float[np.ndarray, "N c"]:
-    """Return signals of zero mean: the inverse of `lines_of`."""
-    whole = np.zeros((samples // 2 + 1, lines.shape[1]), complex)
-    whole[1 : 1 + len(lines)] = lines * np.sqrt(samples)
-    return np.fft.irfft(whole, samples, axis=0)
+def in_time_of[A: (np.ndarray, Array)](lines: A, samples: int) -> A:
+    """Return signals (N, *c) of zero mean from lines (K, *c): the inverse of `lines_of`."""
+    xp = jnp if isinstance(lines, jax.Array) else np
+    absent = [(1, samples // 2 - len(lines)), *((0, 0) for _ in lines.shape[1:])]
+    return xp.fft.irfft(xp.pad(lines, absent), samples, axis=0) * float(samples) ** 0.5
 
 
 def parts_of(flight: Flight) -> tuple[tuple[int, int], ...]:
@@ -157,6 +161,86 @@ def cut_notes(layout: Layout, data: Data, names: Sequence[str]) -> list[Finding]
         )
         notes.append(note("frequency.flight-cut", words, *lacking))
     return notes
+
+
+# Linear models of flights.
+#
+# A nonlinear model is linearised at the operating point of the flight. For a full helicopter that
+# is the trim at the mean speed. For other models it is the equilibrium at the mean inputs, or the
+# initial state if there is none. The point depends on the parameters, with the derivative of an
+# implicit function.
+
+# Params, State and Inputs are Any, because they are a model's own classes.
+
+_STEADY = 1e-6
+"""Largest rates of an equilibrium, relative to those at the initial state."""
+
+
+def condition_of(model: Model, flight: Flight) -> Condition | None:
+    """Return the steady flight at which a full helicopter is linearised; None for other models."""
+    if model.linear or not is_full_nonlinear(model):
+        return None
+    condition = mean_condition(flight.outputs, flight.dt)
+    # The heading matters in hover too, because it mixes positions and velocities in ground axes.
+    return condition._replace(heading=mean_heading(flight.outputs))
+
+
+def cannot_linearise(problem: Problem) -> str | None:
+    """Return the reason why a flight has no trim to linearise the model at, or None."""
+    for flight in problem.training:
+        condition = condition_of(problem.model, flight)
+        if condition is None:
+            continue
+        try:
+            trim(problem.model, problem.start_params(flight.known), condition)
+        except ValueError as e:
+            return f"the model cannot be linearised for {flight.name or 'a flight'}: {e}"
+    return None
+
+
+def linear_drive(layout: Layout, drive: Drive, condition: Condition | None) -> tuple[Model, Drive]:
+    """Return a linear model of a flight, and its inputs and parameters.
+
+    Args:
+        condition: result of `condition_of`.
+    """
+    model = layout.model
+    if model.linear:
+        return model, drive
+    if condition is None:
+        inputs = jax.tree.map(jnp.mean, drive.inputs)
+        state = _equilibrium_at(model, drive.params, inputs)
+    else:
+        steady = equilibrium(model, drive.params, condition)
+        state, inputs = steady.state, steady.inputs
+    return linearised(model), drive._replace(params=about(model, drive.params, state, inputs))
+
+
+def _equilibrium_at(model: Model, params: Any, inputs: Any) -> Any:
+    """Return the equilibrium State for constant inputs, or the initial state if there is none."""
+    start = naming.ravel(model.initial_state(params), jnp.result_type(float))
+
+    def rates(x: Array, arguments: Any) -> Array:
+        p, u = arguments
+        return naming.ravel(model.vector_field(p, naming.unravel(model.State, x), u), x.dtype)
+
+    still = jax.lax.stop_gradient((params, inputs))
+    # The search is damped, so that states without an equilibrium, like a heading, keep their start.
+    solution = optx.root_find(
+        rates,
+        optx.LevenbergMarquardt(1e-12, 1e-12),
+        jax.lax.stop_gradient(start),
+        args=still,
+        max_steps=100,
+        throw=False,
+    )
+    x = jax.lax.stop_gradient(solution.value)
+    size = 1.0 + jnp.max(jnp.abs(rates(start, still)))
+    rest = jnp.max(jnp.abs(rates(x, still))) <= _STEADY * size
+    inverse = jax.lax.stop_gradient(jnp.linalg.pinv(jax.jacfwd(rates)(x, still)))
+    # One more Newton step has the derivative of the root by the parameters.
+    x = x - inverse @ rates(x, (params, inputs))
+    return naming.unravel(model.State, jnp.where(rest, x, start))
 
 
 # Discretised models of groups of flights with equal layouts.
@@ -237,191 +321,171 @@ def _with(values: tuple[Any, ...], i: int, value: Any) -> tuple[Any, ...]:
     return (*values[:i], value, *values[i + 1 :])
 
 
-def shared_of(layout: Layout, u: Unknowns) -> Float[Array, " q"]:
-    """Return the unknowns that all flights share: parameters, gains and the time shift."""
-    params, gains = [u.params[n] for n in layout.free], [u.gains[n] for n in layout.gains]
-    shift = [] if u.shift is None else [u.shift]
-    return jnp.stack([jnp.asarray(v) for v in (*params, *gains, *shift)])
+def shared_of(u: Unknowns) -> tuple[Float[Array, " q"], Callable[[Array], Unknowns]]:
+    """Return the unknowns that all flights share (parameters, gains, time shift), and a function
+    that returns all unknowns with others in their place."""
+    rest = jax.lax.stop_gradient(u)
+    v, restored = ravel_pytree((u.params, u.gains, u.shift))
+
+    def unknowns(v: Array) -> Unknowns:
+        params, gains, shift = restored(v)
+        return rest._replace(params=params, gains=gains, shift=shift)
+
+    return v, unknowns
 
 
-def with_shared(layout: Layout, u: Unknowns, v: Float[Array, " q"]) -> Unknowns:
-    """Return the unknowns with the shared ones replaced, in the order of `shared_of`."""
-    # The layout's order is used because JAX sorts the keys of dictionaries.
-    values = dict(zip((*layout.free, *layout.gains), v, strict=False))
-    return u._replace(
-        params={n: values[n] for n in layout.free},
-        gains={n: values[n] for n in layout.gains},
-        shift=None if u.shift is None else v[-1],
-    )
+# The model at the lines of a record.
 
 
-# Complex vectors are stored as real ones, [re, im], because products of real matrices are faster.
+def at_lines(m: Matrices, record: Record) -> tuple[Complex[Array, " K"], Complex[Array, "K n n"]]:
+    """Return z of a record's lines and (zI - Ad)^-1 there, without a derivative."""
+    Ad = jax.lax.stop_gradient(m.Ad)
+    z = jnp.asarray(record.z, np.result_type(Ad.dtype, np.complex64))
+    unit = jnp.eye(len(Ad), dtype=z.dtype)[None]
+    return z, jnp.linalg.inv(z[:, None, None] * unit - Ad[None].astype(z.dtype))
 
 
-def stacked(v: Complex[Array, "K *c"]) -> Float[Array, "K 2 *c"]:
-    """Return real and imaginary parts on a second axis."""
-    return jnp.stack([jnp.real(v), jnp.imag(v)], axis=1)
+def modelled(
+    m: Matrices,
+    driving: Driving,
+    R: Complex[Array, "K n n"],
+    ends: Complex[Array, "K n"] | None = None,
+) -> Complex[Array, "K p"]:
+    """Return the outputs at the lines of a record.
+
+    Args:
+        driving: inputs (N, r) over the record.
+        R: (zI - Ad)^-1 at the lines.
+        ends: inputs of the states by the ends of the record; default zero.
+    """
+    B, C, D, Ad = (v.astype(R.dtype) for v in (m.B, m.C, m.D, m.Ad))
+    inputs = lines_of(driving.U) @ B.T
+    inputs = inputs if ends is None else inputs + ends
+    # Products replace the derivative of an inverse: dY = C R (dAd X + dU) + dC X. The differences
+    # are zero, but their derivatives are not.
+    X = jax.lax.stop_gradient(jnp.einsum("kij,kj->ki", R, inputs))
+    dA, dC = (v - jax.lax.stop_gradient(v) for v in (Ad, C))
+    H = jax.lax.stop_gradient(C)[None] @ R
+    passing = lines_of(driving.held) @ D.T
+    return jnp.einsum("kpn,kn->kp", H, inputs + X @ dA.T) + X @ dC.T + passing
 
 
-def real(M: Complex[Array, "K a b"]) -> Float[Array, "K 2a 2b"]:
-    """Return the real matrix that acts on stacked vectors as M does on complex ones."""
-    re, im = jnp.real(M), jnp.imag(M)
-    parts = jnp.stack([jnp.stack([re, -im], axis=2), jnp.stack([im, re], axis=2)], axis=1)
-    return parts.reshape(len(M), 2 * M.shape[1], 2 * M.shape[2])
-
-
-def times(M: Float[Array, "K 2a 2b"], v: Float[Array, "K 2 b *f"]) -> Float[Array, "K 2 a *f"]:
-    """Return the products at each line."""
-    made = M @ v.reshape(len(v), M.shape[2], -1)
-    return made.reshape(len(v), 2, -1, *v.shape[3:])
+def real_rows(v: Complex[Array, "K p *c"]) -> Float[Array, "r *c"]:
+    """Return real and imaginary parts of whitened errors as rows of variance 1."""
+    # The real part of a complex normal error has half of its variance.
+    v = 2.0**0.5 * v.reshape(-1, *v.shape[2:])
+    return jnp.concatenate([jnp.real(v), jnp.imag(v)])
 
 
 _NO_END = 1e-10
 """Effect of a state, relative to the largest one, below which it has none."""
-_ROUNDING = 1e-12
-"""Power of a direction, relative to the largest one, below which it is rounding."""
-
-
-def orthonormal(gram: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """Return S with S^T G S the identity, but zero for directions without effect.
-
-    Args:
-        gram: products G of columns; the columns times S are orthonormal.
-    """
-    sizes = jnp.sqrt(jnp.maximum(jnp.diagonal(gram), 0.0))
-    # The column of a state without effect on the outputs is rounding, and its direction changes at
-    # each step. Projecting it out would make the sum of squares rough.
-    precision = float(jnp.finfo(gram.dtype).eps)
-    seen = sizes > max(_NO_END, 10.0 * precision) * jnp.max(sizes)
-    over = jnp.where(seen, 1.0 / jnp.where(seen, sizes, 1.0), 0.0)
-    values, vectors = jnp.linalg.eigh(gram * over[:, None] * over[None, :])
-    kept = values > max(_ROUNDING, 100.0 * precision) * values[-1]
-    root = jnp.where(kept, 1.0 / jnp.sqrt(jnp.where(kept, values, 1.0)), 0.0)
-    return over[:, None] * vectors * root[None, :]
-
-
-# Errors of a record, and the effects of its ends.
-
-
-_NUMBERS = 20_000
-"""Largest product of outputs, states and lines in a block: 256 lines of a helicopter, or the whole
-record of a small vehicle."""
+_ROUNDING = 100.0
+"""Power of a direction, relative to the largest one, below which it is rounding, as a multiple of
+the floating-point precision."""
 _SPARED = 0.1
 """Largest fraction of a record's degrees of freedom for its ends and those of gusts."""
 
 
-class Resolved(NamedTuple):
-    """Model at the lines of a record, without derivatives, in b blocks of k lines that fit the
-    processor's caches."""
+def orthonormal(gram: Float[Array, "m m"], least: float = 0.0) -> Float[Array, "m m"]:
+    """Return S with S^T G S the identity, but zero for directions without effect.
 
-    record: Record
-    W: Float[Array, "b k 2p 2p"]
-    """Whitening to rows of variance 1; zero beyond the record's lines."""
-    R: Float[Array, "b k 2n 2n"]
-    """(zI - Ad)^-1."""
-    H: Float[Array, "b k 2p 2n"]
-    """W C (zI - Ad)^-1."""
-    effects: Float[Array, "b k 2 e"]
-    """Spectrum of a jump of a state between the ends and, except in a very short record, of a slow
-    gust on it."""
-    S: Float[Array, "m m"]
-    """Makes `basis_of` orthonormal; zero columns for states without effect."""
-
-    def lines(self, v: Float[Array, "f N *c"]) -> Float[Array, "b k 2 *c f"]:
-        """Return the transform of the record's part of signals over whole flights, by block."""
-        # Signals are delayed before they are cut, because an input may be logged before it acts.
-        part = jnp.moveaxis(v[:, self.record.first : self.record.last], 0, -1)
-        return by_block(stacked(lines_of(part)), len(self.W))
+    Args:
+        gram: products G of columns; the columns times S are orthonormal.
+        least: size of a column, relative to the largest one, below which it has no effect.
+    """
+    sizes = jnp.sqrt(jnp.maximum(jnp.diagonal(gram), 0.0))
+    seen = sizes > least * jnp.max(sizes)
+    # Columns are normalised to be independent of units.
+    over = jnp.where(seen, 1.0 / jnp.where(seen, sizes, 1.0), 0.0)
+    values, vectors = jnp.linalg.eigh(gram * over[:, None] * over[None, :])
+    kept = values > _ROUNDING * jnp.finfo(values.dtype).eps * values[-1]
+    root = jnp.where(kept, 1.0 / jnp.sqrt(jnp.where(kept, values, 1.0)), 0.0)
+    return over[:, None] * vectors * root[None, :]
 
 
-def by_block(v: Array, count: int) -> Array:
-    """Return lines (K, ...) in blocks (b, k, ...), the last one padded with zeros."""
-    size = -(-len(v) // count)
-    v = jnp.pad(v, [(0, count * size - len(v)), *((0, 0) for _ in v.shape[1:])])
-    return v.reshape(count, size, *v.shape[1:])
+def projection(basis: Float[Array, "r m"]) -> tuple[Float[Array, "r m"], Float[Array, "m m"]]:
+    """Return orthonormal effects Q of a record's ends, and S with Q the basis times S.
+
+    Columns of ends without effect are zero.
+    """
+    # The column of a state without effect on the outputs is rounding, and its direction changes at
+    # each step. Projecting it out would make the sum of squares rough.
+    least = max(_NO_END, 10.0 * float(jnp.finfo(basis.dtype).eps))
+    S = orthonormal(basis.T @ basis, least)
+    return basis @ S, S
 
 
-def resolved(m: Matrices, record: Record, whitening: Complex[Array, "K p p"]) -> Resolved:
-    """Evaluate a model at the lines of a record."""
-    (p, n), K = m.C.shape, record.lines
-    # The real part of a complex normal error has half of its variance.
-    W = by_block(2.0**0.5 * real(whitening).astype(m.C.dtype), -(-K * m.C.size // _NUMBERS))
-    count, size = W.shape[:2]
-    # The padding continues the lines to avoid singular matrices.
-    k = np.arange(1, count * size + 1)
-    z = np.exp(2j * np.pi * k / np.where(k <= K, record.samples, record.samples + 2 * size))
-    z = z.astype(np.result_type(m.Ad.dtype, np.complex64))
+class Ends(NamedTuple):
+    """Effects of the ends of one record of each flight of a group, and their least squares."""
+
+    R: Complex[Array, "K n n"]
+    """(zI - Ad)^-1 at the lines."""
+    Q: Float[Array, "r m"]
+    """Orthonormal effects on the whitened errors."""
+    inputs: Complex[Array, "f K n"]
+    """Inputs of the states by the ends, by flight."""
+
+
+def ends_of(
+    m: Matrices,
+    record: Record,
+    whitening: Complex[Array, "K p p"],
+    driving: Driving,
+    outputs: Float[Array, "f N p"],
+) -> Ends:
+    """Fit the ends of one record of each flight by linear least squares.
+
+    Args:
+        driving: inputs over whole flights (f, N, r), like the outputs.
+    """
+    z, R = at_lines(m, record)
     # A gust that does not end where it began has a jump, which affects all lines. Treated as
     # independent noise of each line, it would shift slow modes by several standard deviations.
     # Above its corner frequency it is an integrated push; dividing by the length keeps it
     # comparable to the states' ends.
-    effects = np.stack([z, z / (z - 1.0) / record.samples], axis=1)
+    effects = jnp.stack([z, z / (z - 1.0) / record.samples], axis=1)
+    (p, n), K = m.C.shape, record.lines
     if 2 * n > _SPARED * 2 * p * K:
         effects = effects[:, :1]
-    effects = by_block(stacked(jnp.asarray(effects)), count)
-
-    def of_block(of: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        z, W, effects = of
-        unit = jnp.eye(n, dtype=z.dtype)[None]
-        R = jnp.linalg.inv(z[:, None, None] * unit - m.Ad[None].astype(z.dtype))
-        H = W @ real(m.C[None].astype(z.dtype) @ R)
-        basis = basis_of(H, effects)
-        return real(R), H, basis.T @ basis
-
-    R, H, grams = jax.lax.map(of_block, (jnp.asarray(z).reshape(count, size), W, effects))
-    return Resolved(record, W, R, H, effects, orthonormal(jnp.sum(grams, axis=0)))
-
-
-def basis_of(H: Float[Array, "k 2p 2n"], effects: Float[Array, "k 2 e"]) -> Float[Array, "s m"]:
-    """Return the effects of the states' ends, then of the gusts' ends, on the rows of a block."""
-    n = H.shape[2] // 2
-    re, im = H[:, :, None, :n], H[:, :, None, n:]
-    made = re * effects[:, None, 0, :, None] + im * effects[:, None, 1, :, None]
-    return made.reshape(-1, effects.shape[2] * n)
-
-
-class Errors(NamedTuple):
-    """Errors of one record of each flight of a group, by block."""
-
-    rows: Float[Array, "b s f"]
-    """Measured less modelled, whitened, without the effects of the ends; zero in the padding."""
-    X: Float[Array, "b k 2 n f"]
-    """States."""
-    y: Float[Array, "b k 2 p f"]
-    """Measured outputs less the direct feedthrough of the inputs."""
+    H = whitening.astype(z.dtype) @ m.C[None].astype(z.dtype) @ R
+    made = H[:, :, None, :] * effects[:, None, :, None]
+    Q, S = projection(real_rows(made.reshape(K, p, -1)))
+    e = whitened(whitening, errors_of_record(m, record, driving, outputs, R))
+    factors = (e @ Q @ S.T).reshape(len(outputs), -1, n).astype(z.dtype)
+    return Ends(R, Q, jnp.einsum("ke,fen->fkn", effects, factors))
 
 
 def errors_of_record(
-    at: Resolved, m: Matrices, driving: Driving, outputs: Float[Array, "f N p"]
-) -> Errors:
-    """Return the errors of one record of each flight of a group.
+    m: Matrices,
+    record: Record,
+    driving: Driving,
+    outputs: Float[Array, "f N p"],
+    R: Complex[Array, "K n n"],
+    ends: Complex[Array, "f K n"] | None = None,
+) -> Complex[Array, "f K p"]:
+    """Return measured less modelled outputs at the lines of one record of each flight.
 
-    Args:
-        driving: inputs over the whole flights, like `outputs`.
+    The arguments are those of `ends_of` and `modelled`.
     """
-    inputs = jnp.einsum("nr,bkcrf->bkcnf", m.B, at.lines(driving.U))
-    y = at.lines(outputs - driving.held @ m.D.T)
 
-    def unprojected(of: Any) -> tuple[Array, Array]:
-        W, H, effects, inputs, y = of
-        rows = (times(W, y) - times(H, inputs)).reshape(-1, y.shape[-1])
-        return rows, basis_of(H, effects).T @ rows
+    def of_flight(driving: Driving, outputs: Array, ends: Array | None) -> Complex[Array, "K p"]:
+        return lines_of(outputs) - modelled(m, driving, R, ends)
 
-    rows, along = jax.lax.map(unprojected, (at.W, at.H, at.effects, inputs, y))
-    # Linear least squares gives the states' ends of each flight.
-    ends = at.S @ (at.S.T @ jnp.sum(along, axis=0))
-
-    def without_ends(of: Any) -> tuple[Array, Array]:
-        R, H, effects, inputs, rows = of
-        of_ends = ends.reshape(effects.shape[2], -1, ends.shape[1])
-        X = times(R, inputs + jnp.einsum("kce,enf->kcnf", effects, of_ends))
-        return rows - basis_of(H, effects) @ ends, X
-
-    rows, X = jax.lax.map(without_ends, (at.R, at.H, at.effects, inputs, rows))
-    return Errors(rows, X, y)
+    # Signals are delayed before they are cut, because an input may be logged before it acts.
+    whole = (driving, outputs)
+    return jax.vmap(of_flight)(
+        *jax.tree.map(lambda v: v[:, record.first : record.last], whole), ends
+    )
 
 
-def parts_of_group(layout: Layout, noise: Noise, members: list[int]) -> list[tuple[Record, Array]]:
+def whitened(W: Complex[Array, "K p p"], errors: Complex[Array, "f K p"]) -> Float[Array, "f r"]:
+    """Return the errors of each flight in rows of variance 1."""
+    return jax.vmap(real_rows)(jnp.einsum("kij,fkj->fki", W.astype(errors.dtype), errors))
+
+
+def records_of_group(
+    layout: Layout, noise: Noise, members: list[int]
+) -> list[tuple[Record, Complex[Array, "K p p"]]]:
     """Return the records of each flight of a group, with their whitening."""
     # Records of equal length share one spectrum (`smoothed`), that of the first flight.
     pairs = zip(records_of(layout), noise.whitening, strict=True)
@@ -452,11 +516,9 @@ def errors_of_lines(layout: Layout, data: Data, noise: Noise, z: Float[Array, " 
         m, driving = discretised(layout, data, u, members)
         first = m if first is None else first
         y = measured(layout, data, members)
-        for k, (record, W) in enumerate(parts_of_group(layout, noise, members)):
-            made = errors_of_record(resolved(m, record, W), m, driving, y)
-            left = made.y - jnp.einsum("pn,bkcnf->bkcpf", m.C, made.X)
-            left = left.reshape(-1, *left.shape[2:])[: record.lines]
-            for j, i in enumerate(members):
-                errors[i, k] = jax.lax.complex(left[:, 0, :, j], left[:, 1, :, j])
+        for k, (record, W) in enumerate(records_of_group(layout, noise, members)):
+            at = ends_of(m, record, W, driving, y)
+            made = errors_of_record(m, record, driving, y, at.R, at.inputs)
+            errors |= {(i, k): e for i, e in zip(members, made, strict=True)}
     assert first is not None
     return LineErrors([errors[at] for at in sorted(errors)], first)

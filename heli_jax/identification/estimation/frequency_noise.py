@@ -1,4 +1,4 @@
-"""Spectra of noise and gusts, estimated from residuals of a model or of regressions on inputs."""
+"""Spectra of noise and gusts, estimated from residuals of a model."""
 
 import functools
 from collections import Counter
@@ -6,16 +6,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from heli_jax.identification.estimation.frequency_lines import (
-    Matrices,
-    discretised,
-    lines_of,
-    records_of,
-)
+from heli_jax.identification.estimation.frequency_lines import Matrices, discretised
 from heli_jax.identification.unknowns.layout import Data, Layout, unpack
 
 # Spectra of records at their own frequencies, smoothed over frequency and records.
@@ -26,8 +20,6 @@ from heli_jax.identification.unknowns.layout import Data, Layout, unpack
 LEAST, PART = 6.0, 0.08
 """Least sd of the Gaussian that smooths the noise's spectrum, in lines and as a fraction of the
 frequency. Narrower ones overfit the noise and make intervals too narrow."""
-AVERAGES = 2.0 * np.pi**0.5 * LEAST
-"""Least number of independent lines of one record in a smoothed spectrum: (sum w)^2 / sum w^2."""
 _ROUNDING = 1e-10
 """Least spectrum, as a fraction of the mean over all frequencies."""
 _KNOTS = 4.0
@@ -45,22 +37,19 @@ def smoothed(
         least: least sd in lines.
     """
     p, counts = lines[0].shape[1], Counter(len(v) for v in lines)
-    # Records of equal length share spectrum and kernel, so their powers are added first. A spectrum
-    # is Hermitian, so the lower half is enough.
-    below = np.tril_indices(p)
+    # Records of equal length share spectrum and kernel, so their powers are added first.
     sums = {}
     for K in counts:
-        power = summed_powers(np.stack([v for v in lines if len(v) == K]))[:, below[0], below[1]]
-        # The view as doubles needs complex numbers in double precision.
-        sums[K] = np.ascontiguousarray(power, dtype=complex).view(float)
+        power = summed_powers(np.stack([v for v in lines if len(v) == K]))
+        # Products of real matrices are faster than those with complex ones.
+        sums[K] = np.ascontiguousarray(power.reshape(K, -1), dtype=complex).view(float)
     spectra = {}
     for K in counts:
         kernels = {other: _kernel(K, other, part, least) for other in counts}
-        total = sum(kernels[other][0] @ power for other, power in sums.items())
-        weight = sum(counts[other] * of_one for other, (_, of_one) in kernels.items())
-        half = _between_knots(total / np.asarray(weight)[:, None], K, part, least).view(complex)
-        S = np.empty((K, p, p), complex)
-        S[:, below[1], below[0]], S[:, below[0], below[1]] = np.conj(half), half
+        total = sum(kernels[other] @ power for other, power in sums.items())
+        weight = sum(n * np.sum(kernels[other], axis=1) for other, n in counts.items())
+        S = _between_knots(total / np.asarray(weight)[:, None], K, part, least)
+        S = S.view(complex).reshape(K, p, p)
         own = np.einsum("kii->ki", S)
         own += _ROUNDING * np.mean(np.real(own), axis=0)
         spectra[K] = S
@@ -83,79 +72,33 @@ def summed_powers(v: Complex[np.ndarray, "f K p"]) -> Complex[np.ndarray, "K p p
     return at_line @ np.conj(at_line.transpose(0, 2, 1))
 
 
-def whitening_alone(
-    lines: Sequence[Complex[np.ndarray, "K p"]],
-) -> tuple[Complex[np.ndarray, "K p p"], ...]:
-    """Return, by record, the whitening of each signal alone, without correlations.
-
-    Raises:
-        numpy.linalg.LinAlgError: a signal is zero throughout.
-    """
-
-    def own(S: np.ndarray) -> np.ndarray:
-        return inverse_roots(S * np.eye(S.shape[1]))
-
-    # The records of a bootstrap may have other outputs.
-    made = {}
-    for p in {v.shape[1] for v in lines}:
-        alike = [v for v in lines if v.shape[1] == p]
-        made |= {(len(W), p): W for W in once_a_length(own, smoothed(alike))}
-    return tuple(made[v.shape] for v in lines)
-
-
 @functools.lru_cache(maxsize=32)
-def knots_of(
-    K: int, part: float = PART, least: float = LEAST
-) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Return the knots for K lines, and their weights for interpolation.
-
-    A spectrum is computed at the knots (lines from 0). Each line gets the knot below and the weight
-    of the next one.
-    """
+def _knots(K: int, part: float, least: float) -> np.ndarray:
+    """Return the lines, counted from 0 to K - 1, at which a spectrum is computed."""
     knots = [0]
     while knots[-1] < K - 1:
         width = max(least, part * (knots[-1] + 1))
         knots.append(min(knots[-1] + max(1, int(width / _KNOTS)), K - 1))
-    at = np.array(knots if K > 1 else [0, 0])
+    return np.array(knots if K > 1 else [0, 0])
+
+
+def _between_knots(values: np.ndarray, K: int, part: float, least: float) -> np.ndarray:
+    """Interpolate values at the knots (knots, ...) to all lines (K, ...)."""
+    at = _knots(K, part, least)
     low = np.clip(np.searchsorted(at, np.arange(K), side="right") - 1, 0, len(at) - 2)
     share = (np.arange(K) - at[low]) / np.maximum(at[low + 1] - at[low], 1)
-    return at, (low, share)
-
-
-def _between_knots(at_knots: np.ndarray, K: int, part: float, least: float) -> np.ndarray:
-    """Interpolate values at the knots (knots, ...) to all lines (K, ...)."""
-    _, (low, share) = knots_of(K, part, least)
-    share = share.reshape(-1, *(1 for _ in at_knots.shape[1:]))
-    return at_knots[low] + share * np.diff(at_knots, axis=0)[low]
+    share = share.reshape(-1, *(1 for _ in values.shape[1:]))
+    return values[low] + share * np.diff(values, axis=0)[low]
 
 
 @functools.lru_cache(maxsize=32)
-def _kernel(
-    K: int, other: int, part: float, least: float
-) -> tuple[Float[np.ndarray, "knots other"], Float[np.ndarray, " knots"]]:
-    """Return the weights of a record of `other` lines at the knots of K lines, and their sums."""
+def _kernel(K: int, other: int, part: float, least: float) -> Float[np.ndarray, "knots other"]:
+    """Return the weights of a record of `other` lines at the knots of K lines."""
     # Frequencies are relative to the sampling rate, which all records share.
-    f, first = (knots_of(K, part, least)[0] + 1) / (2 * K + 1), 1 / (2 * other + 1)
+    f, first = (_knots(K, part, least) + 1) / (2 * K + 1), 1 / (2 * other + 1)
     g = first * np.arange(1, other + 1)
     width = np.maximum(least * first, part * f)
-    kernel = np.exp(-0.5 * ((f[:, None] - g[None, :]) / width[:, None]) ** 2)
-    return kernel, kernel.sum(axis=1)
-
-
-@functools.lru_cache(maxsize=32)
-def averages(
-    K: int, counts: tuple[tuple[int, int], ...], part: float = PART, least: float = LEAST
-) -> Float[np.ndarray, " K"]:
-    """Return the number of independent lines (K,) in a smoothed spectrum, (sum w)^2 / sum w^2.
-
-    Args:
-        counts: for each length, the lines of a record and the number of records.
-    """
-    at, _ = knots_of(K, part, least)
-    kernels = [(n, *_kernel(K, other, part, least)) for other, n in counts]
-    total = sum(n * of_one for n, _, of_one in kernels)
-    squares = sum(n * np.sum(w**2, axis=1) for n, w, _ in kernels)
-    return np.interp(np.arange(K), at, total**2 / squares)
+    return np.exp(-0.5 * ((f[:, None] - g[None, :]) / width[:, None]) ** 2)
 
 
 def inverse_roots(S: Complex[np.ndarray, "K p p"]) -> Complex[np.ndarray, "K p p"]:
@@ -195,7 +138,7 @@ def log_determinants(W: Complex[np.ndarray, "K p p"]) -> Float[np.ndarray, " K"]
 GUST_LEAST, GUST_PART = 12.0, 0.12
 """Least sd of the Gaussian that smooths the rest, in lines and as a fraction of the frequency."""
 _CELLS = 0.16, 6.0
-"""`part` and `least` of the spectral cells, see `knots_of`. Up to the fiftieth line cells are
+"""`part` and `least` of the spectral cells, see `_knots`. Up to the fiftieth line cells are
 single lines, because slow modes are narrow; above they span 4 % of the frequency."""
 _OCTAVES = 2
 """Octaves between the corners of the gusts' spectra."""
@@ -217,15 +160,17 @@ def whitening_by(
     vehicle: Matrices, errors: Sequence[Complex[np.ndarray, "K p"]]
 ) -> tuple[Complex[np.ndarray, "K p p"], ...]:
     """Return the whitening of each record's errors; records of equal length share an array."""
-    counts = Counter(len(e) for e in errors)
+    counts, p = Counter(len(e) for e in errors), errors[0].shape[1]
     before = _prewhitening(vehicle, errors, list(counts))
     left = smoothed(
         [np.einsum("kij,kj->ki", before[len(e)], e) for e in errors], GUST_PART, least=GUST_LEAST
     )
-    p = errors[0].shape[1]
 
     def whitening(S: np.ndarray) -> np.ndarray:
-        n = averages(len(S), tuple(counts.items()), GUST_PART, GUST_LEAST)
+        # Number of independent lines in the smoothed spectrum, (sum w)^2 / sum w^2.
+        kernels = [(n, _kernel(len(S), K, GUST_PART, GUST_LEAST)) for K, n in counts.items()]
+        total, squares = (sum(n * np.sum(w**k, axis=1) for n, w in kernels) for k in (1, 2))
+        n = _between_knots(total**2 / np.asarray(squares), len(S), GUST_PART, GUST_LEAST)
         n = np.maximum(n, p + 1.0)
         return ((n - p) / n)[:, None, None] * (inverse_roots(S) @ before[len(S)])
 
@@ -240,7 +185,7 @@ def _prewhitening(
     cells = []
     for K in lengths:
         of_length = np.stack([e for e in errors if len(e) == K])
-        at, _ = knots_of(K, *_CELLS)
+        at = _knots(K, *_CELLS)
         edges = np.concatenate([[0], (at[1:] + at[:-1] + 1) // 2])
         count = np.diff(np.append(edges, K)).astype(float)
         power = np.add.reduceat(summed_powers(of_length), edges, axis=0)
@@ -330,70 +275,3 @@ def _powers_of_gusts(
         shown, due = np.moveaxis((by_shape @ told).reshape(-1, 2, n + p), 1, 0)
         powers = np.maximum(powers * (shown / np.where(due > 0, due, 1.0)), least)
     return powers[:, :n].T, powers[0, n:]
-
-
-_ALONE = 1e-9
-"""Fraction of the inputs' power below which two of them are dependent, and of the outputs' power
-below which there is no residual."""
-
-
-# The noise's spectrum without a model: residual of local regressions of the outputs on inputs.
-#
-# Source: Brillinger, Time Series (1981), chapter 8, for regression of spectra; Pintelon and
-# Schoukens (2012), chapter 7, for the ends of a record as an added smooth function of the
-# frequency.
-
-
-def whitening_without_model(layout: Layout, data: Data) -> tuple[np.ndarray, ...] | None:
-    """Return, by record, the whitening (K, p, p) of the outputs' part that no response to the
-    inputs explains; None with too few lines.
-
-    In closed loop that part is too small where feedback moves the inputs more than the excitation
-    does.
-    """
-    flights = jax.device_get(data.flights)
-    lines = []
-    for record in records_of(layout):
-        flight = flights[record.flight]
-        outputs = [flight.outputs[n] for n in layout.outputs[record.flight]]
-        signals = np.stack([*outputs, *flight.inputs], axis=1)[record.first : record.last]
-        lines.append(lines_of(signals))
-    p = len(layout.outputs[0])
-    powers = np.sum([np.sum(np.abs(v) ** 2, axis=0) for v in lines], axis=0)
-    moving = p + np.flatnonzero(powers[p:] > 0)
-    # A response varies over the lines of a smoothed spectrum, strongly near a mode.
-    order = next((q for q in (2, 1) if (q + 1) * (moving.size + 1) <= 0.5 * AVERAGES), 0)
-    # The effects of a record's ends are smooth over the lines, so a constant is added to the
-    # inputs.
-    size = np.sqrt(np.mean(powers[:p]) / sum(len(v) for v in lines))
-    lines = [np.column_stack([v[:, :p], *_powers(v[:, moving], size, order)]) for v in lines]
-    counts, spectra = tuple(Counter(len(v) for v in lines).items()), smoothed(lines)
-    regressors = spectra[0].shape[1] - p
-    if min(np.min(averages(K, counts)) for K, _ in counts) <= regressors + p:
-        return None
-
-    def whitening(S: np.ndarray) -> np.ndarray:
-        n = averages(len(S), counts)
-        return inverse_roots(_left(S, p) * (n / (n - regressors))[:, None, None])
-
-    return tuple(once_a_length(whitening, spectra))
-
-
-def _powers(inputs: np.ndarray, size: float, order: int) -> list[np.ndarray]:
-    """Return inputs (K, m) and a constant, times powers of the frequency up to an order.
-
-    They are regressors of a response that is locally a polynomial.
-    """
-    beside = np.column_stack([inputs, np.full(len(inputs), size)])
-    f = np.arange(1, len(inputs) + 1)[:, None] / len(inputs)
-    return [beside * f**q for q in range(order + 1)]
-
-
-def _left(S: np.ndarray, p: int) -> np.ndarray:
-    """Return the spectra (K, p, p) of the first p signals, less the part due to the others."""
-    size = np.sqrt(np.real(np.einsum("kii->ki", S)))
-    R = S / (size[:, :, None] * size[:, None, :])
-    others = R[:, p:, p:] + _ALONE * np.eye(S.shape[1] - p)
-    rest = R[:, :p, :p] - R[:, :p, p:] @ np.linalg.solve(others, R[:, p:, :p])
-    rest = 0.5 * (rest + np.conj(np.swapaxes(rest, 1, 2))) + _ALONE * np.eye(p)
-    return rest * size[:, :p, None] * size[:, None, :p]

@@ -5,11 +5,12 @@ in Hann windows, the error of the model's responses is
 
 $$\Delta H = \overline{E Z^*}\; \overline{U Z^*}^{-1}.$$
 
-The model passes through the same windows as the record, so that windows cause no bias. Its bounded
-solution replaces a simulation, so that it may be unstable. The effects of the record's ends are
-projected out. Errors are complex and linear. The spectral matrix of the noise whitens them between
-outputs and inputs; it is that of the errors' part that no response explains. Lines of a window are
-weighted by their independence.
+The model passes through the same windows as the record, so that windows cause no bias. Its response
+at the lines of the whole record replaces a simulation, so that it may be unstable. These lines lack
+mean and Nyquist frequency, which windows remove. The effects of the record's ends are projected
+out. Errors are complex and linear. The spectral matrix of the noise whitens them between outputs
+and inputs; it is that of the errors' part that no response explains. Lines of a window are weighted
+by their independence.
 
 Sources: Pintelon and Schoukens (2012), chapters 2 and 9; Bendat and Piersol (2010), chapter 9;
 Tischler and Remple (2012), chapters 7 to 12, for the approach. Their logarithmic errors and
@@ -17,7 +18,7 @@ coherence weights are not used, because they lose a factor of 2 to 10 in precisi
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -38,12 +39,15 @@ from heli_jax.identification.estimation.evaluation import Evaluation
 from heli_jax.identification.estimation.frequency_instrument import absent_instrument
 from heli_jax.identification.estimation.frequency_lines import (
     Driving,
-    Matrices,
+    Record,
     alike,
+    at_lines,
     discretised,
-    orthonormal,
+    in_time_of,
+    modelled,
+    projection,
+    real_rows,
     shared_of,
-    with_shared,
 )
 from heli_jax.identification.estimation.objective import Objective, RowTags, untagged
 from heli_jax.identification.estimation.output_error import OBJECTIVE as OUTPUT_ERROR
@@ -51,7 +55,6 @@ from heli_jax.identification.estimation.output_error import in_time
 from heli_jax.identification.estimation.residual import Residuals
 from heli_jax.identification.estimation.response_weights import (
     ResponseWeights,
-    back,
     first_weights,
     noise_density,
     on_device,
@@ -74,201 +77,103 @@ from heli_jax.identification.unknowns.layout import (
     unpack,
 )
 
-# The model through the windows of the record.
-#
-# With $z = e^{i \pi (2 k + 1) / N}$ the sums $X = (zI - A_d)^{-1} B U$ are those of the solution
-# with $x_N = -x_0$. It is bounded where a simulation diverges. The response over the record is the
-# sum of this solution and of $n$ effects of the ends: those of stable modes decay from the start,
-# those of unstable ones towards the end. Lines half-way between the Fourier lines avoid the pole of
-# an integrator.
-#
-# Sources: Devasia, Chen and Paden (1996) for bounded solutions of unstable plants; Golub and
-# Pereyra (1973) and Kaufman (1975) for the projection.
-
-
-def bounded_outputs(
-    m: Matrices,
-    driving: Driving,
-    R: Complex[Array, "K n n"],
-    ends: Float[Array, " n"] | None = None,
-) -> Float[Array, "p N"]:
-    """Return the outputs over a record by the bounded solution.
-
-    Args:
-        R: result of `inverses`.
-        ends: factors of `effects_of_ends`; default zero.
-    """
-    z, turns = _lines(len(driving.U))
-    U = _at_lines(driving.U, turns) @ m.B.T.astype(z.dtype)
-    if ends is not None:
-        U = U + z[:, None] * ends.astype(z.dtype)[None]
-    # Products replace the derivative of an inverse: dY = H (dAd X + dU) + dC X. The differences are
-    # zero, but their derivatives are not.
-    X = jax.lax.stop_gradient(jnp.einsum("kij,kj->ki", R, U))
-    C = jax.lax.stop_gradient(m.C).astype(z.dtype)
-    dA, dC = ((v - jax.lax.stop_gradient(v)).astype(z.dtype) for v in (m.Ad, m.C))
-    lines = jnp.einsum("kpn,kn->pk", C[None] @ R, U + X @ dA.T) + dC @ X.T
-    return _in_time(lines, turns) + m.D @ driving.held.T
-
-
-def inverses(m: Matrices, samples: int) -> Complex[Array, "K n n"]:
-    """Return (zI - Ad)^-1 at the lines of a record, without a derivative."""
-    z, _ = _lines(samples)
-    Ad = jax.lax.stop_gradient(m.Ad).astype(z.dtype)
-    return jnp.linalg.inv(z[:, None, None] * jnp.eye(len(Ad), dtype=z.dtype)[None] - Ad[None])
-
-
-def effects_of_ends(m: Matrices, R: Complex[Array, "K n n"], samples: int) -> Array:
-    """Return the effects (p, n, N) of a record's ends on the outputs, for each state."""
-    z, turns = _lines(samples)
-    H = jax.lax.stop_gradient(m.C)[None].astype(z.dtype) @ R
-    return _in_time(jnp.moveaxis(H * z[:, None, None], 0, -1), turns)
-
-
-def _lines(N: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return half of the lines z (K,) (the rest are conjugates), and exp(i pi t / N) (N,)."""
-    # With odd N the line at the Nyquist frequency is its own conjugate.
-    k = np.arange((N + 1) // 2)
-    return np.exp(1j * np.pi * (2 * k + 1) / N), np.exp(1j * np.pi * np.arange(N) / N)
-
-
-def _at_lines(v: Float[Array, "N *c"], turns: Complex[np.ndarray, " N"]) -> Complex[Array, "K *c"]:
-    back = np.conj(turns).reshape(-1, *(1 for _ in v.shape[1:]))
-    return jnp.fft.fft(v.astype(turns.dtype) * back, axis=0)[: (turns.size + 1) // 2]
-
-
-def _in_time(
-    lines: Complex[Array, "*c K"], turns: Complex[np.ndarray, " N"]
-) -> Float[Array, "*c N"]:
-    N, K = turns.size, lines.shape[-1]
-    weights = np.full(K, 2.0, turns.dtype)
-    if N % 2:
-        weights[-1] = 1.0
-    of_lines, in_time = (v.reshape(*(1 for _ in lines.shape[1:]), -1) for v in (weights, turns))
-    return jnp.real(jnp.fft.ifft(lines * of_lines, N, axis=-1) * in_time)
-
 
 def _groups(layout: Layout, data: Data, weights: ResponseWeights) -> list[list[int]]:
-    """Return groups of flights that have windows and equal layouts."""
-    return [g for g in alike(layout, data) if weights.windows.starts[g[0]]]
+    """Return groups of flights that have equal layouts and windows."""
+    starts, groups = weights.windows.starts, dict[Any, list[int]]()
+    for number, members in enumerate(alike(layout, data)):
+        for i in members:
+            if starts[i]:
+                groups.setdefault((number, starts[i]), []).append(i)
+    return list(groups.values())
 
 
-class _Measured(NamedTuple):
-    """Windows of a flight."""
+class _InWindows(NamedTuple):
+    """A group of flights in windows."""
 
-    y: Float[Array, "p N"]
-    """Measured outputs; zero without measurement."""
-    Z: Array | np.ndarray
-    """Instruments in windows (W, k, m), see `Windowed`."""
-    seen: Array | np.ndarray
-    """Measured outputs of each window (W, p)."""
-
-
-def _measured(data: Data, w: Windowed, members: list[int]) -> _Measured:
-    """Return the windows of some flights, with a leading axis."""
-    first, made = np.cumsum([0, *(len(s) for s in w.starts)]), []
-    for i in members:
-        outputs, own = data.flights[i].outputs, slice(first[i], first[i + 1])
-        absent = jnp.zeros_like(next(iter(outputs.values())))
-        y = jnp.stack([jnp.nan_to_num(outputs.get(n, absent)) for n in w.outputs])
-        made.append(_Measured(y, w.Z[own], w.seen[own]))
-    return jax.tree.map(lambda *v: jnp.stack(v), *made)
+    E: Complex[Array, "f W k p"]
+    """Transforms of measured less modelled outputs."""
+    effects: Complex[Array, "W k p n"]
+    """Those of the effects of a record's ends, by state."""
+    Z: Complex[Array, "f W k m"]
+    """Transforms of the instruments, see `Windowed`."""
 
 
-def _by_flight(
+def _in_windows(
     layout: Layout,
     data: Data,
-    weights: ResponseWeights,
+    w: Windowed,
     u: Unknowns,
     group: list[int],
-    ends: Float[Array, "f n"] | None,
-    body: Callable[[Array, Array, _Measured], Any],
-) -> Any:
-    """Return `body(E, effects, measured)` of each flight of a group, with a leading axis.
-
-    E (p, W, k) are the errors of the outputs in windows, effects (p, n, W, k) those of the record's
-    ends.
+    ends: Float[Array, "f n"] | None = None,
+) -> _InWindows:
+    """Send records and model of a group through the windows.
 
     Args:
         ends: factors of the effects, by flight; default zero.
     """
-    w = weights.windows
-    N = next(iter(data.flights[group[0]].outputs.values())).shape[0]
+    outputs = [data.flights[i].outputs for i in group]
+    # Zeros stand for samples outside of the windows.
+    y = jnp.stack([jnp.stack([jnp.nan_to_num(o[n]) for n in w.outputs], axis=1) for o in outputs])
+    N = y.shape[1]
     of_windows = dataclasses.replace(layout, outputs=(w.outputs,) * len(data.flights))
     m, driving = discretised(of_windows, data, u, group)
+    z, R = at_lines(m, Record(group[0], 0, N))
 
-    def windows(y: Array) -> Complex[Array, "p *c W k"]:
-        E = window_transforms(y.reshape(-1, N), w.starts[group[0]], w.length, w.numbers, w.dt)
-        return jnp.asarray(E).reshape(*y.shape[:-1], *E.shape[1:])
+    def windows(y: Float[Array, "N p *c"]) -> Complex[Array, "W k p *c"]:
+        signals, starts = y.reshape(N, -1).T, w.starts[group[0]]
+        X = jnp.asarray(window_transforms(signals, starts, w.length, w.numbers, w.dt))
+        return jnp.moveaxis(X, 0, -1).reshape(*X.shape[1:], *y.shape[1:])
 
-    R = inverses(m, N)
-    effects = windows(effects_of_ends(m, R, N))
+    def errors(driving: Driving, y: Array, ends: Array | None) -> Complex[Array, "W k p"]:
+        inputs = None if ends is None else z[:, None] * ends[None].astype(z.dtype)
+        return windows(y - in_time_of(modelled(m, driving, R, inputs), N))
 
-    def of_one(one: tuple[Driving, _Measured, Array | None]) -> Any:
-        driving, measured, ends = one
-        left = measured.y - bounded_outputs(m, driving, R, ends)
-        return body(windows(left), effects, measured)
-
-    # Flights are processed one at a time, because the derivatives of one fill the caches.
-    return jax.lax.map(of_one, (driving, _measured(data, w, group), ends))
-
-
-def _cross(measured: _Measured, E: Complex[Array, "p c W k"]) -> Complex[Array, "k p m c"]:
-    """Return the products with the instruments in windows, summed over a flight."""
-    E = E * measured.seen.T[:, None, :, None].astype(E.dtype)
-    return jnp.einsum("wkz,pcwk->kpzc", jnp.conj(measured.Z), E)
-
-
-def _summed(each: Iterable[Array]) -> Array:
-    return jnp.sum(jnp.concatenate(list(each)), axis=0)
+    H = jax.lax.stop_gradient(m.C)[None].astype(z.dtype) @ R
+    first = np.cumsum([0, *(len(s) for s in w.starts)])
+    return _InWindows(
+        jax.vmap(errors)(driving, y, ends),
+        windows(in_time_of(H * z[:, None, None], N)),
+        jnp.stack([w.Z[first[i] : first[i + 1]] for i in group]),
+    )
 
 
 def _whitened(weights: ResponseWeights, S: Complex[Array, "k p m c"]) -> Float[Array, "r c"]:
     """Return the responses of sums over all flights, in rows of variance 1."""
     w, (k, c) = weights.windows, (S.shape[0], S.shape[3])
-    S = S / jnp.sum(w.seen, axis=0).astype(S.dtype)[None, :, None, None]
-    dH = jnp.einsum("pkmz,kpzc->kpmc", weights.averages.P, S)
-    rows = weights.whitening @ dH.reshape(k, -1, c)
-    # The real part of a complex normal error has half of its variance.
-    return 2.0**0.5 * jnp.concatenate([jnp.real(rows), jnp.imag(rows)]).reshape(-1, c)
+    dH = jnp.einsum("kmz,kpzc->kpmc", weights.averages.P, S / len(w.Z))
+    return real_rows(weights.whitening @ dH.reshape(k, -1, c))
 
 
 def rows_of_responses(
     layout: Layout, data: Data, weights: ResponseWeights, u: Unknowns
 ) -> Float[Array, " r"]:
     """Return the whitened errors of all responses, with the effects of the ends projected out."""
-    v, groups = shared_of(layout, u), _groups(layout, data, weights)
-    at, rest = jax.lax.stop_gradient((v, u))
+    groups, (v, unknowns) = _groups(layout, data, weights), shared_of(u)
+    at = jax.lax.stop_gradient(v)
 
-    def sums(v: Array, ends: Sequence[Array | None], body: Callable[..., Any]) -> list[Any]:
-        here = with_shared(layout, rest, v)
-        each = zip(groups, ends, strict=True)
-        return [_by_flight(layout, data, weights, here, g, end, body) for g, end in each]
+    def errors(v: Array, ends: Sequence[Array | None]) -> Float[Array, " r"]:
+        sums = []
+        for group, factors in zip(groups, ends, strict=True):
+            E, _, Z = _in_windows(layout, data, weights.windows, unknowns(v), group, factors)
+            sums.append(jnp.einsum("fwkz,fwkp->kpz", jnp.conj(Z), E))
+        return _whitened(weights, jnp.sum(jnp.stack(sums), axis=0)[..., None])[:, 0]
 
-    def with_effects(E: Array, effects: Array, own: _Measured) -> Any:
-        return _cross(own, E[:, None]), _cross(own, effects)
-
-    made = sums(at, [None] * len(groups), with_effects)
-    rows = _whitened(weights, _summed(S for S, _ in made))[:, 0]
     # Each state of each flight gives one column of end effects.
-    columns = [jnp.moveaxis(e, 0, 3).reshape(*e.shape[1:4], -1) for _, e in made]
-    basis = _whitened(weights, jnp.concatenate(columns, axis=3))
-    S = orthonormal(basis.T @ basis)
-    Q = basis @ S
-    along = Q.T @ rows
+    columns = []
+    for group in groups:
+        _, effects, Z = _in_windows(layout, data, weights.windows, unknowns(at), group)
+        made = jnp.einsum("fwkz,wkpn->kpzfn", jnp.conj(Z), effects)
+        columns.append(made.reshape(*made.shape[:3], -1))
+    Q, S = projection(_whitened(weights, jnp.concatenate(columns, axis=3)))
     # Least squares gives the factors of the effects by group.
-    each = jnp.split(S @ along, np.cumsum([c.shape[3] for c in columns])[:-1])
-    ends = [v.reshape(len(e), -1) for v, (_, e) in zip(each, made, strict=True)]
-
-    def errors(v: Array) -> Array:
-        return _whitened(
-            weights, _summed(sums(v, ends, lambda E, _, own: _cross(own, E[:, None])))
-        )[:, 0]
-
+    factors = S @ (Q.T @ errors(at, [None] * len(groups)))
+    each = jnp.split(factors, np.cumsum([c.shape[3] for c in columns])[:-1])
+    ends = [v.reshape(len(group), -1) for v, group in zip(each, groups, strict=True)]
     # Variable projection (Kaufman): derivatives keep these factors fixed. Only unknowns shared by
     # all flights count, because nuisances have no effect here.
-    J = jax.jacfwd(errors)(at)
-    rows, J = jax.lax.stop_gradient((rows - Q @ along, J - Q @ (Q.T @ J)))
+    J = jax.jacfwd(errors)(at, ends)
+    rows, J = jax.lax.stop_gradient((errors(at, ends), J - Q @ (Q.T @ J)))
     return rows + J @ (v - at)
 
 
@@ -276,28 +181,22 @@ def rows_of_responses(
 def errors_in_windows(
     layout: Layout, data: Data, weights: ResponseWeights, z: Array
 ) -> Complex[Array, "W k p"]:
-    """Return the transforms of measured less modelled outputs; zero for unmeasured outputs."""
+    """Return the transforms of measured less modelled outputs."""
     u, of_flight = unpack(layout, data, z), dict[int, Array]()
     # The ends are fitted to all windows, each output weighted by its noise, not only to the
     # responses.
     power = jnp.real(jnp.einsum("kii->ki", weights.density))
 
-    def left(E: Array, effects: Array, own: _Measured) -> Array:
-        seen = own.seen.T[:, :, None].astype(E.dtype)
-        scale = seen / jnp.sqrt(power).T[:, None, :].astype(E.dtype)
-
-        def rows(v: Array) -> Array:
-            v = jnp.moveaxis(v * scale[:, None], 1, -1).reshape(-1, v.shape[1])
-            return jnp.concatenate([jnp.real(v), jnp.imag(v)])
-
-        basis = rows(effects)
-        S = orthonormal(basis.T @ basis)
-        ends = S @ (S.T @ (basis.T @ rows(E[:, None])[:, 0]))
-        return (E - jnp.einsum("n,pnwk->pwk", ends.astype(E.dtype), effects)) * seen
+    def rows(v: Complex[Array, "W k p c"]) -> Float[Array, "r c"]:
+        v = v / jnp.sqrt(power)[None, :, :, None].astype(v.dtype)
+        return real_rows(v.reshape(-1, *v.shape[2:]))
 
     for group in _groups(layout, data, weights):
-        made = _by_flight(layout, data, weights, u, group, None, left)
-        of_flight |= {i: jnp.moveaxis(made[j], 0, -1) for j, i in enumerate(group)}
+        E, effects, _ = _in_windows(layout, data, weights.windows, u, group)
+        Q, S = projection(rows(effects))
+        factors = (S @ (Q.T @ rows(jnp.moveaxis(E, 0, -1)))).astype(E.dtype)
+        left = E - jnp.einsum("nf,wkpn->fwkp", factors, effects)
+        of_flight |= dict(zip(group, left, strict=True))
     return jnp.concatenate([of_flight[i] for i in sorted(of_flight)])
 
 
@@ -340,7 +239,7 @@ class FrequencyResponse(Objective):
     ) -> tuple[Float[Array, " q"], Noise]:
         """Estimate the spectrum of the errors' part that no response explains."""
         z = in_time(layout, data, noise, z)
-        weights = back(noise.whitening)
+        weights = jax.device_get(noise.whitening)
         errors = np.asarray(errors_in_windows(layout, data, noise.whitening, z))
         density = noise_density(weights.windows, weights.averages, errors)
         weights = weighed(weights, density)
@@ -369,17 +268,11 @@ class FrequencyResponse(Objective):
         """Return the simulated flights; the noise includes the disturbances."""
         return OUTPUT_ERROR.records(reached, u, runs, seed)
 
-    def errors_in_windows(
-        self, layout: Layout, data: Data, noise: Noise, z: Array
-    ) -> Complex[Array, "W k p"]:
-        """Return the transforms of measured less modelled outputs; zero for unmeasured outputs."""
-        return errors_in_windows(layout, data, noise.whitening, z)
-
     def response_agreement(
         self, layout: Layout, data: Data, noise: Noise, z: Array
     ) -> ResponseAgreement | None:
         """Return chi-squared and Tischler's J of every response."""
-        weights = back(noise.whitening)
+        weights = jax.device_get(noise.whitening)
         w, used = weights.windows, weights.used
         E = response_of(
             w, weights.averages, np.asarray(errors_in_windows(layout, data, noise.whitening, z))
@@ -399,7 +292,7 @@ class FrequencyResponse(Objective):
             high,
             freedom,
             w.seconds,
-            tuple(zip(w.outputs, w.averages.tolist(), strict=True)),
+            tuple((n, w.averages) for n in w.outputs),
             w.instruments,
             (*left_out, *(() if w.together else (APART,))),
         )

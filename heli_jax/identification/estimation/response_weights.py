@@ -3,11 +3,10 @@
 With Z, U, E the transforms of instruments, inputs and errors in each window, the response in the
 errors is dH = S_zu^-1 S_ze. Given the inputs, its covariance between outputs i and j is
 
-    P_i V_ij P_j^H S_ij,    P = S_zu^-1,
+    P V P^H S_ij,    P = S_zu^-1,
 
-with S the noise's spectral matrix and V_ij the sum of conj(Z) Z over windows that both outputs
-have, with overlapping windows weighted by their correlation. It is exact also for a chirp, whose
-power at one frequency lies in one window.
+with S the noise's spectral matrix and V the sum of conj(Z) Z, with overlapping windows weighted by
+their correlation. It is exact also for a chirp, whose power at one frequency lies in one window.
 
 Sources: Bendat and Piersol, Random Data (2010), chapter 9; Pintelon and Schoukens (2012), chapter
 2, for the estimate by instrument.
@@ -55,19 +54,19 @@ _SMALLEST = 1e-9
 
 
 class Averages(NamedTuple):
-    """Errors of responses as determined by the inputs; p outputs, m inputs, k lines."""
+    """Errors of responses as determined by the inputs; m inputs, k lines."""
 
     P: np.ndarray
-    """Inverse cross-spectra from instruments to inputs in each output's windows, (p, k, m, m); NaN
-    if inputs are dependent."""
-    V: np.ndarray
-    """Covariance of the cross-spectra over the density of the noise, (p, p, k, m, m)."""
+    """Inverse cross-spectra (k, m, m) from instruments to inputs; zero if inputs are dependent."""
+    sound: np.ndarray
+    """True (k,) if inputs are independent."""
+    covariance: np.ndarray
+    """Covariance (k, m, m) of the responses' errors over the density of the noise."""
     share: np.ndarray
-    """Independent share of an error, because errors at neighbouring lines are correlated, (p, k,
-    m)."""
+    """Independent share (k, m) of an error, because errors at neighbouring lines are correlated."""
     freedom: np.ndarray
-    """Expected sum over windows of the squares of white noise of density 1, less the part that a
-    response explains, (k, p)."""
+    """Expected sum (k,) over windows of the squares of white noise of density 1, less the part that
+    a response explains."""
 
 
 def averages(w: Windowed) -> Averages:
@@ -75,32 +74,32 @@ def averages(w: Windowed) -> Averages:
     turns = np.outer(w.lines, np.arange(w.length)) / w.length
     g = hann(w.length) * np.exp(-2j * np.pi * turns)
     g = g - np.mean(g, axis=1, keepdims=True)
-    near = [_correlations(g, d, w.step) for d in range(min(_NEIGHBOURS + 1, len(g)))]
-    # Most outputs have the same missing windows, or none, so each case is computed once.
-    cases, case = np.unique(w.seen, axis=1, return_inverse=True)
-    masks, case = cases.T, case.reshape(-1)
-    V = np.array([[_spread(w, a, b, near[0]) for b in masks] for a in masks])
-    P, share, freedom = [], [], []
-    # Subtracting the mean removes part of the white noise at the first line.
-    power = np.real(near[0][0])
-    for i, seen in enumerate(masks):
-        S = _cross(seen, w.Z, w.U)
-        z, u = (np.real(np.einsum("kaa->ka", _cross(seen, v, v))) for v in (w.Z, w.U))
-        P.append(inverse(S, z, u))
-        share.append(_share(w, seen, np.nan_to_num(P[-1]), near))
-        taken = np.real(np.einsum("kab,kba->k", _inverse_power(w, seen), V[i, i]))
-        freedom.append(np.maximum(np.sum(seen) * (power - taken), 0.5))
-    return Averages(
-        np.stack(P)[case],
-        V[case][:, case],
-        np.stack(share)[case],
-        np.stack(freedom, axis=1)[:, case],
-    )
+    z, u = (np.mean(np.abs(v) ** 2, axis=0) for v in (w.Z, w.U))
+    P = inverse(_cross(w.Z, w.U), z, u)
+    sound, P = np.isfinite(P).all((1, 2)), np.nan_to_num(P)
+    share = np.ones(P.shape[:2])
+    # One over the sum of an error's correlations with the lines around it.
+    for d in range(min(_NEIGHBOURS + 1, len(g))):
+        correlations = _correlations(g, d, w.step)
+        V, k = _spread(w, correlations), len(g) - d
+        C = np.einsum("kxa,kab,kyb->kxy", P[:k], V, np.conj(P[d:]), optimize=True)
+        own = np.real(np.einsum("kxx->kx", C))
+        if d == 0:
+            covariance, size = C, np.sqrt(np.maximum(own, 1e-300))
+            # Subtracting the mean removes part of the white noise at the first line.
+            power = len(w.Z) * np.real(correlations[0])
+            taken = len(w.Z) * np.real(np.einsum("kab,kba->k", _inverse_power(w), V))
+            continue
+        # Negative correlations are ignored, because no response varies that fast.
+        rho = np.maximum(own / (size[:k] * size[d:]), 0.0)
+        share[:k] += rho
+        share[d:] += rho
+    return Averages(P, sound, covariance, 1.0 / share, np.maximum(power - taken, 0.5))
 
 
-def _cross(seen: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the mean (k, m, m) of conj(a) b over the measured windows."""
-    return np.einsum("w,wkx,wky->kxy", seen, np.conj(a), b, optimize=True) / np.sum(seen)
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the mean (k, x, y) of conj(a) b over the windows."""
+    return np.einsum("wkx,wky->kxy", np.conj(a), b, optimize=True) / len(a)
 
 
 def _correlations(g: np.ndarray, d: int, step: int) -> dict[int, np.ndarray]:
@@ -120,74 +119,44 @@ def _correlations(g: np.ndarray, d: int, step: int) -> dict[int, np.ndarray]:
     return found
 
 
-def _spread(
-    w: Windowed, first: np.ndarray, second: np.ndarray, c: dict[int, np.ndarray]
-) -> np.ndarray:
-    """Return the covariance (k - d, m, m) of two means of conj(Z) E.
+def _spread(w: Windowed, correlations: dict[int, np.ndarray]) -> np.ndarray:
+    """Return the covariance (k - d, m, m) of two means of conj(Z) E, d lines apart.
 
-    E is white noise of density 1. The second mean is at the d-th line after the first.
+    E is white noise of density 1.
     """
-    k = len(c[0])
-    a = first[:, None, None] * w.Z[:, :k]
-    b = second[:, None, None] * w.Z[:, len(w.numbers) - k :]
-    total = np.zeros((k, *a.shape[2:], b.shape[2]), complex)
-    for j, correlation in c.items():
-        later = w.later(abs(j))
-        here, there = slice(max(-j, 0), len(a) - max(j, 0)), slice(max(j, 0), len(a) - max(-j, 0))
-        x, y = a[here][later], b[there][later]
-        products = np.einsum("wkx,wky->kxy", np.conj(x), y, optimize=True)
+    k = len(correlations[0])
+    a, b = w.Z[:, :k], w.Z[:, len(w.numbers) - k :]
+    total = np.zeros((k, a.shape[2], b.shape[2]), complex)
+    for j, correlation in correlations.items():
+        first, second = w.pairs(j)
+        products = np.einsum("wkx,wky->kxy", np.conj(a[first]), b[second], optimize=True)
         total += correlation[:, None, None] * products
-    return total / (np.sum(first) * np.sum(second))
-
-
-def _share(
-    w: Windowed, seen: np.ndarray, P: np.ndarray, near: list[dict[int, np.ndarray]]
-) -> np.ndarray:
-    """Return one over the sum of an error's correlations with the lines around it, (k, m)."""
-    size, total = np.ones(P.shape[:2]), np.ones(P.shape[:2])
-    for d, c in enumerate(near):
-        k = len(c[0])
-        V = _spread(w, seen, seen, c)
-        C = np.real(np.einsum("kxa,kab,kxb->kx", P[:k], V, np.conj(P[d:]), optimize=True))
-        if d == 0:
-            size = np.sqrt(np.maximum(C, 1e-300))
-            continue
-        # Negative correlations are ignored, because no response varies that fast.
-        rho = np.maximum(C / (size[:k] * size[d:]), 0.0)
-        total[:k] += rho
-        total[d:] += rho
-    return 1.0 / total
+    return total / len(w.Z) ** 2
 
 
 def response_of(
     w: Windowed, at: Averages, E: Complex[np.ndarray, "W k p"]
 ) -> Complex[np.ndarray, "k p m"]:
-    """Return the response dH of errors to the inputs; NaN if inputs are dependent.
-
-    Args:
-        E: errors, or the outputs themselves; zero in windows that an output does not have.
-    """
-    S = np.einsum("wkz,wkp->kpz", np.conj(w.Z), E, optimize=True)
-    S = S / np.sum(w.seen, axis=0)[None, :, None]
-    return np.einsum("pkmz,kpz->kpm", at.P, S)
+    """Return the response dH of errors, or of the outputs themselves, to the inputs; zero if inputs
+    are dependent."""
+    return np.swapaxes(at.P @ _cross(w.Z, E), 1, 2)
 
 
 def noise_density(
     w: Windowed, at: Averages, E: Complex[np.ndarray, "W k p"]
 ) -> Complex[np.ndarray, "k p p"]:
-    """Return the smoothed spectral matrix of the errors' part that no response explains.
-
-    Args:
-        E: errors (W, k, p); zero in windows that an output does not have.
-    """
+    """Return the smoothed spectral matrix of the errors' part that no response explains."""
     p, power = E.shape[2], np.mean(np.abs(w.Y) ** 2, axis=(0, 1))
     floor = np.maximum(_ROUNDING * power, 1e-300)
-    averages = np.maximum(w.averages - len(w.inputs), 0.5)
-    least = _ENOUGH * len(w.outputs) / (_LINES * float(np.min(averages)))
+    averages = max(w.averages - len(w.inputs), 0.5)
+    least = _ENOUGH * p / (_LINES * averages)
     width = np.clip(least, 0.5 * _WIDEST, _WIDEST) * np.maximum(1.0, _PART * w.lines)
     kernel = np.exp(-0.5 * ((w.lines[:, None] - w.lines[None, :]) / width[:, None]) ** 2)
     kernel = kernel / np.sum(kernel, axis=1, keepdims=True)
-    own = np.sum(np.abs(_unexplained(w, E, w.seen)) ** 2, axis=0) / at.freedom
+    # The regression is on the instruments, because the response is unbounded without excitation.
+    explained = _inverse_power(w) @ _cross(w.Z, E)
+    left = E - np.einsum("wkm,kmp->wkp", w.Z, explained, optimize=True)
+    own = np.sum(np.abs(left) ** 2, axis=0) / at.freedom[:, None]
     own = np.maximum(own, floor)
     # The mean over lines of a steep spectrum is too large. So it is taken of the spectrum over its
     # geometric mean (prewhitening: Blackman and Tukey, 1958).
@@ -195,29 +164,16 @@ def noise_density(
     size = np.sqrt(shape * (kernel @ (own / shape)))
     R = np.broadcast_to(np.eye(p), (len(own), p, p))
     if w.together:
-        # Coherences use only windows that all outputs have. Otherwise pairs might contradict each
-        # other, and the matrix would not be positive definite.
-        D = _unexplained(w, E, np.repeat(w.common[:, None], p, axis=1)) / np.sqrt(shape)
+        D = left / np.sqrt(shape)
         S = np.einsum("kl,wli,wlj->kij", kernel, D, np.conj(D), optimize=True)
         root = np.sqrt(np.maximum(np.real(np.einsum("kii->ki", S)), _ROUNDING))
         R = S / (root[:, :, None] * root[:, None, :])
     return _definite(R * size[:, :, None] * size[:, None, :], floor)
 
 
-def _unexplained(
-    w: Windowed, E: Complex[np.ndarray, "W k p"], seen: Float[np.ndarray, "W p"]
-) -> Complex[np.ndarray, "W k p"]:
-    """Return the errors' part that no response to the instruments explains, in measured windows."""
-    # The regression is on the instruments, because the response is unbounded without excitation.
-    P = np.stack([_inverse_power(w, mask) for mask in seen.T])
-    S_ze = np.einsum("wp,wkz,wkp->kpz", seen, np.conj(w.Z), E, optimize=True)
-    part = np.einsum("pkmz,kpz->kpm", P, S_ze / np.sum(seen, axis=0)[None, :, None])
-    return (E - np.einsum("wkm,kpm->wkp", w.Z, part, optimize=True)) * seen[:, None, :]
-
-
-def _inverse_power(w: Windowed, seen: Float[np.ndarray, " W"]) -> Complex[np.ndarray, "k m m"]:
+def _inverse_power(w: Windowed) -> Complex[np.ndarray, "k m m"]:
     """Return the inverse of the instruments' spectral matrix; zero if they are dependent."""
-    S_zz = _cross(seen, w.Z, w.Z)
+    S_zz = _cross(w.Z, w.Z)
     power = np.real(np.einsum("kaa->ka", S_zz))
     return np.nan_to_num(inverse(S_zz, power, power))
 
@@ -235,8 +191,7 @@ def _definite(S: np.ndarray, floor: np.ndarray) -> np.ndarray:
 
 def covariance(at: Averages, S: Complex[np.ndarray, "k p p"]) -> Complex[np.ndarray, "k p m p m"]:
     """Return the covariance of the errors of all responses at each line."""
-    P = np.nan_to_num(at.P)
-    return np.einsum("ikxa,ijkab,jkyb,kij->kixjy", P, at.V, np.conj(P), S, optimize=True)
+    return np.einsum("kxy,kij->kixjy", at.covariance, S)
 
 
 def whitening(
@@ -259,13 +214,10 @@ def whitening(
 def partial_coherence(w: Windowed, at: Averages) -> Float[np.ndarray, "k p m"]:
     """Return the partial coherence of each output with each input; 0 if inputs are dependent."""
     H = response_of(w, at, w.Y)
-    left = (w.Y - np.einsum("wkm,kpm->wkp", w.U, np.nan_to_num(H))) * w.seen[:, None, :]
-    density = np.sum(np.abs(left) ** 2, axis=0) / np.sum(w.seen, axis=0)
-    spread = [
-        np.einsum("kxa,kab,kxb->kx", P, _cross(w.seen[:, j], w.Z, w.Z), np.conj(P), optimize=True)
-        for j, P in enumerate(at.P)
-    ]
-    error = density[:, :, None] * np.real(np.stack(spread, axis=1))
+    left = w.Y - np.einsum("wkm,kpm->wkp", w.U, H, optimize=True)
+    density = np.mean(np.abs(left) ** 2, axis=0)
+    spread = np.einsum("kxa,kab,kxb->kx", at.P, _cross(w.Z, w.Z), np.conj(at.P), optimize=True)
+    error = density[:, :, None] * np.real(spread)[:, None, :]
     with np.errstate(all="ignore"):
         return np.nan_to_num(np.abs(H) ** 2 / (np.abs(H) ** 2 + error))
 
@@ -274,10 +226,9 @@ def pairs_used(
     w: Windowed,
     options: ResponseOptions,
     coherence: Float[np.ndarray, "k p m"],
-    sound: Bool[np.ndarray, "k p m"],
 ) -> Bool[np.ndarray, "k p m"]:
     """Return, by frequency, which responses are used."""
-    used = np.zeros(sound.shape, bool)
+    used = np.zeros(coherence.shape, bool)
     omega = 2.0 * np.pi * w.hz
     everything = tuple(PairOptions(i, o) for i in w.inputs for o in w.outputs)
     for pair in options.pairs or everything:
@@ -289,7 +240,7 @@ def pairs_used(
         # The mean over an octave is compared: a line that exceeds the limit by chance also has too
         # large a gain by chance.
         enough = octave_mean(omega, coherence[at]) >= least
-        used[at] = sound[at] & enough & (w.hz >= low * (1 - 1e-9)) & (w.hz <= high * (1 + 1e-9))
+        used[at] = enough & (w.hz >= low * (1 - 1e-9)) & (w.hz <= high * (1 + 1e-9))
     return used
 
 
@@ -301,7 +252,6 @@ class ResponseWeights(NamedTuple):
 
     windows: Windowed
     averages: Averages
-    """Averages, with zeros where they are not determined."""
     coherence: Any
     """Partial coherence (k, p, m)."""
     used: Any
@@ -331,7 +281,7 @@ class ResponseWeights(NamedTuple):
     @property
     def numbers_of_noise(self) -> float:
         """Number of independent real values from which the noise's spectrum is estimated."""
-        averages = np.maximum(self.windows.averages - len(self.windows.inputs), 1.0)
+        averages = max(self.windows.averages - len(self.windows.inputs), 1.0)
         seen = np.any(np.asarray(self.used), axis=2)
         return float(np.sum(2.0 * np.asarray(self.share)[:, None] * seen * averages))
 
@@ -352,15 +302,13 @@ def first_weights(problem: Problem, flights: Sequence[Flight]) -> ResponseWeight
     options = problem.frequency
     w = windowed(flights, options, instruments_of(problem))
     at = averages(w)
-    sound = np.isfinite(response_of(w, at, w.Y))
-    if len(w.inputs) > 1 and not sound.any():
+    if len(w.inputs) > 1 and not at.sound.any():
         raise ValueError(
             f"frequency: {' and '.join(w.inputs)} move as one, so that no response tells what each "
             "of them does; expected inputs that move apart, or one of them"
         )
     coherence = partial_coherence(w, at)
-    at = at._replace(P=np.nan_to_num(at.P))
-    used = pairs_used(w, options, coherence, sound)
+    used = pairs_used(w, options, coherence) & at.sound[:, None, None]
     _require_lines(problem, w, used)
     density = noise_density(w, at, w.Y)
     weights = weighed(ResponseWeights(w, at, coherence, used, density, None, None), density)
@@ -371,7 +319,7 @@ def first_weights(problem: Problem, flights: Sequence[Flight]) -> ResponseWeight
 def weighed(weights: ResponseWeights, density: Complex[np.ndarray, "k p p"]) -> ResponseWeights:
     """Return the weights with another spectrum of the noise."""
     used = weights.used
-    each = np.moveaxis(weights.averages.share, 0, 1)
+    each = weights.averages.share[:, None, :]
     share = np.sum(each * used, axis=(1, 2)) / np.maximum(np.sum(used, axis=(1, 2)), 1)
     share = np.where(share > 0, share, 1.0)
     W = whitening(weights.averages, density, used) * np.sqrt(share)[:, None, None]
@@ -422,8 +370,3 @@ def _require_numbers(problem: Problem, weights: ResponseWeights) -> None:
 def on_device(weights: ResponseWeights) -> ResponseWeights:
     """Return the weights as JAX arrays, copied once instead of with every call."""
     return jax.tree.map(lambda v: jax.device_put(v) if isinstance(v, np.ndarray) else v, weights)
-
-
-def back(weights: ResponseWeights) -> ResponseWeights:
-    """Return the weights as NumPy arrays."""
-    return jax.tree.map(lambda v: np.asarray(v) if isinstance(v, jax.Array) else v, weights)

@@ -41,6 +41,7 @@ from heli_jax.identification.estimation.frequency_noise import (
     once_a_length,
     smoothed,
 )
+from heli_jax.identification.estimation.frequency_response import errors_in_windows
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Noise, Solution
@@ -119,8 +120,7 @@ def _room_of_responses(at: Solution) -> list[Float[np.ndarray, " k"]]:
     direct = np.array([n not in w.instruments for n in w.inputs])
     if not direct.any():
         return []
-    # Call a method of the objective, since this module must not import the objective's.
-    E = np.asarray(layout.objective.errors_in_windows(layout, data, noise, z))
+    E = np.asarray(errors_in_windows(layout, data, noise.whitening, z))
     joint = np.concatenate([np.asarray(w.U), np.asarray(w.Y)], axis=2)
     S, See = (np.einsum("wka,wkb->kab", v, np.conj(v)) / len(v) for v in (joint, E))
     return [_room(np.linalg.inv(np.linalg.cholesky(density)), S, See, direct)]

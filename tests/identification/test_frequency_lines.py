@@ -1,21 +1,26 @@
-"""Vehicles with memory longer than a window, against NumPy."""
+"""The response of linear models at the lines of a record, against NumPy."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from heli_jax import Flight
 from heli_jax.flights.flight import own_instruments
-from heli_jax.identification.estimation.frequency_lines import Driving, Matrices, orthonormal
-from heli_jax.identification.estimation.frequency_response import (
-    bounded_outputs,
-    effects_of_ends,
-    inverses,
+from heli_jax.identification.estimation.frequency_lines import (
+    Driving,
+    Matrices,
+    Record,
+    at_lines,
+    ends_of,
+    errors_of_record,
+    modelled,
+    projection,
 )
 
 
-def test_every_run_of_a_machine_is_its_bounded_solution_and_what_the_ends_add():
-    samples = 91
+@pytest.mark.parametrize("samples", [90, 91])
+def test_every_run_of_a_model_is_its_response_at_the_lines_and_the_effects_of_the_ends(samples):
     rng = np.random.default_rng(samples)
     # An unstable mode, an integrator and a lag.
     A = np.array([[1.08, 0.0, 0.1], [0.3, 1.0, 0.0], [0.0, 0.0, 0.7]])
@@ -23,18 +28,23 @@ def test_every_run_of_a_machine_is_its_bounded_solution_and_what_the_ends_add():
     U, x = rng.standard_normal((samples, 2)), rng.standard_normal(3)
     machine = Matrices(*(jnp.asarray(v) for v in (A, B, C, D)))
     signals = Driving(jnp.asarray(U), jnp.asarray(U))
-    y = np.zeros((2, samples))
+    y, first = np.zeros((samples, 2)), x
     for k in range(samples):
-        y[:, k] = C @ x + D @ U[k]
+        y[k] = C @ x + D @ U[k]
         x = A @ x + B @ U[k]
-    at = inverses(machine, samples)
-    left = (y - np.asarray(bounded_outputs(machine, signals, at))).ravel()
-    basis = np.moveaxis(np.asarray(effects_of_ends(machine, at, samples)), 1, 0).reshape(3, -1).T
-    ends = np.linalg.lstsq(basis, left, rcond=None)[0]
-    whole = np.asarray(bounded_outputs(machine, signals, at, jnp.asarray(ends)))
-    np.testing.assert_allclose(whole, y, atol=1e-8 * np.max(np.abs(y)))
-    S = np.asarray(orthonormal(jnp.asarray(basis.T @ basis)))
-    np.testing.assert_allclose(S @ (S.T @ (basis.T @ left)), ends, rtol=1e-6)
+    z, R = at_lines(machine, Record(0, 0, samples))
+    expected = np.linalg.inv(np.asarray(z)[:, None, None] * np.eye(3) - A)
+    np.testing.assert_allclose(R, expected, rtol=1e-10)
+    ends = z[:, None] * jnp.asarray(first - x + 0j)[None] / samples**0.5
+    lines = np.fft.rfft(y, axis=0)[1 : (samples + 1) // 2] / samples**0.5
+    made = modelled(machine, signals, R, ends)
+    np.testing.assert_allclose(made, lines, atol=1e-8 * np.max(np.abs(lines)))
+    # Least squares finds the effects of the ends.
+    W = jnp.broadcast_to(jnp.eye(2, dtype=complex), (len(z), 2, 2))
+    record, one = Record(0, 0, samples), jax.tree.map(lambda v: v[None], signals)
+    at = ends_of(machine, record, W, one, jnp.asarray(y)[None])
+    left = errors_of_record(machine, record, one, jnp.asarray(y)[None], at.R, at.inputs)
+    np.testing.assert_allclose(left, 0.0, atol=1e-8 * np.max(np.abs(lines)))
 
 
 def test_a_state_that_no_output_shows_adds_nothing():
@@ -42,31 +52,30 @@ def test_a_state_that_no_output_shows_adds_nothing():
     rng = np.random.default_rng(2)
     basis = rng.standard_normal((40, 3))
     basis[:, 1] = 1e-15 * rng.standard_normal(40)
-    S = np.asarray(orthonormal(jnp.asarray(basis.T @ basis)))
-    Q = basis @ S
+    Q, S = (np.asarray(v) for v in projection(jnp.asarray(basis)))
     shown, _ = np.linalg.qr(basis[:, [0, 2]])
     np.testing.assert_allclose(Q @ Q.T, shown @ shown.T, atol=1e-12)
     assert not S[1].any()
 
 
-def test_slopes_of_the_bounded_solution_are_those_of_the_whole_expression():
-    """Test derivatives, although the inverse for each line has none."""
-    rng = np.random.default_rng(7)
+def test_slopes_of_the_response_are_those_of_the_whole_expression():
+    """Though the inverse for each line has no derivative of its own."""
+    rng, record = np.random.default_rng(7), Record(0, 0, 60)
     shapes = ((3, 3), (3, 2), (2, 3), (2, 2), (60, 2), (60, 2))
     here, along = ([jnp.asarray(rng.standard_normal(s)) for s in shapes] for _ in range(2))
-    ends, turns = jnp.asarray(rng.standard_normal(3)), np.exp(1j * np.pi * np.arange(60) / 60)
-    z = np.exp(1j * np.pi * (2 * np.arange(60) + 1) / 60)
+    ends = jnp.asarray(rng.standard_normal(3)).astype(complex)
+    z = np.exp(2j * np.pi * np.arange(1, 30) / 60)
 
     def outputs(*v):
         m, signals = Matrices(*v[:4]), Driving(*v[4:])
-        return bounded_outputs(m, signals, inverses(m, 60), ends)
+        return modelled(m, signals, at_lines(m, record)[1], jnp.asarray(z)[:, None] * ends[None])
 
     def plain(A, B, C, D, U, acting):
-        lines = jnp.fft.fft(U * turns.conj()[:, None], axis=0)
+        lines, passing = (jnp.fft.rfft(v, axis=0)[1:30] / 60**0.5 for v in (U, acting))
         driving = lines @ B.T + z[:, None] * ends[None]
         resolvent = z[:, None, None] * np.eye(3)[None] - A[None]
         X = jnp.linalg.solve(resolvent, driving[:, :, None])[:, :, 0]
-        return jnp.real(jnp.fft.ifft(C @ X.T, axis=1) * turns[None]) + D @ acting.T
+        return X @ C.T + passing @ D.T
 
     made = jax.jvp(outputs, here, along)
     with jax.numpy_dtype_promotion("standard"):
