@@ -119,14 +119,13 @@ class Device(abc.ABC):
         """The Model with its device.
 
         Args:
-            again: puts the same device around another model: that without the stand.
+            again: puts the same device around another model, the one in `Model.within`.
         """
         model, states = self.model, tuple(self.parts.states)
         steady = model.steady_flight
         if steady is not None:
             # The device rests too: a state more to solve for, and its derivative to vanish.
             steady = SteadyFlight((*states, *steady.unknowns), (*states, *steady.equations))
-        bare = model.without_stand
         # Time constants, frequencies and damping of a device are above zero whatever the model
         # around which it stands: a fit then searches their logarithm.
         positive = tuple(n for n, q in self.parts.params.items() if q.positive)
@@ -144,7 +143,6 @@ class Device(abc.ABC):
             "noise_intensity": None if model.noise_intensity is None else self.noise_intensity,
             "limits": None if model.limits is None else self.limits,
             "steady_flight": steady,
-            "without_stand": None if bare is None else again(bare),
             "positive": (*model.positive, *positive),
             "within": _around(model.within, again),
         }

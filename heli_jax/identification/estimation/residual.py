@@ -43,7 +43,7 @@ def _colours(layout: Layout) -> tuple[Int[np.ndarray, " q"], Int[np.ndarray, " q
     Groups are the windows, then the signals, then the flights. The result is None if each unknown
     has its own direction.
     """
-    # All rows of a filter depend on every unknown, through the concentrated scale.
+    # All rows of a filter depend on every unknown, through the row of the variances.
     windows = sum(count for count, _ in layout.windows)
     if layout.noise_model != "white" or windows < 2:
         return None
