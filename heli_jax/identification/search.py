@@ -1,6 +1,6 @@
 """Search for the optimum of a problem: first guess, starts, noise and disturbance."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -91,11 +91,8 @@ def search(
     # continues only if there is one.
     first_steps = min(max_steps, _FIRST_STEPS) if layout.sigmas else max_steps
     over = Search(problem, layout, data, first_steps)
-    # The first guess already holds the residuals at the first start.
-    same = guess.begun is data and bool(np.array_equal(points[0], guess.z))
-    known: Any = (guess.e.r, guess.e.J) if same else None
     first = Search(problem, layout, guess.begun, first_steps)
-    optima = first.run(guess.noise, points, report, known=known)
+    optima = first.run(guess.noise, points, report)
     best = relax_noise_covariance(over, guess.noise, min(optima, key=rank))
     over.max_steps = max_steps
     if layout.sigmas:

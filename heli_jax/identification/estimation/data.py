@@ -14,7 +14,7 @@ from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.residual import residual_and_jacobian
 from heli_jax.identification.estimation.simulated_flights import (
-    SimulatedOutputs,
+    Run,
     by_output,
     simulated_at,
 )
@@ -136,13 +136,13 @@ def _with_state_scales(problem: Problem, layout: Layout, data: Data) -> Data:
         # The average over outputs is used because one wrong gain scales them all.
         sizes = [_size(v[np.isfinite(v)]) / _size(outputs[n][:near]) for n, v in y.items()]
         ratio, dtype = 10.0 * float(np.mean(sizes)), flight.dt.dtype
-        states = zip(names, runs.states[i], strict=True)
+        states = zip(names, runs[i].states, strict=True)
         scale = {n: np.asarray(ratio * _size(x[:near]), dtype) for n, x in states}
         scaled.append(flight._replace(state_scale=scale))
     return data._replace(flights=tuple(scaled))
 
 
-def _simulated(layout: Layout, data: Data, z: jax.Array) -> SimulatedOutputs:
+def _simulated(layout: Layout, data: Data, z: jax.Array) -> tuple[Run, ...]:
     """Return the simulation at z."""
     # The program of the residuals is used if it simulates. It must be compiled anyway, and
     # compiling a separate simulation takes longer than computing the derivatives.

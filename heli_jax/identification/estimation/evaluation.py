@@ -44,12 +44,12 @@ def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) ->
     """Evaluate residuals, Jacobian, simulation and named unknowns at a point."""
     at = residual_and_jacobian(layout, data, noise, z)
     # Output-error residuals already contain a simulation; filter innovations do not.
-    outputs = simulated_at(layout, data, z) if at.simulated is None else at.simulated
+    runs = simulated_at(layout, data, z) if at.simulated is None else at.simulated
     # Everything is fetched at once, with one wait for the device.
-    outputs, innovations, r, J, values, slopes = jax.device_get(
-        (outputs, at.innovations, at.r, at.J, *named(layout, data, z))
+    runs, innovations, r, J, values, slopes = jax.device_get(
+        (runs, at.innovations, at.r, at.J, *named(layout, data, z))
     )
-    simulated = by_output(layout, outputs)
+    simulated = by_output(layout, runs)
     raw = tuple(
         {n: np.asarray(flight.outputs[n]) - v for n, v in run.items()}
         for flight, run in zip(data.flights, simulated, strict=True)

@@ -103,14 +103,12 @@ def optimise(
     *,
     held: np.ndarray | None = None,
     damping: float = _DAMPING,
-    known: tuple[Array | np.ndarray, Array | np.ndarray] | None = None,
 ) -> Optimum:
     """Return the least-squares optimum from z0.
 
     Args:
         held: (q,) True for an unknown fixed at its start; default none.
         damping: mu of the first step.
-        known: residuals and Jacobian at z0, if already computed.
     """
     start, logarithms = np.asarray(z0, np.float64), ~without_size(layout)
     moving = np.ones(layout.size, bool) if held is None else ~held
@@ -118,15 +116,15 @@ def optimise(
     ties = np.eye(layout.size)[free & logarithms & moving] / _TIE_SD
     low, high = _bounds(layout, data)
 
-    def linearise(z: np.ndarray, rows: Any = None) -> Point:
-        r, J = rows or residual_and_jacobian(layout, data, noise, jnp.asarray(z))[:2]
+    def linearise(z: np.ndarray) -> Point:
+        r, J = residual_and_jacobian(layout, data, noise, jnp.asarray(z))[:2]
         # An overflowed derivative gives no direction.
         J = np.where(moving & np.isfinite(J).all(axis=0), J, 0.0)
         R = np.linalg.qr(np.column_stack([r, J]), mode="r")
         return Point(z, np.append(R[:, 0], ties @ (z - start)), np.vstack([R[:, 1:], ties]))
 
     with np.errstate(all="ignore"):  # simulations may overflow on the way
-        at, region = linearise(start, known), Region(damping, np.inf)
+        at, region = linearise(start), Region(damping, np.inf)
         sizes, count = np.zeros(layout.size), measured_count(data)
         short, steps = not np.isfinite(at.squares), 1
         while True:

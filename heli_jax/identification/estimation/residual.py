@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from heli_jax.identification.estimation.kalman import Innovations
-from heli_jax.identification.estimation.simulated_flights import Run, SimulatedOutputs, outputs_of
+from heli_jax.identification.estimation.simulated_flights import Run, with_bias
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, flight_places, unpack
 from heli_jax.numerics.jitted import jitted
 
@@ -142,8 +142,8 @@ class ResidualAndJacobian(NamedTuple):
     """Derivative of r by z."""
     innovations: tuple[Innovations, ...]
     """Innovations by flight; empty with output error."""
-    simulated: SimulatedOutputs | None
-    """Simulated outputs; None without simulation."""
+    simulated: tuple[Run, ...] | None
+    """Simulated flights with bias; None without simulation."""
 
 
 @jitted
@@ -169,5 +169,5 @@ def residual_and_jacobian(
     r, J, (_, runs, innovations) = jax.vmap(along, out_axes=(None, -1, None))(directions)
     if colours is not None:
         J = _spread_out(layout, data, J, *colours)
-    simulated = None if runs is None else outputs_of(unpack(layout, data, z), runs)
+    simulated = None if runs is None else with_bias(unpack(layout, data, z), runs)
     return ResidualAndJacobian(r, J, innovations, simulated)
