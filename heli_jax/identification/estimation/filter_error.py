@@ -22,10 +22,10 @@ from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.kalman import (
     Estimate,
     Innovations,
-    begun,
     by_name,
     corrected,
     filter_of,
+    filter_start,
     innovations,
 )
 from heli_jax.identification.estimation.noise_scales import (
@@ -350,7 +350,7 @@ def errors_ahead(
         positional: model, params, inputs, measured and sd, as for `kalman.innovations`.
         every: samples of a window; each starts from the filter's prediction of its first sample.
     """
-    drive, first, y, R = begun(*positional, options)
+    drive, first, y, R = filter_start(*positional, options)
     filter_ = filter_of(drive)
 
     def step(carry: tuple[Estimate, Estimate], sample: Any) -> tuple[Any, Any]:

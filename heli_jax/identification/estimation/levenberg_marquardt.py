@@ -137,18 +137,18 @@ def optimise(
             slope = at.J.T @ at.r
             outwards = ((at.z <= low) & (slope > 0)) | ((at.z >= high) & (slope < 0))
             units = np.where(outwards, 0.0, sizes)
-            ahead = gain_ahead(at.r, at.J, units)
-            if short or not CONVERGED <= ahead < np.inf or steps >= max_steps:
+            gain = predicted_gain(at.r, at.J, units)
+            if short or not CONVERGED <= gain < np.inf or steps >= max_steps:
                 break
             trial = linearise(np.clip(at.z + _step(at, units, region), low, high))
             steps += 1
-            accepted, region = judge_step(at, trial, region)
+            accepted, region = assess_step(at, trial, region)
             if accepted:
                 short = _is_short(at, trial, sizes, start)
                 at = trial
             if stages.watched():
                 stages.advance(detail=f"cost {at.squares / count:.4g}")
-        converged = ahead < CONVERGED or (short and ahead < _STUCK * at.squares)
+        converged = gain < CONVERGED or (short and gain < _STUCK * at.squares)
         moved = float(np.sum(np.square(at.J @ (at.z - start))))
     cost = at.squares / count
     converged = bool(converged and np.isfinite(cost))
@@ -181,7 +181,7 @@ def fit_nuisances(
     return min(runs, key=lambda run: run.cost).z
 
 
-def gain_ahead(
+def predicted_gain(
     r: Float[np.ndarray, " k"], J: Float[np.ndarray, "k q"], sizes: Float[np.ndarray, " q"]
 ) -> float:
     """Return the decrease of the sum of squares that a full Gauss-Newton step predicts.
@@ -216,7 +216,7 @@ def _step(at: Point, sizes: np.ndarray, region: Region) -> np.ndarray:
     return step * (region.radius / change) if change > region.radius else step
 
 
-def judge_step(at: Point, trial: Point, region: Region) -> tuple[bool, Region]:
+def assess_step(at: Point, trial: Point, region: Region) -> tuple[bool, Region]:
     """Return True if a step is accepted, and the region of the next one."""
     along = at.J @ (trial.z - at.z)
     predicted = 0.5 * float(np.sum(np.square(at.r + along)) - at.squares)

@@ -167,5 +167,5 @@ class FirstGuess(NamedTuple):
     noise: Noise
     z: Float[Array, " q"]
     e: Evaluation
-    begun: Data
+    search_data: Data
     """Data of the first search."""
