@@ -31,9 +31,6 @@ from heli_jax.identification.restarts import RESTARTS, SearchState, left_stabili
 from heli_jax.identification.unknowns.layout import layout_of
 from heli_jax.messages import messages
 
-_FIRST_STEPS = 40
-"""Steps of filter error before the disturbance is confirmed."""
-
 
 def first_guess(problem: Problem) -> FirstGuess:
     """Return the problem at its start values, with a first guess of the noise."""
@@ -86,14 +83,10 @@ def search(
     else:
         points = draw(layout, problem, z, starts, seed)
 
-    # Filter error does not converge if the record has no disturbance. So the first run is short and
-    # continues only if there is one.
-    first_steps = min(max_steps, _FIRST_STEPS) if layout.sigmas else max_steps
-    over = Search(problem, layout, data, first_steps)
-    first = Search(problem, layout, search_data, first_steps)
+    over = Search(problem, layout, data, max_steps)
+    first = Search(problem, layout, search_data, max_steps)
     optima = first.run(noise, points, report)
     best = relax_noise_covariance(over, noise, min(optima, key=rank))
-    over.max_steps = max_steps
     if layout.sigmas:
         best = significant_disturbances(over, best)
     name = "start" if len(optima) == 1 else "starts"

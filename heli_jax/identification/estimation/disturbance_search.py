@@ -50,7 +50,7 @@ def significant_disturbances(search: Search, optimum: RelaxedOptimum) -> Relaxed
     are almost zero, the residuals equal those of output error.
 
     Args:
-        optimum: the optimum with all disturbances; its search may have been cut short.
+        optimum: the optimum with all disturbances.
     """
     layout = search.layout
     candidates = [d for d in disturbances_of(layout.model) if d.sigma in layout.sigmas]
@@ -68,9 +68,6 @@ def significant_disturbances(search: Search, optimum: RelaxedOptimum) -> Relaxed
         if without.best.converged and not ratio > NO_DISTURBANCE:
             optimum = without.after(optimum)
             absent.append(d)
-    if not optimum.best.converged:
-        # The search was cut short before the disturbance was confirmed, so it continues.
-        optimum = relaxed_from(search, optimum.noise, optimum.best.z).after(optimum)
     if len(candidates) == 1:
         return optimum
     # Both parameters are absent: without sigma_w the correlation time has no effect.
