@@ -14,7 +14,6 @@ from heli_jax.identification.agreement import (
     signals_of,
     whiteness_of,
 )
-from heli_jax.identification.estimation.disturbance_search import NO_DISTURBANCE
 from heli_jax.identification.estimation.evaluation import Evaluation
 from heli_jax.identification.estimation.filter_error import (
     SECONDS,
@@ -309,11 +308,7 @@ class Context:
     @property
     def absent(self) -> tuple[str, ...]:
         """Parameters of disturbances that are not significant."""
-        if self.optimum is None:
-            return ()
-        ratio = self.optimum.ratio
-        none = ratio is not None and ratio < NO_DISTURBANCE
-        return self.at.layout.disturbance if none else self.optimum.absent
+        return () if self.optimum is None else self.optimum.absent
 
     @cached_property
     def fast_modes(self) -> list[FastMode]:
