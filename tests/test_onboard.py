@@ -84,8 +84,6 @@ def test_a_helicopter_has_them_too(written, vehicles_folder):
     }
     found = configuration.load(written(**content))
     assert not found.model.linear
-    assert found.model.without_stand is not None
-    assert found.model.without_stand.name == "roll+cyclics"
     np.testing.assert_allclose(found.vehicle.params.rate_cyclic, 0.1)
     wrong = {**content, "vehicle": {**content["vehicle"], "R1": 1.0}}
     with pytest.raises(InputError, match="R1 must be less than R2"):

@@ -243,10 +243,8 @@ def candidate_models(experiment: Experiment, fitted: Problem) -> "Alternatives":
     requested = (
         stated if disturbance is not None and disturbance.axis else undisturbed_too(model, stated)
     )
-    # The stand is compared only if its stiffness is free.
-    bare = model.without_stand if len(requested) == 1 and "kappa" in fitted.free else None
     with located(f"{experiment.path}: disturbance"):
-        return alternatives(fitted, model, requested, stated=stated, without_stand=bare)
+        return alternatives(fitted, model, requested, stated=stated)
 
 
 # Params are classes of each model, hence Any.

@@ -256,7 +256,7 @@ class FitConfig(Section):
     max_steps: Annotated[int, Field(ge=1)] = 200
     """most steps of the optimiser from each start"""
     compare: bool = False
-    """true: also fit candidate models: no disturbance, one pole, two poles; no stand; with several
+    """true: also fit candidate models: no disturbance, one pole, two poles; with several
     disturbances all, and each left out"""
     intervals: IntervalsConfig = IntervalsConfig()
     """intervals besides the Gaussian ones"""

@@ -141,17 +141,6 @@ def disturbances_of(model: Model) -> tuple[Disturbance, ...]:
     return ()
 
 
-def only_disturbed(model: Model) -> bool:
-    """True if all process noise comes from disturbances and none is the model's own."""
-    if model.noise_intensity is None:
-        return True
-    # With every sigma at zero, any remaining noise is the model's own, at any parameter values.
-    params = dict.fromkeys(naming.names(model.Params), 1.0)
-    params |= {d.sigma: 0.0 for d in disturbances_of(model)}
-    own = naming.asdict(model.noise_intensity(model.Params(**params)))
-    return all(float(v) == 0.0 for v in own.values())
-
-
 def _disturbances(model: Model, on: tuple[str, ...], poles: int) -> tuple[Disturbance, ...]:
     """Return the disturbances to add, by name; raise ValueError if one is not possible."""
     if not on:

@@ -101,7 +101,6 @@ def linearised(model: Model) -> Model:
         start=None,
         limits=None,
         steady_flight=None,
-        without_stand=None,
         within=None,
     )
 

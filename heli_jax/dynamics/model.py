@@ -90,8 +90,8 @@ class Model(eqx.Module):
     `linear=True` states that `vector_field` and `output` are linear in (state, inputs) and zero at
     zero. Discretisation is then exact, with matrices from differentiation.
 
-    `axes`, `steady_flight` and `without_stand` are optional. By default they follow from the names
-    of states and inputs: see `axes_of`.
+    `axes` and `steady_flight` are optional. By default they follow from the names of states and
+    inputs: see `axes_of`.
     """
 
     # All fields are static, since a model is compiled and its numbers are parameters. Models with
@@ -125,8 +125,6 @@ class Model(eqx.Module):
     """Axes of rotation; None: from the names of the states."""
     steady_flight: SteadyFlight | None = eqx.field(static=True, default=None)
     """Unknowns and equations of trim; None: from the names of states and inputs, if it can fly."""
-    without_stand: "Model | None" = eqx.field(static=True, default=None)
-    """For a vehicle on a stand, the same vehicle in free flight."""
     within: "tuple[Model, Callable[[Model], Model]] | None" = eqx.field(static=True, default=None)
     """For a model with sensors of derivatives (`with_motion_sensors`): the inner model, and the
     function that adds its devices to another model.

@@ -180,9 +180,7 @@ def on_stand(model: Model) -> Model:
             rates = naming.replace(rates, **{axis.rate: slowed})
         return rates
 
-    return dataclasses.replace(
-        model, name=f"{model.name}-on-stand", vector_field=vector_field, without_stand=model
-    )
+    return dataclasses.replace(model, name=f"{model.name}-on-stand", vector_field=vector_field)
 
 
 def _inertias(p: Record, axis: Axis) -> tuple[Scalar, Scalar]:

@@ -1,5 +1,6 @@
 """Measured and simulated signals of a fit, and their agreement."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -36,17 +37,15 @@ def correlated_residuals(signals: tuple[Signals, ...]) -> dict[str, float]:
     """
     correlated = {}
     for s in signals:
-        names = list(s.measured)
-        for b, a in ((b, a) for i, a in enumerate(names) for b in names[:i]):
+        # Two diverging simulations have correlated errors, whatever the noise.
+        names = [n for n, y in s.measured.items() if not diverges(metrics(y, s.simulated[n]))]
+        for b, a in itertools.combinations(names, 2):
             # Flights are kept apart, because biases of joined flights would look like correlation.
             x, y = s.residual(a), s.residual(b)
             # Sensors of different rates share few samples; only those count.
             seen = np.isfinite(x) & np.isfinite(y)
             n = int(seen.sum())
             if n < _FEWEST or not (np.std(x[seen]) > 0 and np.std(y[seen]) > 0):
-                continue
-            # Two diverging simulations have correlated errors, whatever the noise.
-            if any(diverges(metrics(s.measured[m], s.simulated[m])) for m in (a, b)):
                 continue
             rho = float(np.corrcoef(x[seen], y[seen])[0, 1])
             # For independent white residuals the standard deviation of rho is 1 / sqrt(n).

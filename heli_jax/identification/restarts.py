@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from heli_jax import naming
 from heli_jax.identification.equation_error.start import equation_error_start
 from heli_jax.identification.estimation.data import data_of, start_vector
-from heli_jax.identification.estimation.disturbance_search import NO_DISTURBANCE, with_noise_guess
+from heli_jax.identification.estimation.disturbance_search import with_noise_guess
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.multistart import (
     FirstGuess,
@@ -186,7 +186,7 @@ def _has_one_disturbance(at: SearchState) -> bool:
         best.best.converged
         and len(layout.sigmas) == 1
         # Only a disturbance can distinguish such values.
-        and (best.ratio is None or best.ratio > NO_DISTURBANCE)
+        and not best.absent
         and at.search.problem.model.linear
         and len(layout.free) <= _MOST_PARAMETERS
     )

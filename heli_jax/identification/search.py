@@ -1,6 +1,6 @@
 """Search for the optimum of a problem: first guess, starts, noise and disturbance."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,18 +31,15 @@ from heli_jax.identification.restarts import RESTARTS, SearchState, left_stabili
 from heli_jax.identification.unknowns.layout import layout_of
 from heli_jax.messages import messages
 
-_FIRST_STEPS = 40
-"""Steps of filter error before the disturbance is confirmed."""
-
 
 def first_guess(problem: Problem) -> FirstGuess:
     """Return the problem at its start values, with a first guess of the noise."""
     layout = layout_of(problem, problem.training)
     data = data_of(problem, problem.training, layout)
     noise = first_noise(problem, problem.training)
-    begun = layout.objective.data_at_start(data)
+    search_data = layout.objective.data_at_start(data)
     z = start_vector(layout, data, problem)
-    z = noise_guess_at(layout, begun, noise, z) if layout.disturbance else z
+    z = noise_guess_at(layout, search_data, noise, z) if layout.disturbance else z
     # Started at rest at zero, a record without input is insensitive to every parameter.
     if not any(np.ptp(u) > 0 for f in problem.training for u in f.inputs.values()):
         z = in_time(layout, data, noise, z)
@@ -52,7 +49,7 @@ def first_guess(problem: Problem) -> FirstGuess:
     if level is not noise:
         noise = level
         e = evaluate(layout, data, noise, z)
-    return FirstGuess(layout, data, noise, z, e, begun)
+    return FirstGuess(layout, data, noise, z, e, search_data)
 
 
 class SearchResult(NamedTuple):
@@ -80,28 +77,20 @@ def search(
         starts: number of start points, as in `fit`.
         report: called with a line of text before each longer computation.
     """
-    layout, data = guess.layout, guess.data
-
+    layout, data, noise, z, e, search_data = guess
     if starts is None:
-        points = delay_start(problem, layout, guess.begun, guess.noise, guess.z, guess.e.J)[None]
+        points = delay_start(problem, layout, search_data, noise, z, e.J)[None]
     else:
-        points = draw(layout, problem, guess.z, starts, seed)
+        points = draw(layout, problem, z, starts, seed)
 
-    # Filter error does not converge if the record has no disturbance. So the first run is short and
-    # continues only if there is one.
-    first_steps = min(max_steps, _FIRST_STEPS) if layout.sigmas else max_steps
-    over = Search(problem, layout, data, first_steps)
-    # The first guess already holds the residuals at the first start.
-    same = guess.begun is data and bool(np.array_equal(points[0], guess.z))
-    known: Any = (guess.e.r, guess.e.J) if same else None
-    first = Search(problem, layout, guess.begun, first_steps)
-    optima = first.run(guess.noise, points, report, known=known)
-    best = relax_noise_covariance(over, guess.noise, min(optima, key=rank))
-    over.max_steps = max_steps
+    over = Search(problem, layout, data, max_steps)
+    first = Search(problem, layout, search_data, max_steps)
+    optima = first.run(noise, points, report)
+    best = relax_noise_covariance(over, noise, min(optima, key=rank))
     if layout.sigmas:
         best = significant_disturbances(over, best)
     name = "start" if len(optima) == 1 else "starts"
-    runs = [Run(name, z, run) for z, run in zip(points, optima, strict=True)]
+    runs = [Run(name, start, run) for start, run in zip(points, optima, strict=True)]
     chosen = min(runs, key=lambda run: rank(run.optimum))
     state = SearchState(over, guess, best, starts, seed)
     for restart in RESTARTS:
@@ -110,18 +99,18 @@ def search(
         points = list(restart.points(state))
         if points:
             report(f"another search, {messages()[f'search.{restart.name}'].title}")
-        begun = state.best
-        for noise, z in points:
-            [run] = over.run(noise, z[None, :])
-            runs.append(Run(restart.name, z, run))
+        previous = state.best
+        for noise, start in points:
+            [run] = over.run(noise, start[None, :])
+            runs.append(Run(restart.name, start, run))
             other = relax_noise_covariance(over, noise, run)
             if is_better(over, other, state.best):
                 state, chosen = state._replace(best=other), runs[-1]
-        if state.best is begun:
+        if state.best is previous:
             continue
-        before, after = (log_posterior(over, o) for o in (begun, state.best))
+        before, after = (log_posterior(over, o) for o in (previous, state.best))
         note = found(f"search.{restart.name}", "note", before=before, after=after)
-        state = state._replace(best=state.best.after(begun, note))
+        state = state._replace(best=state.best.after(previous, note))
     return SearchResult(over, state.best, table(layout, data, runs, chosen))
 
 

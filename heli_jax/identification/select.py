@@ -16,7 +16,7 @@ from heli_jax.identification.diagnostics.search import STOPPED
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.fit import fit
 from heli_jax.identification.methods import METHODS, objective_of
-from heli_jax.identification.problem import Free, Problem
+from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Fit, Status
 from heli_jax.numbers import p_value
 
@@ -70,7 +70,6 @@ class _Form(NamedTuple):
     axes: tuple[str, ...]
     """Disturbed axes or states."""
     poles: int
-    stand: bool
 
 
 def alternatives(
@@ -79,7 +78,6 @@ def alternatives(
     names: Sequence[str],
     *,
     stated: Sequence[str] = (),
-    without_stand: Model | None = None,
 ) -> Alternatives:
     """List candidates for filter error: no disturbance, one and two poles on the named axes, and
     with several axes each one left out.
@@ -90,52 +88,36 @@ def alternatives(
         model: the model without disturbance.
         names: axes or states that may be disturbed.
         stated: the disturbances of a configuration, which form a candidate of their own.
-        without_stand: the same vehicle without its stand, to compare the two.
 
     Raises:
         ValueError: one of the names cannot be disturbed.
     """
     names = tuple(names)
     one, two = "one pole", "two poles"
-    forms = {"no disturbance": _Form((), 1, True)}
+    forms = {"no disturbance": _Form((), 0)}
     if len(names) > 1:
         one, two = (f"all: {', '.join(names)}{end}" for end in ("", "; two poles"))
         for name in names:
             rest = tuple(n for n in names if n != name)
-            forms[f"without {name}: {', '.join(rest)}"] = _Form(rest, 1, True)
+            forms[f"without {name}: {', '.join(rest)}"] = _Form(rest, 1)
         if 0 < len(stated) < len(names) - 1:
-            forms[f"only {', '.join(stated)}"] = _Form(tuple(stated), 1, True)
-    forms |= {one: _Form(names, 1, True), two: _Form(names, 2, True)}
-    free = {n: f for n, f in problem.free.items() if n not in ("kappa", "zeta")}
-    if without_stand is not None and free:
-        forms |= {f"{name}, no stand": f._replace(stand=False) for name, f in forms.items()}
-    bare, problems = replace(problem, free=free) if free else problem, {}
-    for name, form in forms.items():
-        base, vehicle = (problem, model) if form.stand else (bare, without_stand)
-        assert vehicle is not None
-        problems[name] = _by_filter_error(
-            base, vehicle, form.axes or names[:1], form.poles if form.axes else 0
-        )
-    vanishes = without_stand is not None and _stand_may_vanish(problem)
+            forms[f"only {', '.join(stated)}"] = _Form(tuple(stated), 1)
+    forms |= {one: _Form(names, 1), two: _Form(names, 2)}
+    problems = {
+        name: _by_filter_error(problem, model, form.axes or names[:1], form.poles)
+        for name, form in forms.items()
+    }
+    # One pole is not nested in two, because both poles have the same time constant.
     pairs = [
         (small, large)
         for small, a in forms.items()
         for large, b in forms.items()
-        if small != large and _is_nested(a, b, vanishes)
+        if set(a.axes) < set(b.axes) and a.poles in (0, b.poles)
     ]
     return Alternatives(problems, tuple(pairs))
 
 
-def _is_nested(small: _Form, large: _Form, stand_may_vanish: bool) -> bool:
-    """True if one form is a special case of another by one assumption."""
-    if small.stand != large.stand:
-        # Free flight equals a stand whose stiffness and damping are zero, if these may reach zero.
-        return stand_may_vanish and large.stand and small[:2] == large[:2]
-    # One pole is not nested in two, because both poles have the same time constant.
-    return set(small.axes) < set(large.axes) and (not small.axes or small.poles == large.poles)
-
-
-def _by_filter_error(problem: Problem, model: Model, on: Sequence[str], poles: int = 1) -> Problem:
+def _by_filter_error(problem: Problem, model: Model, on: Sequence[str], poles: int) -> Problem:
     """Return the problem for filter error with disturbances.
 
     Without poles one disturbance is fixed at almost zero, so that likelihoods are comparable.
@@ -164,17 +146,6 @@ def _by_filter_error(problem: Problem, model: Model, on: Sequence[str], poles: i
     )
 
 
-def _stand_may_vanish(problem: Problem) -> bool:
-    """True if stiffness and damping of the stand can each reach zero or are zero."""
-    values = naming.asdict(problem.vehicle)
-    return all(
-        (problem.free[name].lower or 0.0) <= 0
-        if name in problem.free
-        else all(f.known.get(name, values[name]) == 0.0 for f in problem.training)
-        for name in ("kappa", "zeta")
-    )
-
-
 def choose(
     problems: Mapping[str, Problem],
     nested: Sequence[tuple[str, str]] = (),
@@ -183,8 +154,6 @@ def choose(
     **fit_options: Any,  # keywords of `fit`
 ) -> Choice:
     """Fit all problems and compare them.
-
-    A model with a lower likelihood than a nested one is fitted again from there, with a note.
 
     Args:
         nested: pairs of names (small, large) for likelihood-ratio tests.
@@ -208,7 +177,6 @@ def choose(
         report(f"comparing models: {name}")
         fits[name] = fit(problem, **fit_options)
     pairs = [(a, b) for a, b in nested if a in fits and b in fits]
-    sentences = _none_below_its_part(problems, pairs, fits, report, fit_options)
     candidates = {}
     for name, f in fits.items():
         values = {n: e.value for n, e in f.estimates.items()}
@@ -219,76 +187,12 @@ def choose(
     ranked = tuple(
         sorted(candidates.values(), key=lambda c: (c.status == "not-converged", round(c.aic, 1)))
     )
-    sentences += _sentences(ranked, compared)
+    sentences = _sentences(ranked, compared)
     return Choice(ranked, tuple(t for t in compared if t.degrees > 0), tuple(sentences))
 
 
 _BELOW = 0.05
 """Log-likelihood by which a model may fall below a nested one, due to convergence."""
-
-
-def _none_below_its_part(
-    problems: Mapping[str, Problem],
-    nested: Sequence[tuple[str, str]],
-    fits: dict[str, Fit],
-    report: Callable[[str], None],
-    fit_options: dict[str, Any],
-) -> list[str]:
-    """Fit models again that ended below a nested model, from the nested optimum.
-
-    Changes `fits` and returns notes.
-    """
-    sentences = []
-    for a, b in nested:
-        before, least = fits[b].log_likelihood, fits[a].log_likelihood - _BELOW
-        if not before < least:
-            continue
-        report(f"comparing models: {b} again, from {a}")
-        try:
-            again = fit(begun_from(problems[b], problems[a], fits[a]), **fit_options)
-        except ValueError:  # it may be unstable at parameters of the nested model
-            again = fits[b]
-        if again.log_likelihood > before + _BELOW:
-            fits[b] = again
-        reached = fits[b].log_likelihood
-        where = f"below {a}, which is nested in it (log-likelihood {before:.1f} for {least:.1f})"
-        if reached > before:
-            sentences.append(
-                f"{b} first ended {where}: begun anew from that optimum it reaches {reached:.1f}."
-            )
-        if reached < least:
-            sentences.append(
-                f"{b} ends {where}, also when it begins there: its own optimum was not found, and "
-                "its test means nothing."
-            )
-    return sentences
-
-
-_ALL_BUT_NOTHING = 1e-3
-"""Start of a parameter that the nested model lacks, as a fraction of its stated start."""
-
-
-def begun_from(problem: Problem, nested: Problem, optimum: Fit) -> Problem:
-    """Return the problem started at the optimum of `nested`, its disturbance included.
-
-    A parameter fixed in `nested` starts at that value. A parameter that `nested` lacks starts near
-    zero.
-    """
-    free = {}
-    for name, parameter in problem.free.items():
-        value = _ALL_BUT_NOTHING * parameter.start
-        if name in optimum.estimates:
-            value = optimum.estimates[name].value
-        elif nested.model.name == problem.model.name and getattr(nested.vehicle, name) != 0:
-            value = float(getattr(nested.vehicle, name))
-        free[name] = parameter._replace(start=_inside(parameter, value))
-    # A vanished disturbance has no value to start from.
-    noise = {
-        n: jnp.asarray(optimum.nuisance[m].value)
-        for n, m in same_parameters(problem.model, nested.model).items()
-        if n in problem.noise and m in optimum.nuisance and optimum.nuisance[m].value > 0
-    }
-    return replace(problem, free=free, vehicle=naming.replace(problem.vehicle, **noise))
 
 
 def same_parameters(model: Model, other: Model) -> dict[str, str]:
@@ -299,15 +203,6 @@ def same_parameters(model: Model, other: Model) -> dict[str, str]:
     by_state = {d.state: d for d in disturbances_of(other)}
     pairs = [(d, by_state[d.state]) for d in disturbances_of(model) if d.state in by_state]
     return {n: m for d, o in pairs for n, m in ((d.sigma, o.sigma), (d.tau, o.tau))}
-
-
-def _inside(free: Free, value: float) -> float:
-    """Return the value, or the nearest value clearly inside the bounds."""
-    # An optimum may be at a bound.
-    low = -math.inf if free.lower is None else free.lower
-    high = math.inf if free.upper is None else free.upper
-    size = high - low if math.isfinite(high - low) else abs(value) or abs(free.start)
-    return min(max(value, low + 1e-3 * size), high - 1e-3 * size)
 
 
 def _test(small: Candidate, large: Candidate) -> Nested:
@@ -337,10 +232,15 @@ def _sentences(ranked: tuple[Candidate, ...], compared: list[Nested]) -> list[st
     if failed:
         sentences.append(f"Did not converge, so not compared: {', '.join(failed)}.")
     sentences += [
+        f"{t.large} ends below {t.small}, which is nested in it: its optimum was not found."
+        for t in compared
+        if t.ratio < -2.0 * _BELOW
+    ]
+    sentences += [
         f"{t.small} within {t.large}: twice the log-likelihood gained is {t.ratio:.3g} for "
         f"{t.degrees} more unknown{'s' if t.degrees > 1 else ''} (p {p_value(t.p_value)})."
         for t in compared
-        if t.degrees > 0 and not {t.small, t.large} & set(failed)
+        if t.degrees > 0 and t.ratio >= -2.0 * _BELOW and not {t.small, t.large} & set(failed)
     ]
     return sentences + [
         f"{t.small} within {t.large}: the larger one has no unknown more, so there is no test."

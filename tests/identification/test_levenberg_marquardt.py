@@ -6,8 +6,8 @@ import pytest
 from heli_jax.identification.estimation.levenberg_marquardt import (
     Point,
     Region,
-    gain_ahead,
-    judge_step,
+    assess_step,
+    predicted_gain,
 )
 
 RNG = np.random.default_rng(0)
@@ -26,23 +26,23 @@ def residual(gain, J=J, scale=1.0):
 
 @pytest.mark.parametrize("scale", [0.0, 1.0, 1e3])
 def test_the_gain_is_what_a_full_step_takes_off(scale):
-    assert gain_ahead(residual(1e-4, scale=scale), J, SIZES) == pytest.approx(1e-4, rel=1e-4)
+    assert predicted_gain(residual(1e-4, scale=scale), J, SIZES) == pytest.approx(1e-4, rel=1e-4)
 
 
 def test_an_unknown_that_stays_put_has_no_gain():
     still = J * [1.0, 0.0, 1.0, 0.0]
     r = residual(1e-4, still[:, [0, 2]], scale=1e3)
-    assert gain_ahead(r, still, SIZES * [1, 0, 1, 0]) == pytest.approx(1e-4, rel=1e-4)
+    assert predicted_gain(r, still, SIZES * [1, 0, 1, 0]) == pytest.approx(1e-4, rel=1e-4)
 
 
 def test_what_is_no_number_has_not_converged():
-    assert gain_ahead(np.full(12, np.nan), J, SIZES) == np.inf
+    assert predicted_gain(np.full(12, np.nan), J, SIZES) == np.inf
 
 
 def judged(r, step, cost, region=BEGUN):
     """Judge a step to a point with half the sum of squares equal to `cost`."""
     reached = Point(Y + step, np.full(12, np.sqrt(cost / 6.0)), J)
-    return judge_step(Point(Y, r, J), reached, region)
+    return assess_step(Point(Y, r, J), reached, region)
 
 
 def test_the_step_after_a_refused_one_is_shorter():

@@ -75,7 +75,6 @@ def with_input_delays(model: Model, parameters: Mapping[str, str]) -> Model:
 @functools.cache
 def _with_input_delays(model: Model, parameters: tuple[tuple[str, str], ...]) -> Model:
     on_time(model, (n for n, _ in parameters))
-    bare = model.without_stand
     new: dict[str, list[str]] = {}
     for name, parameter in parameters:
         # Several inputs may share one parameter, for example all sticks that go through one radio.
@@ -95,9 +94,6 @@ def _with_input_delays(model: Model, parameters: tuple[tuple[str, str], ...]) ->
         name=f"{model.name}+delays",
         Params=naming.extended(model.Params, f"{model.Params.__name__}Late", fields),
         delays=(*model.delays, *parameters),
-        # The free-flight model has the delay too, so that margins of a model on the stand include
-        # it.
-        without_stand=None if bare is None else _with_input_delays(bare, parameters),
     )
 
 

@@ -117,7 +117,7 @@ class Device(abc.ABC):
         """Return the model with its device.
 
         Args:
-            again: puts the same device around another model (the one without the stand).
+            again: puts the same device around another model, the one in `Model.within`.
         """
         model, states = self.model, tuple(self.parts.states)
         steady = model.steady_flight
@@ -125,8 +125,8 @@ class Device(abc.ABC):
             # The device is at rest in steady flight too: its states are unknowns, their derivatives
             # zero.
             steady = SteadyFlight((*states, *steady.unknowns), (*states, *steady.equations))
-        bare = model.without_stand
-        # These parameters are positive around any model, so a fit searches their logarithm.
+        # Time constants, frequencies and damping of a device are above zero whatever the model
+        # around which it stands: a fit then searches their logarithm.
         positive = tuple(n for n, q in self.parts.params.items() if q.positive)
         fields = {
             "name": f"{model.name}+{suffix}",
@@ -142,7 +142,6 @@ class Device(abc.ABC):
             "noise_intensity": None if model.noise_intensity is None else self.noise_intensity,
             "limits": None if model.limits is None else self.limits,
             "steady_flight": steady,
-            "without_stand": None if bare is None else again(bare),
             "positive": (*model.positive, *positive),
             "within": _around(model.within, again),
         }

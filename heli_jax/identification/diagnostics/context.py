@@ -14,9 +14,12 @@ from heli_jax.identification.agreement import (
     signals_of,
     whiteness_of,
 )
-from heli_jax.identification.estimation.disturbance_search import NO_DISTURBANCE
 from heli_jax.identification.estimation.evaluation import Evaluation
-from heli_jax.identification.estimation.filter_error import SECONDS, predictions_ahead
+from heli_jax.identification.estimation.filter_error import (
+    SECONDS,
+    expected_error,
+    predictions_ahead,
+)
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
 from heli_jax.identification.identifiability.equivalents import second_solutions
@@ -237,8 +240,7 @@ class Context:
         # Without any significant disturbance the fit is that of output error.
         if layout.disturbance and set(layout.disturbance) <= set(self.absent):
             return None
-        at = self.at
-        return layout.objective.expected_error(layout, at.data, at.noise, self.e, at.z)
+        return expected_error(self.at, self.e) if layout.noise_model == "disturbance" else None
 
     @cached_property
     def ahead(self) -> bool:
@@ -291,14 +293,12 @@ class Context:
             return Evidence(records, self.metrics, self.whiteness, expected, unknowns)
         # Predictions from the filter's states in place of a simulation.
         records, error, expected = [], {}, {}
-        for (label, flight), prediction in zip(
-            self.flights, predictions_ahead(self.at), strict=True
-        ):
-            records.append(Record(label, flight.outputs, prediction.predicted))
-            for n, v in prediction.predicted.items():
-                missed = float(np.nansum(np.square(flight.outputs[n] - v)))
-                error[n] = error.get(n, 0.0) + missed
-                expected[n] = expected.get(n, 0.0) + float(np.nansum(prediction.variance[n]))
+        for (label, flight), ahead in zip(self.flights, predictions_ahead(self.at), strict=True):
+            predicted = {n: flight.outputs[n] - np.asarray(v) for n, v in ahead.error.items()}
+            records.append(Record(label, flight.outputs, predicted))
+            for n, v in ahead.error.items():
+                error[n] = error.get(n, 0.0) + float(np.nansum(np.square(v)))
+                expected[n] = expected.get(n, 0.0) + float(np.nansum(ahead.variance[n]))
         agreement = {n: joined_metrics(n, records) for n in error}
         against = {n: error[n] / expected[n] if expected[n] > 0 else np.inf for n in error}
         return Evidence(tuple(records), agreement, self.whiteness, against, ahead=SECONDS)
@@ -308,11 +308,7 @@ class Context:
     @property
     def absent(self) -> tuple[str, ...]:
         """Parameters of disturbances that are not significant."""
-        if self.optimum is None:
-            return ()
-        ratio = self.optimum.ratio
-        none = ratio is not None and ratio < NO_DISTURBANCE
-        return self.at.layout.disturbance if none else self.optimum.absent
+        return () if self.optimum is None else self.optimum.absent
 
     @cached_property
     def fast_modes(self) -> list[FastMode]:

@@ -14,7 +14,7 @@ from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.residual import residual_and_jacobian
 from heli_jax.identification.estimation.simulated_flights import (
-    SimulatedOutputs,
+    Run,
     by_output,
     simulated_at,
 )
@@ -136,13 +136,13 @@ def _with_state_scales(problem: Problem, layout: Layout, data: Data) -> Data:
         # The average over outputs is used because one wrong gain scales them all.
         sizes = [_size(v[np.isfinite(v)]) / _size(outputs[n][:near]) for n, v in y.items()]
         ratio, dtype = 10.0 * float(np.mean(sizes)), flight.dt.dtype
-        states = zip(names, runs.states[i], strict=True)
+        states = zip(names, runs[i].states, strict=True)
         scale = {n: np.asarray(ratio * _size(x[:near]), dtype) for n, x in states}
         scaled.append(flight._replace(state_scale=scale))
     return data._replace(flights=tuple(scaled))
 
 
-def _simulated(layout: Layout, data: Data, z: jax.Array) -> SimulatedOutputs:
+def _simulated(layout: Layout, data: Data, z: jax.Array) -> tuple[Run, ...]:
     """Return the simulation at z."""
     # The program of the residuals is used if it simulates. It must be compiled anyway, and
     # compiling a separate simulation takes longer than computing the derivatives.
@@ -231,7 +231,7 @@ def _initial_states(layout: Layout, data: Data, problem: Problem, z: np.ndarray)
             # One step finds the initial states of a linear model from anywhere. In nonlinear models
             # a far start may lead to another solution.
             if not layout.model.linear:
-                x0 = _state_that_shows(layout, params, flight, k * m, first)
+                x0 = _matching_state(layout, params, flight, k * m, first)
             z[at] = x0[[names.index(n) for n in layout.states]] / scales
 
 
@@ -250,19 +250,15 @@ def own_start(model: Model, params: Any) -> dict[str, float]:
     return {n: v if v != 0.0 else float(getattr(hover, n)) for n, v in start.items()}
 
 
-_LINE = 5
-"""Samples of the straight line that gives the value at the first sample."""
-
-
-def _state_that_shows(
+def _matching_state(
     layout: Layout, params: Any, flight: FlightData, k: int, first: np.ndarray
 ) -> np.ndarray:
-    """Return the state (n,) nearest to `first` that matches the measured outputs at sample k.
+    """Return the state (n,) nearest to `first` that fits the first measurements from sample k.
 
     Three Gauss-Newton steps suffice, because outputs are mostly states or functions of angles.
     """
-    measured = {n: _at_start(np.asarray(y)[k:]) for n, y in flight.outputs.items()}
-    measured = {n: v for n, v in measured.items() if np.isfinite(v)}
+    after = {n: np.asarray(y)[k:] for n, y in flight.outputs.items()}
+    measured = {n: y[np.isfinite(y)][0] for n, y in after.items() if np.isfinite(y).any()}
     inputs = jax.tree.map(lambda u: u[k], flight.inputs)
     names, x = naming.names(layout.model.State), first
     rows = [naming.names(layout.model.Outputs).index(n) for n in measured]
@@ -274,14 +270,3 @@ def _state_that_shows(
         # The shortest step leaves states without effect on the outputs unchanged.
         x = x + np.linalg.pinv(np.asarray(C)[rows], rcond=1e-8) @ error
     return x
-
-
-def _at_start(y: np.ndarray) -> float:
-    """Return the value at the first sample, averaged over a few; NaN without measurements."""
-    seen = np.flatnonzero(np.isfinite(y[:_LINE]))
-    if seen.size < 3:
-        # There are too few samples for a line. A slow sensor's first sample is later, but better
-        # than zero.
-        seen = seen if seen.size else np.flatnonzero(np.isfinite(y))
-        return float(y[seen[0]]) if seen.size else float("nan")
-    return float(np.polyval(np.polyfit(seen, y[seen], 1), 0.0))

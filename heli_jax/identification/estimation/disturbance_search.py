@@ -50,32 +50,23 @@ def significant_disturbances(search: Search, optimum: RelaxedOptimum) -> Relaxed
     are almost zero, the residuals equal those of output error.
 
     Args:
-        optimum: the optimum with all disturbances; its search may have been cut short.
+        optimum: the optimum with all disturbances.
     """
     layout = search.layout
-    candidates = [d for d in disturbances_of(layout.model) if d.sigma in layout.sigmas]
-    absent: list[Disturbance] = []
+    absent: list[str] = []
     # Disturbances are removed one after another. If each were left out of the full set, two
     # exchangeable ones would both look superfluous.
-    for d in candidates:
+    for d in disturbances_of(layout.model):
         # A well-determined disturbance needs no search without it.
-        if _is_known(search, optimum, d):
+        if d.sigma not in layout.sigmas or _is_known(search, optimum, d):
             continue
         without, ratio = _without(search, optimum, d)
-        if len(candidates) == 1:
-            optimum = optimum._replace(ratio=ratio)
         # The condition is negated because a NaN ratio is no evidence of a disturbance.
         if without.best.converged and not ratio > NO_DISTURBANCE:
             optimum = without.after(optimum)
-            absent.append(d)
-    if not optimum.best.converged:
-        # The search was cut short before the disturbance was confirmed, so it continues.
-        optimum = relaxed_from(search, optimum.noise, optimum.best.z).after(optimum)
-    if len(candidates) == 1:
-        return optimum
-    # Both parameters are absent: without sigma_w the correlation time has no effect.
-    names = [n for d in absent for n in (d.sigma, d.tau) if n in layout.disturbance]
-    return optimum._replace(absent=tuple(names))
+            # Without sigma_w the correlation time has no effect.
+            absent += [n for n in (d.sigma, d.tau) if n in layout.disturbance]
+    return optimum._replace(absent=tuple(absent))
 
 
 def with_noise_guess(search: Search, noise: Noise, z: Float[Array, " q"]) -> Float[Array, " q"]:

@@ -44,12 +44,12 @@ def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) ->
     """Evaluate residuals, Jacobian, simulation and named unknowns at a point."""
     at = residual_and_jacobian(layout, data, noise, z)
     # Output-error residuals already contain a simulation; filter innovations do not.
-    outputs = simulated_at(layout, data, z) if at.simulated is None else at.simulated
+    runs = simulated_at(layout, data, z) if at.simulated is None else at.simulated
     # Everything is fetched at once, with one wait for the device.
-    outputs, innovations, r, J, values, slopes = jax.device_get(
-        (outputs, at.innovations, at.r, at.J, *named(layout, data, z))
+    runs, innovations, r, J, values, slopes = jax.device_get(
+        (runs, at.innovations, at.r, at.J, *named(layout, data, z))
     )
-    simulated = by_output(layout, outputs)
+    simulated = by_output(layout, runs)
     raw = tuple(
         {n: np.asarray(flight.outputs[n]) - v for n, v in run.items()}
         for flight, run in zip(data.flights, simulated, strict=True)
@@ -83,30 +83,14 @@ def deviations(J: np.ndarray) -> np.ndarray:
     They are infinite for a coordinate without effect or with a component in a direction without
     effect.
     """
-    return combined_deviations(J, np.eye(J.shape[1]), NULL, _TAKES_PART)
-
-
-def combined_deviations(
-    J: np.ndarray, combinations: np.ndarray, no_effect: float, takes_part: float
-) -> np.ndarray:
-    """Return the standard deviations (k,) of combinations of coordinates from whitened rows.
-
-    Args:
-        J: the rows (n, q).
-        combinations: (k, q).
-        no_effect: fraction of the largest singular value below which a direction has no effect.
-        takes_part: component in such a direction above which a combination is not determined.
-    """
     # A diverged simulation determines nothing.
     if not np.isfinite(J).all():
-        return np.full(len(combinations), np.inf)
+        return np.full(J.shape[1], np.inf)
     norms, sizes, right = _svd(J)
-    kept = sizes > no_effect * sizes[0]
-    along = (combinations / norms) @ right.T
-    lengths = np.linalg.norm(combinations / norms, axis=1)
-    lost = np.abs(along[:, ~kept]) > takes_part * lengths[:, None]
-    sds = np.linalg.norm(along[:, kept] / sizes[kept], axis=1)
-    return np.where(lost.any(axis=1), np.inf, sds)
+    kept = sizes > NULL * sizes[0]
+    lost = np.abs(right[~kept]) > _TAKES_PART
+    sds = np.linalg.norm(right[kept] / sizes[kept, None], axis=0) / norms
+    return np.where(lost.any(axis=0), np.inf, sds)
 
 
 def directions(J: np.ndarray, least: float = NULL) -> np.ndarray:

@@ -1,12 +1,12 @@
 """Filter error: the innovations of a Kalman filter, over their standard deviations.
 
 Maximum likelihood for vehicles with a disturbance (Jategaonkar, 2006, chapter 5). The disturbance's
-intensity and correlation time are estimated with the parameters. The scale of the measurement noise
-is concentrated out of the likelihood unless it is given.
+intensity and correlation time, and the sd of the measurement noise, are estimated with the
+parameters.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax import naming
-from heli_jax.dynamics.disturbance import disturbances_of, only_disturbed
 from heli_jax.dynamics.model import Model, correlation_of, initial_sd_of
 from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import Flight, labels
@@ -23,10 +22,10 @@ from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.kalman import (
     Estimate,
     Innovations,
-    begun,
     by_name,
     corrected,
     filter_of,
+    filter_start,
     innovations,
 )
 from heli_jax.identification.estimation.noise_scales import (
@@ -53,7 +52,6 @@ from heli_jax.identification.unknowns.layout import (
     Noise,
     Solution,
     Unknowns,
-    scales_of,
     unpack,
 )
 from heli_jax.simulation.options import SimulationOptions
@@ -98,8 +96,6 @@ def disturbed_records(reached: Solution, u: Unknowns, i: int, keys: Array) -> di
 _FLOOR = 1e-3
 """Least square of the likelihood's row over the count, which keeps the row real if the noise
 decreases."""
-_BLIND = 1e4
-"""Noise that makes a filter ignore the measurement, as a multiple of the signal."""
 _DIGITS = 1e13
 """Ratio of the variances of innovation and measurement beyond which float64 has no digits left."""
 _TOLERANCE = 1e-6
@@ -120,29 +116,19 @@ class FilterError(Objective):
         return Residuals(_likelihood_rows(layout, data, noise, u, by_flight), None, by_flight)
 
     def tags(self, layout: Layout, data: Data, count: int) -> RowTags:
-        """Return the row tags: innovations, one row of the scale unless it is concentrated out, and
-        the variances of the same samples."""
+        """Return the row tags: innovations, one row of the mean log variance, and the variances of
+        the same samples."""
         tags = super().tags(layout, data, count)
         n = int(tags.residual.sum())
         for of_rows in tags[:3]:
             of_rows[count - n :] = of_rows[:n]
         return tags
 
-    def scaled_outputs(self, problem: Problem) -> tuple[tuple[str, ...], bool]:
-        """Return the outputs with their own noise factor, and whether the common factor is
-        concentrated out.
-
-        It is if every sigma_w and sigma_y is unknown; all outputs but the first then have a factor.
-        If one is given, or the model has its own process noise, all outputs have one.
-        """
+    def scaled_outputs(self, problem: Problem) -> tuple[str, ...]:
+        """Return all outputs, unless their noise is fixed."""
         if "sigma_y" in problem.fixed_noise:
-            return (), False
-        # A common factor needs all noises unknown: a given noise fixes it.
-        sigmas = [d.sigma for d in disturbances_of(problem.model)]
-        unknown = bool(sigmas) and not any(n in problem.fixed_noise for n in sigmas)
-        concentrated = unknown and only_disturbed(problem.model)
-        outputs = tuple(sorted({n for f in problem.training for n in f.outputs}))
-        return outputs[concentrated:], concentrated
+            return ()
+        return tuple(sorted({n for f in problem.training for n in f.outputs}))
 
     def first_noise(self, problem: Problem, noise: Noise, flights: Sequence[Flight]) -> Noise:
         """Add the corrections, which are zero before the first relaxation."""
@@ -158,52 +144,32 @@ class FilterError(Objective):
     def relax(
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
     ) -> tuple[Float[Array, " q"], Noise]:
-        """Scale all noise, including the disturbance in z, by one factor.
+        """Return z, and the noise with the level and the corrections at z.
 
-        The optimum stays the same.
+        The noise itself is part of z.
         """
         n, e = measured_count(data), evaluate(layout, data, noise, z)
-        freedom = n / max(n - layout.determined, 1)
-        squares, logs = innovation_sums(e, noise)
-        level = np.asarray(logs / n, noise.log_variance_ratio.dtype)
-        if not layout.concentrated:
-            measured = signal_numbers(layout, data).size
-            corrections = corrections_at(layout, data, noise, e, z, measured)
-            return z, noise._replace(log_variance_ratio=level, corrections=corrections)
-        # This is the most likely scale, corrected for the degrees of freedom of the unknowns.
-        factor = np.sqrt(squares / n * freedom)
-        for name in layout.sizes:
-            # The gains, and so the optimum, depend only on ratios of noises.
-            at = layout.disturbance_at(name)
-            z = z.at[at].add(jnp.asarray(np.log(factor), z.dtype))
-        sd = tuple(
-            {name: np.asarray(s * factor, s.dtype) for name, s in by_output.items()}
-            for by_output in noise.sd
-        )
-        return z, Noise(sd, level)
+        level = np.asarray(innovation_sums(e, noise)[1] / n, noise.log_variance_ratio.dtype)
+        measured = signal_numbers(layout, data).size
+        corrections = corrections_at(layout, data, noise, e, z, measured)
+        return z, noise._replace(log_variance_ratio=level, corrections=corrections)
 
     def noise_matters(self, problem: Problem, layout: Layout, before: Noise, after: Noise) -> bool:
         """True if the change of the noise affects the optimum.
 
-        This has three causes. Priors are weighed against a concentrated scale, or that scale
-        changed much. The noise fell below the floor of the likelihood's row. A correction changed.
+        The noise fell below the floor of the likelihood's row, or a correction changed.
         """
-        if layout.concentrated:
-            return any(f.prior for f in problem.free.values()) or _is_far(before, after)
         fell = before.log_variance_ratio - after.log_variance_ratio
         return bool(fell > _FELL) or corrections_changed(before, after) > _CORRECTED
 
     def log_likelihood(self, layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
-        """Return the log-likelihood of the innovations (Schweppe, 1965); a concentrated scale
-        maximises it."""
+        """Return the log-likelihood of the innovations (Schweppe, 1965)."""
         n = measured_count(data)
         squares, logs = innovation_sums(e, noise)
         # The sums use log(s / sd^2), so the sd restore the units of the outputs.
         for flight, sd in zip(data.flights, noise.sd, strict=True):
             for k, y in flight.outputs.items():
                 logs += 2.0 * float(np.log(sd[k])) * int(np.isfinite(np.asarray(y)).sum())
-        if layout.concentrated:
-            return float(-0.5 * (n * (1.0 + np.log(2.0 * np.pi * squares / n)) + logs))
         return float(-0.5 * (squares + n * np.log(2.0 * np.pi) + logs))
 
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
@@ -214,46 +180,6 @@ class FilterError(Objective):
             )
             for i in range(len(reached.data.flights))
         ]
-
-    def expected_error(
-        self, layout: Layout, data: Data, noise: Noise, e: Evaluation, z: Array
-    ) -> dict[str, float]:
-        """Return, by output, the ratio of the simulation error's power to that explained by
-        disturbance and noise.
-
-        A filter with very noisy measurements never corrects its state. The variance of its
-        innovations is then that of a simulation error.
-        """
-        largest: dict[str, float] = {}
-        for f in data.flights:
-            for n, y in f.outputs.items():
-                size = float(np.sqrt(np.nanmean(np.square(np.asarray(y)))))
-                largest[n] = max(largest.get(n, _BLIND * 1e-300), _BLIND * size)
-        # All flights get the same noise, because they share covariances.
-        blinding = tuple(
-            {n: np.asarray(largest[n], np.asarray(s).dtype) for n, s in sd.items()}
-            for sd in noise.sd
-        )
-        blind = evaluate(layout, data, noise._replace(sd=blinding), z)
-        scales = scales_of(layout, z)
-        missed: dict[str, float] = {}
-        expected: dict[str, float] = {}
-        each = zip(e.raw, blind.innovations, blinding, noise.sd, strict=True)
-        for error, innovation, blind_sd, sd in each:
-            for n, s in innovation.variance.items():
-                factor = float(scales.get(n, 1.0)) ** 2
-                # The added noise is subtracted, but the result is not negative.
-                of_state = np.maximum(np.asarray(s) - float(blind_sd[n]) ** 2 * factor, 0.0)
-                seen = np.isfinite(error[n])
-                with np.errstate(all="ignore"):
-                    power = float(np.var(error[n][seen])) * int(seen.sum())
-                    allowed = float(np.nansum(of_state + float(sd[n]) ** 2 * factor))
-                missed[n] = missed.get(n, 0.0) + power
-                expected[n] = expected.get(n, 0.0) + allowed
-        return {
-            n: float(missed[n] / allowed) if np.isfinite(allowed) and allowed > 0 else 0.0
-            for n, allowed in expected.items()
-        }
 
     def ill_conditioned(self, problem: Problem, e: Evaluation, sd: dict[str, float]) -> bool:
         """True if the filter lost precision: variances are negative or too large for float64."""
@@ -280,25 +206,11 @@ class FilterError(Objective):
         """Return findings on the filter."""
         if ill:
             return [found("search.ill-conditioned")]
-        if at.layout.concentrated:
-            return []
         size = float(np.sqrt(innovation_sums(e, at.noise)[0] / measured_count(at.data)))
         # The intervals are wrong by the same factor.
         if 0.8 < size < 1.25:
             return []
         return [found("noise.innovations-size", value=size, distrusts=at.layout.of_interest)]
-
-
-def _is_far(before: Noise, after: Noise) -> bool:
-    """True if the rows' variance was far from 1.
-
-    The search then weighed them wrongly against the rows of variances, and may have ended early.
-    """
-    ratios = [
-        float(sd[n] / old[n]) for sd, old in zip(after.sd, before.sd, strict=True) for n in sd
-    ]
-    level = abs(float(before.log_variance_ratio - after.log_variance_ratio))
-    return bool(2.0 * abs(np.log(max(ratios))) + level > _FELL)
 
 
 def filtered_flights(
@@ -337,15 +249,13 @@ def _likelihood_rows(
 ) -> Array:
     r"""Return rows whose sum of squares is minus twice the log-likelihood, up to a constant.
 
-    Rows are zero without a measurement. The rows are $e_k/\sqrt{s_k}$. If the common scale of all
-    noise is concentrated out, each is multiplied by $\exp(\tfrac12(\overline{\log s} - level))$.
-    Otherwise one row is added, whose square is $N(1 + \overline{\log s} - level)$.
+    Rows are zero without a measurement. The rows are $e_k/\sqrt{s_k}$, and one row whose square is
+    $N(1 + \overline{\log s} - level)$.
 
     These rows contain half of the variances' information ($\tfrac14 s'^2/s^2$ of $\tfrac12$), so
     the optimiser would take twice the step along the noise. Further rows of value zero have the
     derivative $\tfrac12 (s'_k/s_k - \overline{s'/s})$. They make J'J the Fisher information (Mehra,
-    1970; Maine and Iliff, 1985, omit that part). The mean is subtracted: a concentrated scale has
-    no information, otherwise the additional row contains it.
+    1970; Maine and Iliff, 1985, omit that part). The additional row contains the mean.
     """
     y, sd = measured_signals(layout, data, noise)
     at = signals(layout)
@@ -357,18 +267,13 @@ def _likelihood_rows(
     log_s = jnp.where(seen, jnp.log(s / sd**2), 0.0)
     count = jnp.sum(seen.astype(rows.dtype))
     mean = jnp.sum(log_s) / count
-    above = mean - noise.log_variance_ratio
-    # The level of the last relaxation keeps the factor near 1 and the rows at variance 1.
-    if layout.concentrated:
-        rows, last = rows * jnp.exp(0.5 * above), []
-    else:
-        # N mean(log s) is written as a square; adding 1 keeps it positive, where the root is
-        # differentiable.
-        above += correction(layout, noise, u) / count
-        last = [jnp.sqrt(count * jnp.maximum(1.0 + above, _FLOOR))[None]]
+    # N mean(log s) is written as a square. The level of the last relaxation keeps it near 1, where
+    # the root is differentiable.
+    above = mean - noise.log_variance_ratio + correction(layout, noise, u) / count
+    last = jnp.sqrt(count * jnp.maximum(1.0 + above, _FLOOR))
     log_s = jnp.where(seen, log_s - mean, 0.0)
     # The last rows are zero; only the first term contributes a derivative.
-    return jnp.concatenate([rows, *last, 0.5 * (log_s - jax.lax.stop_gradient(log_s))])
+    return jnp.concatenate([rows, last[None], 0.5 * (log_s - jax.lax.stop_gradient(log_s))])
 
 
 def innovation_sums(e: Evaluation, noise: Noise) -> tuple[float, float]:
@@ -393,49 +298,51 @@ SECONDS = 2.0
 """Length of a window, which starts from the filter's prediction [s]."""
 
 
-class Ahead(NamedTuple):
-    """Predictions of one flight up to `SECONDS` ahead, by output; NaN without measurement."""
-
-    predicted: dict[str, Float[np.ndarray, " N"]]
-    """Prediction [SI]."""
-    variance: dict[str, Float[np.ndarray, " N"]]
-    """Variance of the prediction error due to disturbance and noise."""
-
-
-def predictions_ahead(at: Solution) -> tuple[Ahead, ...]:
-    """Return predictions by flight in windows that start from the filter's state.
+def predictions_ahead(at: Solution, seconds: float = SECONDS) -> tuple[Innovations, ...]:
+    """Return measured less predicted by flight, in windows that start from the filter's state.
 
     Args:
         at: the end of a fit by filter error.
+        seconds: length of a window [s]; infinite for a simulation.
     """
-    # The window length must be a static number in the compiled program.
-    samples = tuple(max(1, round(SECONDS / float(flight.dt))) for flight in at.data.flights)
-    return tuple(
-        Ahead(
-            {n: np.asarray(f.outputs[n]) - e for n, e in innovations.error.items()},
-            innovations.variance,
-        )
-        for f, innovations in zip(
-            at.data.flights, jax.device_get(_errors(*at, samples)), strict=True
-        )
-    )
+    flights = [(float(f.dt), next(iter(f.outputs.values())).size) for f in at.data.flights]
+    every = tuple(np.array(max(1, round(min(seconds / dt, n)))) for dt, n in flights)
+    return jax.device_get(_errors(*at, every))
+
+
+def expected_error(at: Solution, e: Evaluation) -> dict[str, float]:
+    """Return, by output, the ratio of the simulation error's power to that explained by
+    disturbance and noise."""
+    missed: dict[str, float] = {}
+    expected: dict[str, float] = {}
+    for error, ahead in zip(e.raw, predictions_ahead(at, np.inf), strict=True):
+        for n, variance in ahead.variance.items():
+            seen = np.isfinite(error[n])
+            with np.errstate(all="ignore"):
+                power = float(np.var(error[n][seen])) * int(seen.sum())
+                missed[n] = missed.get(n, 0.0) + power
+                expected[n] = expected.get(n, 0.0) + float(np.nansum(variance))
+    return {
+        n: float(missed[n] / allowed) if np.isfinite(allowed) and allowed > 0 else 0.0
+        for n, allowed in expected.items()
+    }
 
 
 @eqx.filter_jit
 def _errors(
-    layout: Layout, data: Data, noise: Noise, z: Array, samples: tuple[int, ...]
+    layout: Layout, data: Data, noise: Noise, z: Array, every: tuple[np.ndarray, ...]
 ) -> tuple[Innovations, ...]:
     u = unpack(layout, data, z)
     return tuple(
-        errors_ahead(*_filter_arguments(layout, data, noise, u, i), every)
-        for i, every in enumerate(samples)
+        errors_ahead(*_filter_arguments(layout, data, noise, u, i), samples)
+        for i, samples in enumerate(every)
     )
 
 
 def errors_ahead(
     positional: tuple[Model, Any, Any, dict[str, Array], dict[str, Any]],
     options: SimulationOptions,
-    every: int,
+    every: int | np.ndarray,
 ) -> Innovations:
     """Return measured less predicted in windows of `every` samples, and its variance.
 
@@ -443,7 +350,7 @@ def errors_ahead(
         positional: model, params, inputs, measured and sd, as for `kalman.innovations`.
         every: samples of a window; each starts from the filter's prediction of its first sample.
     """
-    drive, first, y, R = begun(*positional, options)
+    drive, first, y, R = filter_start(*positional, options)
     filter_ = filter_of(drive)
 
     def step(carry: tuple[Estimate, Estimate], sample: Any) -> tuple[Any, Any]:

@@ -230,7 +230,9 @@ def innovations(
     Source: Kalman (1960); the covariance's integral in Van Loan (1978); local linearisation by
     Ozaki (1985).
     """
-    drive, (x, P), y, R = begun(model, params, inputs, measured, sd, options.changed(keywords))
+    drive, (x, P), y, R = filter_start(
+        model, params, inputs, measured, sd, options.changed(keywords)
+    )
     filter_ = filter_of(drive)
 
     def step(carry: Estimate, sample: tuple[Array, Any]) -> tuple[Any, Any]:
@@ -243,7 +245,7 @@ def innovations(
     return by_name(measured, *jax.lax.scan(step, (x, P), (y, filter_.samples))[1])
 
 
-def begun(
+def filter_start(
     model: Model,
     params: Any,
     inputs: Any,

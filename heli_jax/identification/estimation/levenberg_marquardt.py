@@ -103,14 +103,12 @@ def optimise(
     *,
     held: np.ndarray | None = None,
     damping: float = _DAMPING,
-    known: tuple[Array | np.ndarray, Array | np.ndarray] | None = None,
 ) -> Optimum:
     """Return the least-squares optimum from z0.
 
     Args:
         held: (q,) True for an unknown fixed at its start; default none.
         damping: mu of the first step.
-        known: residuals and Jacobian at z0, if already computed.
     """
     start, logarithms = np.asarray(z0, np.float64), ~without_size(layout)
     moving = np.ones(layout.size, bool) if held is None else ~held
@@ -118,15 +116,15 @@ def optimise(
     ties = np.eye(layout.size)[free & logarithms & moving] / _TIE_SD
     low, high = _bounds(layout, data)
 
-    def linearise(z: np.ndarray, rows: Any = None) -> Point:
-        r, J = rows or residual_and_jacobian(layout, data, noise, jnp.asarray(z))[:2]
+    def linearise(z: np.ndarray) -> Point:
+        r, J = residual_and_jacobian(layout, data, noise, jnp.asarray(z))[:2]
         # An overflowed derivative gives no direction.
         J = np.where(moving & np.isfinite(J).all(axis=0), J, 0.0)
         R = np.linalg.qr(np.column_stack([r, J]), mode="r")
         return Point(z, np.append(R[:, 0], ties @ (z - start)), np.vstack([R[:, 1:], ties]))
 
     with np.errstate(all="ignore"):  # simulations may overflow on the way
-        at, region = linearise(start, known), Region(damping, np.inf)
+        at, region = linearise(start), Region(damping, np.inf)
         sizes, count = np.zeros(layout.size), measured_count(data)
         short, steps = not np.isfinite(at.squares), 1
         while True:
@@ -139,18 +137,18 @@ def optimise(
             slope = at.J.T @ at.r
             outwards = ((at.z <= low) & (slope > 0)) | ((at.z >= high) & (slope < 0))
             units = np.where(outwards, 0.0, sizes)
-            ahead = gain_ahead(at.r, at.J, units)
-            if short or not CONVERGED <= ahead < np.inf or steps >= max_steps:
+            gain = predicted_gain(at.r, at.J, units)
+            if short or not CONVERGED <= gain < np.inf or steps >= max_steps:
                 break
             trial = linearise(np.clip(at.z + _step(at, units, region), low, high))
             steps += 1
-            accepted, region = judge_step(at, trial, region)
+            accepted, region = assess_step(at, trial, region)
             if accepted:
                 short = _is_short(at, trial, sizes, start)
                 at = trial
             if stages.watched():
                 stages.advance(detail=f"cost {at.squares / count:.4g}")
-        converged = ahead < CONVERGED or (short and ahead < _STUCK * at.squares)
+        converged = gain < CONVERGED or (short and gain < _STUCK * at.squares)
         moved = float(np.sum(np.square(at.J @ (at.z - start))))
     cost = at.squares / count
     converged = bool(converged and np.isfinite(cost))
@@ -183,7 +181,7 @@ def fit_nuisances(
     return min(runs, key=lambda run: run.cost).z
 
 
-def gain_ahead(
+def predicted_gain(
     r: Float[np.ndarray, " k"], J: Float[np.ndarray, "k q"], sizes: Float[np.ndarray, " q"]
 ) -> float:
     """Return the decrease of the sum of squares that a full Gauss-Newton step predicts.
@@ -218,7 +216,7 @@ def _step(at: Point, sizes: np.ndarray, region: Region) -> np.ndarray:
     return step * (region.radius / change) if change > region.radius else step
 
 
-def judge_step(at: Point, trial: Point, region: Region) -> tuple[bool, Region]:
+def assess_step(at: Point, trial: Point, region: Region) -> tuple[bool, Region]:
     """Return True if a step is accepted, and the region of the next one."""
     along = at.J @ (trial.z - at.z)
     predicted = 0.5 * float(np.sum(np.square(at.r + along)) - at.squares)

@@ -60,28 +60,17 @@ class Search:
         noise: Noise,
         points: Float[Array | np.ndarray, "s q"],
         progress: Progress | None = None,
-        *,
-        known: tuple[Array | np.ndarray, Array | np.ndarray] | None = None,
     ) -> list[Optimum]:
         """Return an optimum for each start.
 
         Args:
             progress: called with a sentence after each of several starts.
-            known: residuals and Jacobian at the first start, if already computed.
         """
         # Starts run in sequence: on two cores a vmap, which waits for the slowest, took four times
         # as long and needed its own compilation.
         runs = []
         for i, z in enumerate(np.asarray(points)):
-            run = optimise(
-                self.layout,
-                self.data,
-                noise,
-                z,
-                self.max_steps,
-                held=self._held,
-                known=known if i == 0 else None,
-            )
+            run = optimise(self.layout, self.data, noise, z, self.max_steps, held=self._held)
             # An optimiser may converge where the model explains nothing, because its gradient is
             # zero there. Both costs are means over the measured values.
             if not run.cost <= _GOOD:
@@ -178,5 +167,5 @@ class FirstGuess(NamedTuple):
     noise: Noise
     z: Float[Array, " q"]
     e: Evaluation
-    begun: Data
+    search_data: Data
     """Data of the first search."""

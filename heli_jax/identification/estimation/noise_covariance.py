@@ -33,18 +33,14 @@ class RelaxedOptimum(NamedTuple):
     noise: Noise
     trace: tuple[tuple[int, float], ...]
     """Steps and cost of each round of the optimiser."""
-    ratio: float | None = None
-    """Twice the log-likelihood that a single disturbance gains; None if it is determined."""
     notes: tuple[Finding, ...] = ()
     """Notes on how the optimum was reached."""
     absent: tuple[str, ...] = ()
-    """Parameters of those among several disturbances that are not significant."""
+    """Parameters of disturbances that are not significant."""
 
     def after(self, earlier: "RelaxedOptimum", *notes: Finding) -> "RelaxedOptimum":
         """Return this optimum with the rounds and notes of an earlier one before its own."""
-        return self._replace(
-            trace=(*earlier.trace, *self.trace), ratio=earlier.ratio, notes=(*earlier.notes, *notes)
-        )
+        return self._replace(trace=(*earlier.trace, *self.trace), notes=(*earlier.notes, *notes))
 
 
 def first_noise(problem: Problem, flights: Sequence[Flight]) -> Noise:

@@ -77,13 +77,9 @@ class Objective(abc.ABC):
         """
         return None
 
-    def scaled_outputs(self, problem: Problem) -> tuple[tuple[str, ...], bool]:
-        """Return the outputs whose noise factor is an unknown in z.
-
-        The flag is True if a common factor of all noise is concentrated out of the likelihood
-        instead.
-        """
-        return (), False
+    def scaled_outputs(self, problem: Problem) -> tuple[str, ...]:
+        """Return the outputs whose noise factor is an unknown in z."""
+        return ()
 
     @abc.abstractmethod
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
@@ -173,14 +169,13 @@ class Objective(abc.ABC):
         """
         # The integral over sd of sd^-(n+1) exp(-S / (2 sd^2)) is proportional to S^(-n/2). Rows of
         # missing samples are zero, and n excludes them.
-        counts = [jnp.sum(jnp.isfinite(y)) for f in data.flights for y in f.outputs.values()]
-        n = jnp.stack(counts).astype(rows.dtype)
         if self.noise_model == "white":
+            counts = [jnp.sum(jnp.isfinite(y)) for f in data.flights for y in f.outputs.values()]
+            n = jnp.stack(counts).astype(rows.dtype)
             numbers = signal_numbers(layout, data)
             S = jnp.zeros(n.size, rows.dtype).at[numbers].add(rows[: numbers.size] ** 2)
             return -0.5 * jnp.sum(n * jnp.log(S))
-        S = jnp.sum(rows**2)
-        return -0.5 * (jnp.sum(n) * jnp.log(S) if layout.concentrated else S)
+        return -0.5 * jnp.sum(rows**2)
 
     def numbers(self, layout: Layout, data: Data, noise: Noise) -> int:
         """Return the number of independent values that the noise is estimated from."""
@@ -193,13 +188,6 @@ class Objective(abc.ABC):
 
         They are (N,), or (runs, N) if a disturbance is drawn.
         """
-
-    def expected_error(
-        self, layout: Layout, data: Data, noise: Noise, e: Evaluation, z: Array
-    ) -> dict[str, float] | None:
-        """Return, by output, the ratio of the simulation error's power to that explained by
-        disturbance and noise; None without a disturbance."""
-        return None
 
     def ill_conditioned(self, problem: Problem, e: Evaluation, sd: dict[str, float]) -> bool:
         """True if the evaluation is dominated by rounding.
@@ -231,4 +219,4 @@ def noise_unknowns(layout: Layout) -> int:
     """Return the number of measurement-noise sds that are estimated in addition to z."""
     # They count in AIC and BIC. A smooth spectrum does not, because each candidate model has its
     # own.
-    return len(signals(layout)) if layout.noise_model == "white" else int(layout.concentrated)
+    return len(signals(layout)) if layout.noise_model == "white" else 0

@@ -54,13 +54,13 @@ def _defects(layout: Layout, data: Data, u: Unknowns, runs: tuple[Run, ...]) -> 
     """Return, by flight, the defects of multiple shooting: jumps of the states between windows over
     their sd."""
     rows = []
-    for flight, run, begun in zip(data.flights, runs, u.states, strict=True):
+    for flight, run, starts in zip(data.flights, runs, u.states, strict=True):
         # Without continuity, the initial states of neighbouring windows are independent.
         if layout.continuity is None or run.ends is None:
             continue
         # The scale is ten times the motion of the state; continuity is a fraction of the motion.
         jumps = [
-            (getattr(run.ends, n)[:-1] - getattr(begun, n)[1:])
+            (getattr(run.ends, n)[:-1] - getattr(starts, n)[1:])
             / (0.1 * layout.continuity * flight.state_scale[n])
             for n in layout.states
         ]

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from heli_jax.identification.estimation.kalman import Innovations
-from heli_jax.identification.estimation.simulated_flights import Run, SimulatedOutputs, outputs_of
+from heli_jax.identification.estimation.simulated_flights import Run, with_bias
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, flight_places, unpack
 from heli_jax.numerics.jitted import jitted
 
@@ -43,7 +43,7 @@ def _colours(layout: Layout) -> tuple[Int[np.ndarray, " q"], Int[np.ndarray, " q
     Groups are the windows, then the signals, then the flights. The result is None if each unknown
     has its own direction.
     """
-    # All rows of a filter depend on every unknown, through the concentrated scale.
+    # All rows of a filter depend on every unknown, through the row of the variances.
     windows = sum(count for count, _ in layout.windows)
     if layout.noise_model != "white" or windows < 2:
         return None
@@ -142,8 +142,8 @@ class ResidualAndJacobian(NamedTuple):
     """Derivative of r by z."""
     innovations: tuple[Innovations, ...]
     """Innovations by flight; empty with output error."""
-    simulated: SimulatedOutputs | None
-    """Simulated outputs; None without simulation."""
+    simulated: tuple[Run, ...] | None
+    """Simulated flights with bias; None without simulation."""
 
 
 @jitted
@@ -169,5 +169,5 @@ def residual_and_jacobian(
     r, J, (_, runs, innovations) = jax.vmap(along, out_axes=(None, -1, None))(directions)
     if colours is not None:
         J = _spread_out(layout, data, J, *colours)
-    simulated = None if runs is None else outputs_of(unpack(layout, data, z), runs)
+    simulated = None if runs is None else with_bias(unpack(layout, data, z), runs)
     return ResidualAndJacobian(r, J, innovations, simulated)

@@ -43,22 +43,13 @@ def driven(layout: Layout, data: Data, u: Unknowns, i: int) -> Drive:
     return Drive(params, layout.model.Inputs(**inputs), flight.dt, u.states[i])
 
 
-class SimulatedOutputs(NamedTuple):
-    """Simulated outputs of the flights."""
-
-    outputs: tuple[Float[Array, "p N"], ...]
-    """Outputs with bias by flight, SI, in the order of `Layout.outputs`."""
-    states: tuple[Float[Array, "s N"], ...]
-    """States by flight, in the order of the model's State."""
-
-
 class Run(NamedTuple):
     """A simulated flight."""
 
     states: Float[Array, "s N"]
     """States, in the order of the model's State."""
     outputs: Float[Array, "p N"]
-    """Measured outputs in the order of `Layout.outputs`, without bias."""
+    """Measured outputs [SI], in the order of `Layout.outputs`."""
     ends: Any
     """State at the end of each window (the first sample of the next), (windows,), with windows
     only."""
@@ -183,31 +174,30 @@ def _with_lead(inputs: Any, samples: np.ndarray, late: Delays | None) -> Any:
     return jax.tree.unflatten(structure, leaves)
 
 
-def outputs_of(u: Unknowns, runs: tuple[Run, ...]) -> SimulatedOutputs:
-    """Return the simulated outputs with their biases, as in reports."""
-    with_bias = [
-        run.outputs + jnp.stack(list(bias.values()))[:, None]
+def with_bias(u: Unknowns, runs: tuple[Run, ...]) -> tuple[Run, ...]:
+    """Return the simulated flights with the biases of their outputs."""
+    return tuple(
+        run._replace(outputs=run.outputs + jnp.stack(list(bias.values()))[:, None])
         for run, bias in zip(runs, u.biases, strict=True)
-    ]
-    return SimulatedOutputs(tuple(with_bias), tuple(run.states for run in runs))
+    )
 
 
 @jitted
-def simulated_at(layout: Layout, data: Data, z: Float[Array, " q"]) -> SimulatedOutputs:
-    """Simulate the flights at z, without derivatives."""
+def simulated_at(layout: Layout, data: Data, z: Float[Array, " q"]) -> tuple[Run, ...]:
+    """Simulate the flights at z with bias, without derivatives."""
     u = unpack(layout, data, z)
-    return outputs_of(u, predict(layout, data, u))
+    return with_bias(u, predict(layout, data, u))
 
 
-def by_output(layout: Layout, simulated: SimulatedOutputs) -> tuple[dict[str, np.ndarray], ...]:
+def by_output(layout: Layout, runs: tuple[Run, ...]) -> tuple[dict[str, np.ndarray], ...]:
     """Return the simulated outputs (N,) of each flight by name.
 
     Args:
-        simulated: outputs fetched from the device.
+        runs: simulated flights fetched from the device.
     """
     return tuple(
-        {n: np.asarray(y) for n, y in zip(names, run, strict=True)}
-        for names, run in zip(layout.outputs, simulated.outputs, strict=True)
+        dict(zip(names, run.outputs, strict=True))
+        for names, run in zip(layout.outputs, runs, strict=True)
     )
 
 

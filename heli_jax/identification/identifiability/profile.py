@@ -15,7 +15,6 @@ import numpy as np
 import scipy.special
 
 from heli_jax.identification.estimation.evaluation import Evaluation, pseudoinverse
-from heli_jax.identification.estimation.levenberg_marquardt import measured_count
 from heli_jax.identification.identifiability.analysis import unknowns_of
 from heli_jax.identification.identifiability.equivalents import (
     Rows,
@@ -115,12 +114,7 @@ class _Line(NamedTuple):
             return math.inf
         if squares <= 0.0:
             return 0.0
-        n = measured_count(self.at.data)
-        # With the scale of the noise concentrated out the logarithm of the cost counts.
-        cost, least = squares / n, self.squares / n
-        concentrated = self.at.layout.concentrated
-        deviance = n * (math.log(cost / least) if concentrated else cost - least)
-        return max(0.0, deviance)
+        return max(0.0, squares - self.squares)
 
     def value(self, distance: float) -> float:
         """Return the parameter, in its unit."""

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 
-import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
@@ -12,12 +11,8 @@ from heli_jax.dynamics.disturbance import sensor_noise
 from heli_jax.flights.flight import labels
 from heli_jax.identification.estimation.evaluation import (
     Evaluation,
-    combined_deviations,
     deviations,
-    evaluate,
 )
-from heli_jax.identification.estimation.filter_error import innovation_sums
-from heli_jax.identification.estimation.simulated_flights import measured_count
 from heli_jax.identification.identifiability.analysis import unknowns_of
 from heli_jax.identification.identifiability.verdict import Unknown
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
@@ -31,38 +26,6 @@ from heli_jax.identification.unknowns.layout import (
     flight_unknowns,
     unpack,
 )
-
-_STEP = 1e-3
-"""of a coordinate, for a difference"""
-_NO_EFFECT = 1e-5
-"""singular value over the largest below which a direction is that of the common scale"""
-_TAKES_PART = 0.02
-"""component in that direction from which on a size is not determined"""
-
-
-def size_deviations(at: Solution, e: Evaluation) -> dict[str, float]:
-    """Return the sd of the logarithm of each size of a noise [1]; {} unless the sizes are relative
-    to a common scale.
-
-    The log of a size is its coordinate plus the log of the common scale, which changes by -1/2 of
-    the mean of log s, with s the variances of the innovations.
-    """
-    layout = at.layout
-    if not (layout.filtered and layout.concentrated and np.isfinite(e.J).all()):
-        return {}
-    n, shared = measured_count(at.data), layout.first_nuisance
-    _, here = innovation_sums(e, at.noise)
-    mean = np.zeros(layout.size)
-    for j in range(shared):
-        moved = evaluate(layout, at.data, at.noise, jnp.asarray(at.z).at[j].add(_STEP))
-        mean[j] = (innovation_sums(moved, at.noise)[1] - here) / (n * _STEP)
-    rows = np.tile(-0.5 * mean, (len(layout.sizes), 1))
-    rows[range(len(layout.sizes)), [layout.disturbance_at(name) for name in layout.sizes]] += 1.0
-    # The squares of the innovations determine the log of the scale with variance 1/(2 n).
-    sds = combined_deviations(e.J, rows, _NO_EFFECT, _TAKES_PART)
-    sds = np.sqrt(sds**2 + 0.5 / n)
-    return dict(zip(layout.sizes, map(float, sds), strict=True))
-
 
 _UNBOUNDED = 1e3
 """factor to either side of an interval from which on a disturbance's parameter is not
@@ -144,8 +107,6 @@ def flight_nuisances(
         return {}
     whites, wider = deviations(e.J), errors.wider
     sds = np.multiply(whites, wider, where=np.isfinite(whites), out=whites.copy())
-    for name, relative in size_deviations(at, e).items():
-        sds[layout.disturbance_at(name)] = relative * wider[layout.disturbance_at(name)]
     reaches = errors.quantiles * sds
     estimates = {}
     # The parameters of process noise are searched in their logarithms.

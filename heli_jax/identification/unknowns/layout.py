@@ -94,8 +94,6 @@ class Layout(eqx.Module):
     """Filter error: outputs with their own unknown noise factor."""
     objective: Any = eqx.field(static=True)
     """The method's `Objective`, whose module imports this one."""
-    concentrated: bool = eqx.field(static=True)
-    """Filter error: True if a common factor of all noise is concentrated out of the likelihood."""
     solver: str | None = eqx.field(static=True)
     substeps: int = eqx.field(static=True)
     block: int = eqx.field(static=True)
@@ -141,11 +139,6 @@ class Layout(eqx.Module):
     def noises(self) -> tuple[str, ...]:
         """Parameters of process noise: disturbance parameters, then sds of noise before filters."""
         return (*self.disturbance, *map(sensor_noise, self.filtered))
-
-    @property
-    def sizes(self) -> tuple[str, ...]:
-        """Standard deviations among the parameters of process noise."""
-        return (*self.sigmas, *map(sensor_noise, self.filtered))
 
     @property
     def sigmas(self) -> tuple[str, ...]:
@@ -291,7 +284,6 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...]) -> Layout:
     """Return the static part of a problem for the given flights."""
     # All of it is hashable and static, so problems with equal layouts share compiled programs.
     objective = objective_of(problem.method)
-    scaled, concentrated = objective.scaled_outputs(problem)
     nuisance = problem.nuisance
     exact = problem.solver == "exact" or (problem.solver is None and problem.model.linear)
     return Layout(
@@ -307,9 +299,8 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...]) -> Layout:
         outputs=tuple(tuple(sorted(f.outputs)) for f in flights),
         disturbance=tuple(problem.noise),
         filtered=tuple(problem.filtered_noise),
-        scaled=scaled,
+        scaled=objective.scaled_outputs(problem),
         objective=objective,
-        concentrated=concentrated,
         solver=problem.solver,
         substeps=problem.substeps,
         # Only an exact recurrence allows several samples in a step.

@@ -97,17 +97,6 @@ def _padded(n: int, lags: int) -> int:
     return cast(int, scipy.fft.next_fast_len(n + lags, real=True))
 
 
-def autocorrelation(residual: np.ndarray, lags: int) -> np.ndarray:
-    """Return the biased autocorrelation (lags + 1,) from lag 0; NaN counts as the mean."""
-    r = _centred(residual)
-    n = r.size
-    size = _padded(n, lags)
-    spectrum = np.abs(np.fft.rfft(r, size)) ** 2
-    # Divide by n and not by the pairs at each lag, to keep the sequence positive semi-definite.
-    c = np.fft.irfft(spectrum, size)[: lags + 1] / n
-    return c / c[0] if c[0] > 0 else np.concatenate([[1.0], np.zeros(lags)])
-
-
 def cross_correlation(u: np.ndarray, residual: np.ndarray, lags: int) -> np.ndarray:
     """Return the correlation (2 lags + 1,) of u(t - lag) with the residual, from -lags to lags.
 

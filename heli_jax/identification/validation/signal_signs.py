@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from heli_jax.dynamics.model import Model, axes_of
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.validation.metrics import autocorrelation, cross_correlation
+from heli_jax.identification.validation.metrics import cross_correlation
 from heli_jax.vehicle import of_helicopter
 
 # An angle and the integral of its rate.
@@ -165,7 +165,8 @@ def _surely(measured: np.ndarray, simulated: np.ndarray, dt: float) -> float | N
     # Standard deviation for independent signals, from their autocorrelations (Bartlett, 1935).
     most = max(1, measured.size // 5)
     window = 1.0 - np.arange(most + 1) / (most + 1)
-    both = window * autocorrelation(measured, most) * autocorrelation(simulated, most)
+    a, b = (cross_correlation(y, y, most)[most:] for y in (measured, simulated))
+    both = window * a * b
     chance = float(np.sqrt(max(both[0] + 2.0 * both[1:].sum(), 1e-12) / seen.sum()))
     least = max(-AGAINST, _SURE * chance)
     if -worst > least and -worst > _LARGER * best:
