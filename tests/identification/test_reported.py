@@ -74,7 +74,7 @@ def test_the_residuals_part_of_the_hessian_is_that_of_finite_differences(found):
 
     h = 2e-3
     J = np.asarray(residual_and_jacobian(at.layout, at.data, at.noise, at.z).J)
-    hessian = J.T @ J + residual_curvature(at)
+    hessian = J.T @ J + residual_curvature(at, J)
     scale = np.linalg.norm(J, axis=0)
     for i, j in ((0, 0), (0, 2), (1, 2), (2, 4)):
         corners = [a * b * cost(i, j, a * h, b * h) for a in (1, -1) for b in (1, -1)]

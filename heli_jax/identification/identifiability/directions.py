@@ -6,7 +6,7 @@ than a factor of ten.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -19,8 +19,9 @@ TAKES_PART = 0.01
 """component of a unit null direction from which on an unknown takes part in it"""
 _FAR = math.log(FACTOR) / Z95
 """sd in relative coordinates of an interval that reaches as far as the factor"""
-_SHARPER = 3.0
-"""factor of a direction's singular value from which on weak priors alone determine it"""
+_SHARPER = 100.0
+"""sensitivity with known nuisances over that with free ones from which on a direction is
+exchangeable with nuisances"""
 _NO_EFFECT = 1e-12
 """norm of a column without effect, over the largest"""
 
@@ -63,16 +64,12 @@ class Directions(NamedTuple):
     """(q, q) in relative coordinates, without the null directions"""
 
 
-def directions(rows: np.ndarray, scale: np.ndarray, smallest: float = NULL) -> Directions:
-    """Return rank and covariance by rows (any, q), of unknowns of a size (q,).
-
-    Args:
-        smallest: part of the largest singular value up to which a direction is null.
-    """
+def directions(rows: np.ndarray, scale: np.ndarray) -> Directions:
+    """Return rank and covariance by rows (any, q), of unknowns of a size (q,)."""
     # Rows of zeros: the decomposition has all q directions.
     padded = np.vstack([rows * scale, np.zeros((scale.size, scale.size))])
     _, singular, right = np.linalg.svd(padded, full_matrices=False)
-    kept = singular > smallest * max(singular[0], 1e-300)
+    kept = singular > NULL * max(singular[0], 1e-300)
     V = scale[:, None] * right[kept].T / singular[kept]
     null = [unit_vector(scale * v) for v in right[~kept]]
     return Directions(singular, int(kept.sum()), null, V @ V.T)
@@ -109,31 +106,26 @@ def with_new_directions(null: list[np.ndarray], others: list[np.ndarray]) -> lis
     return null
 
 
-class WithoutWeakPriors(NamedTuple):
-    """Information of the data without the nuisances' weak priors.
+class Nuisances(NamedTuple):
+    """Initial states, biases and input offsets, which may be exchangeable with parameters."""
 
-    Initial states, biases and input offsets have priors of ten times the signal, so that one
-    without effect does no harm. A parameter that these priors alone bound is not identifiable.
-    """
-
-    sensitivity: np.ndarray
-    """(any, q) with the nuisances free, without any prior"""
+    fixed: np.ndarray
+    """(any, q) sensitivity to the unknowns with the nuisances known"""
     compensation: np.ndarray
     """(k, q) change of the nuisances, in sds of their weak priors, that compensates a unit of each
     unknown"""
-    nuisances: tuple[FlightUnknown, ...]
+    names: tuple[FlightUnknown, ...]
     """(k,)"""
 
     def exchanged(self, v: np.ndarray, sensitivity: np.ndarray) -> tuple[FlightUnknown, ...]:
         """Return the nuisances that are exchangeable with a direction v (q,) of the unknowns; none
-        if the direction is no sharper with the weak priors, by the given sensitivity (any, q)."""
-        held, free = (np.linalg.norm(rows @ v) for rows in (sensitivity, self.sensitivity))
-        least = NULL * np.linalg.norm(sensitivity)
-        if not self.nuisances or held < max(least, _SHARPER * free):
+        if it is no sharper with the nuisances known than by the given sensitivity (any, q)."""
+        known, free = (np.linalg.norm(rows @ v) for rows in (self.fixed, sensitivity))
+        if not self.names or known < max(NULL * np.linalg.norm(self.fixed), _SHARPER * free):
             return ()
         size = np.abs(self.compensation @ v)
         moves = size > 0.1 * max(size.max(), 1e-300)
-        return tuple(n for n, m in zip(self.nuisances, moves, strict=True) if m)
+        return tuple(n for n, m in zip(self.names, moves, strict=True) if m)
 
 
 # Products of powers, such as a/Ixx, and sums, such as La + Lb, that do not change along the null
@@ -147,18 +139,14 @@ _LARGEST = 700.0
 """log of the largest value: exp overflows at 709"""
 
 
-type Spread = Callable[[np.ndarray], float]
-"""standard deviation of a weighted sum (q,) of relative coordinates"""
-
-
 def combinations(
     null: Sequence[np.ndarray],
-    spread: Spread,
+    covariance: np.ndarray,
     unknowns: tuple[Unknown, ...],
     units: Mapping[str, str | None] | None = None,
 ) -> tuple[Combination, ...]:
     """Return the products of powers that do not change along the null directions (q,), or with
-    `units` the sums of parameters of one unit."""
+    `units` the sums of parameters of one unit; with sds by a covariance (q, q)."""
     # From a relative coordinate to log |value|, or for sums to the value.
     to = np.array([u.per_log for u in unknowns])
     if units is not None:
@@ -192,7 +180,9 @@ def combinations(
         by_name = {u.name: float(w) for u, w in zip(unknowns, weights, strict=True) if w}
         values = {u.name: u.value for u in members}
         made = _product if units is None else _sum
-        found.append(made(by_name, values, spread(weights * to)))
+        along = weights * to
+        sd = math.sqrt(max(0.0, float(along @ covariance @ along)))
+        found.append(made(by_name, values, sd))
     return tuple(c for c in found if c.is_bounded)
 
 

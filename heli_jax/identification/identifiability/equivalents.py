@@ -20,7 +20,7 @@ from heli_jax.analysis.linear import linearize
 from heli_jax.analysis.operating_point import operating_point
 from heli_jax.identification.estimation.evaluation import Evaluation, named
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
-from heli_jax.identification.identifiability.directions import Spread, combinations
+from heli_jax.identification.identifiability.directions import combinations
 from heli_jax.identification.identifiability.verdict import Combination, SecondSolution, Unknown
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
@@ -175,15 +175,15 @@ class Valley(NamedTuple):
         return Point({n: float(v) for n, v in zip(names, values, strict=True)}, excess, expected)
 
     def determined_combinations(
-        self, null: Sequence[np.ndarray], spread: Spread, unknowns: tuple[Unknown, ...]
+        self, null: Sequence[np.ndarray], covariance: np.ndarray, unknowns: tuple[Unknown, ...]
     ) -> tuple[Combination, ...]:
         """Return the products of powers, else the sums, that are constant along null directions,
         at the optimum and far from it."""
         params = self.problem.model.Params
         units = {u.name: naming.unit(params, u.name) for u in unknowns if u.is_parameter}
         found = [
-            *combinations(null, spread, unknowns),
-            *combinations(null, spread, unknowns, units),
+            *combinations(null, covariance, unknowns),
+            *combinations(null, covariance, unknowns, units),
         ]
         points = self._far_points(null, unknowns) if found else []
         stays = [c for c in found if _stays(c, unknowns, points)]
@@ -247,8 +247,6 @@ _MAKES = 0.05
 """smallest singular value over the largest, and smallest logarithm, of an exchange"""
 _REACH = math.log(300.0)
 """largest change of a parameter's logarithm"""
-_VISITS = 3
-"""searches of all unknowns after an exchange"""
 _DIFFERENCE = 1e-5
 """relative step of a parameter"""
 
@@ -271,21 +269,15 @@ def second_solutions(
         return ()
     valley, solutions = Valley(problem, at, e), []
     for held in _exchanged_modes(problem, here):
-        # First with the exchanged values held, then all together until they settle.
-        before, point = here, valley.visit(held, {}, same=not optimum, priors=True)
-        for _ in range(_VISITS):
-            if point is None:
-                break
-            before = {n: point.values[n] for n in here}
-            point = valley.visit({}, before, same=not optimum, priors=True)
-            if point is not None and all(_alike(v, point.values[n]) for n, v in here.items()):
-                break
+        # First with the exchanged values held, then all together.
+        point = valley.visit(held, {}, same=not optimum, priors=True)
+        if point is not None:
+            guess = {n: point.values[n] for n in here}
+            point = valley.visit({}, guess, same=not optimum, priors=True)
         # A point within the interval by the slopes is no other solution.
         if point is None or not (point.excess <= SAME and point.expected > _APART):
             continue
         there = {n: point.values[n] for n in here}
-        if not all(map(_alike, before.values(), there.values())):
-            continue
         changed = tuple(n for n, v in here.items() if not _alike(v, there[n]))
         known = (all(map(_alike, s.values.values(), there.values())) for s in solutions)
         if changed and not any(known):
