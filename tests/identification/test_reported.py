@@ -90,7 +90,7 @@ def test_a_product_from_nothing_to_anything_is_not_determined(sd, determined):
     unknowns = tuple(Unknown(n, v, True, 1.0, 0.0) for n, v in (("Ixx", 0.05), ("a", 6.0)))
     null = np.array([1.0, 1.0]) / np.sqrt(2.0)
     across = np.array([1.0, -1.0])
-    found = combinations([null], lambda along: abs(along @ across) * sd / 2.0, unknowns)
+    found = combinations([null], 0.25 * sd**2 * np.outer(across, across), unknowns)
     assert [c.name for c in found] == determined * ["a/Ixx"]
     for c in found:
         assert c.upper95 / c.value == pytest.approx(np.exp(Z95 * sd), rel=1e-5)

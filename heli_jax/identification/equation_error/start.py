@@ -161,9 +161,6 @@ def _record(
 ) -> Record:
     """Return a smoothed flight with its measured states.
 
-    A state is measured if outputs determine it with known coefficients. The derivative of a
-    measured state, like the rate of an angle, is measured too.
-
     Args:
         value: `_matrix` at generic values of the free parameters.
         depends: (r, c) True for entries that depend on free parameters.
@@ -184,23 +181,7 @@ def _record(
         inputs.append(smoothed(acting, dt, width, mode="nearest"))
     u = np.array(inputs)
     rows = [n + outputs.index(name) for name in flight.outputs]
-    # y - D u = C x is used if its coefficients are known. Other outputs are regressed.
-    known = [k for k, row in enumerate(rows) if not depends[row].any()]
-    used = [rows[k] for k in known]
-    shown = _solved(value[used, :n], y[known] - np.tensordot(value[used, n:], u, 1))
-    # With measured k, x_i' - A_ik x_k - B_i u = A_ij x_j determines further states j.
-    rest = [j for j in range(n) if j not in shown]
-    equations = [i for i in shown if not depends[i].any() and np.any(value[i, rest] != 0)]
-    sides = [
-        shown[i][1:]
-        - sum(value[i, k] * x[:-1] for k, x in shown.items())
-        - np.tensordot(value[i, n:], u[:, :-1], 1)
-        for i in equations
-    ]
-    if sides:
-        # This is done only once because each derivative adds noise.
-        more = _solved(value[np.ix_(equations, rest)], np.array(sides))
-        shown |= {rest[j]: x for j, x in more.items()}
+    shown = _measured(value, depends, rows, y, u)
     hidden = [i for i in range(n) if i not in shown]
     regressed = [i for i in shown if depends[i].any() or (value[i, hidden] != 0).any()]
     left = [shown[i][1] for i in regressed] + [
@@ -223,6 +204,43 @@ def _record(
         tuple(Segment(signals[:, p][:, ::every], np.array(left)[:, p][:, ::every]) for p in parts),
         dt * every,
     )
+
+
+def _measured(
+    value: Float[np.ndarray, "r c"],
+    depends: np.ndarray,
+    rows: list[int],
+    y: Float[np.ndarray, "p 3 N"],
+    u: Float[np.ndarray, "m 3 N"],
+) -> dict[int, Float[np.ndarray, "_ N"]]:
+    """Return each state that outputs determine with known coefficients, and its derivatives.
+
+    The derivative of a measured state, like the rate of an angle, is measured too.
+
+    Args:
+        value, depends: as in `_record`.
+        rows: rows of `value` that belong to the outputs y.
+        u: inputs, with derivatives as y.
+    """
+    n = value.shape[1] - len(u)
+    # y - D u = C x is used if its coefficients are known. Other outputs are regressed.
+    known = [k for k, row in enumerate(rows) if not depends[row].any()]
+    used = [rows[k] for k in known]
+    shown = _solved(value[used, :n], y[known] - np.tensordot(value[used, n:], u, 1))
+    # With measured k, x_i' - A_ik x_k - B_i u = A_ij x_j determines further states j.
+    rest = [j for j in range(n) if j not in shown]
+    equations = [i for i in shown if not depends[i].any() and np.any(value[i, rest] != 0)]
+    sides = [
+        shown[i][1:]
+        - sum(value[i, k] * x[:-1] for k, x in shown.items())
+        - np.tensordot(value[i, n:], u[:, :-1], 1)
+        for i in equations
+    ]
+    if sides:
+        # This is done only once because each derivative adds noise.
+        more = _solved(value[np.ix_(equations, rest)], np.array(sides))
+        shown |= {rest[j]: x for j, x in more.items()}
+    return shown
 
 
 def _solved(

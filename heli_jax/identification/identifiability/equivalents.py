@@ -239,6 +239,8 @@ def _stays(
 
 _APART = 9.0
 """squares predicted by the slopes below which two solutions are one"""
+_COMPENSATED = 0.2
+"""excess over the squares predicted by the slopes above which nothing compensates an exchange"""
 _CHANGED = 0.05
 """relative change of a parameter that counts"""
 _RATIO = 1.1
@@ -271,7 +273,7 @@ def second_solutions(
     for held in _exchanged_modes(problem, here):
         # First with the exchanged values held, then all together.
         point = valley.visit(held, {}, same=not optimum, priors=True)
-        if point is not None:
+        if point is not None and point.excess <= _COMPENSATED * point.expected:
             guess = {n: point.values[n] for n in here}
             point = valley.visit({}, guess, same=not optimum, priors=True)
         # A point within the interval by the slopes is no other solution.
