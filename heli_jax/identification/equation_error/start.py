@@ -432,10 +432,8 @@ class EquationErrorStart(NamedTuple):
             "explained": [e.r_squared for e in self.equations],
             "half_width": self.half_width,
         }
-        out = [found("start.equation-error", "note", names=names or ["nothing"], **explained)]
-        if self.hidden:
-            out.append(found("start.hidden-states", "note", names=self.hidden))
-        return out + reasons_of(self.values)
+        taken = found("start.equation-error", "note", names=names or ["nothing"], **explained)
+        return [taken, *reasons_of(self.values)]
 
 
 def reasons_of(values: Mapping[str, StartValue]) -> list[Finding]:
