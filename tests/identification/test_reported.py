@@ -7,7 +7,7 @@ import scipy.signal
 from heli_jax import Flight, Free, Problem, fit, models
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.identifiability.analysis import Around, analyse
-from heli_jax.identification.identifiability.directions import combinations
+from heli_jax.identification.identifiability.equivalents import combinations
 from heli_jax.identification.identifiability.verdict import FACTOR, Z95, Unknown
 from heli_jax.identification.uncertainty.autocorrelated_residuals import residual_curvature
 from tests.identification.bench import BENCH, response, steps, vehicle

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem, check, fit, models
-from heli_jax.identification.identifiability.analysis import analyse
-from heli_jax.identification.identifiability.directions import projected
+from heli_jax.identification.identifiability.analysis import analyse, projected
 from heli_jax.identification.identifiability.verdict import Unknown
 from tests.identification.bench import BENCH, record, vehicle
 

@@ -14,8 +14,7 @@ from jaxtyping import Float
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.identification.estimation.evaluation import Evaluation, deviations
-from heli_jax.identification.identifiability.analysis import NO_EFFECT, relative_rows
-from heli_jax.identification.identifiability.directions import projected
+from heli_jax.identification.identifiability.analysis import NO_EFFECT, projected, relative_rows
 from heli_jax.identification.identifiability.verdict import Unknown
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Layout

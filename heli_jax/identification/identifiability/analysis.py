@@ -1,9 +1,11 @@
 """Identifiability analysis: rank, covariance and null directions of the free parameters.
 
 It works in relative coordinates: log |value| for parameters of one sign, value over a scale for
-those that may be zero. Initial states and biases are projected out first.
+those that may be zero. Initial states and biases are projected out first. A null direction has a
+singular value below rounding, or makes a 95 % interval that reaches further than a factor of ten.
 """
 
+import math
 from collections.abc import Collection
 from typing import NamedTuple
 
@@ -12,19 +14,9 @@ from scipy.sparse.csgraph import connected_components
 
 from heli_jax.flights.flight import labels
 from heli_jax.identification.estimation.evaluation import NULL, Evaluation
-from heli_jax.identification.identifiability.directions import (
-    TAKES_PART,
-    Nuisances,
-    directions,
-    projected,
-    row_reduced,
-    unit_vector,
-    with_new_directions,
-    with_wide_intervals,
-    without_effect,
-)
-from heli_jax.identification.identifiability.equivalents import Valley
+from heli_jax.identification.identifiability.equivalents import Valley, row_reduced, unit_vector
 from heli_jax.identification.identifiability.verdict import (
+    FACTOR,
     Z95,
     Group,
     Pair,
@@ -34,8 +26,17 @@ from heli_jax.identification.identifiability.verdict import (
 )
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.unknowns import transforms
-from heli_jax.identification.unknowns.layout import Layout, flight_unknowns
+from heli_jax.identification.unknowns.layout import FlightUnknown, Layout, flight_unknowns
 
+TAKES_PART = 0.01
+"""component of a unit null direction from which on an unknown takes part in it"""
+_FAR = math.log(FACTOR) / Z95
+"""sd in relative coordinates of an interval that reaches as far as the factor"""
+_SHARPER = 100.0
+"""sensitivity with known nuisances over that with free ones from which on a direction is
+exchangeable with nuisances"""
+_DEAD = 1e-12
+"""norm of a column without effect, over the largest"""
 _NEAR_ZERO = 1e-2
 """value over its reference below which a parameter is in no product of powers"""
 _AT_END = 1e-3
@@ -104,6 +105,104 @@ def relative_rows(
     return unknowns, sensitivity, data[:, q:]
 
 
+def projected(J: np.ndarray, nuisances: np.ndarray) -> np.ndarray:
+    """Return whitened rows (any, q) of the information on the unknowns with the nuisances free.
+
+    Args:
+        J: (n, q) whitened Jacobian by the unknowns.
+        nuisances: (n, k) that by the nuisances, which may be dependent.
+    """
+    # Orthogonal factors, no normal equations: singular values down to 1e-8 of the largest count,
+    # and their squares are below rounding.
+    k = nuisances.shape[1]
+    R = np.linalg.qr(np.hstack([nuisances, J]), mode="r")
+    N, S = R[:, :k], R[:, k:]
+    norms = np.linalg.norm(N, axis=0)
+    left, singular, _ = np.linalg.svd(N / np.where(norms > 0, norms, 1.0), full_matrices=False)
+    spanned = left[:, singular > NULL * max(singular.max(initial=0.0), 1e-300)]
+    for _ in range(2):  # the second time takes off the rounding of the first
+        S = S - spanned @ (spanned.T @ S)
+    return np.linalg.qr(S, mode="r")
+
+
+class Directions(NamedTuple):
+    """Rank and covariance of the unknowns by a whitened sensitivity."""
+
+    singular: np.ndarray
+    """(q,) 1 / sd along orthogonal directions, each unknown in units of its scale; largest first"""
+    rank: int
+    null: list[np.ndarray]
+    """null directions, as unit vectors (q,) in relative coordinates"""
+    covariance: np.ndarray
+    """(q, q) in relative coordinates, without the null directions"""
+
+
+def directions(rows: np.ndarray, scale: np.ndarray) -> Directions:
+    """Return rank and covariance by rows (any, q), of unknowns of a size (q,)."""
+    # Rows of zeros: the decomposition has all q directions.
+    padded = np.vstack([rows * scale, np.zeros((scale.size, scale.size))])
+    _, singular, right = np.linalg.svd(padded, full_matrices=False)
+    kept = singular > NULL * max(singular[0], 1e-300)
+    V = scale[:, None] * right[kept].T / singular[kept]
+    null = [unit_vector(scale * v) for v in right[~kept]]
+    return Directions(singular, int(kept.sum()), null, V @ V.T)
+
+
+def without_effect(sensitivity: np.ndarray, unknowns: tuple[Unknown, ...]) -> tuple[str, ...]:
+    """Return the unknowns without any effect."""
+    sizes = np.linalg.norm(sensitivity, axis=0) * np.array([u.scale for u in unknowns])
+    least = _DEAD * max(sizes.max(), 1e-300)
+    return tuple(u.name for u, s in zip(unknowns, sizes, strict=True) if not s > least)
+
+
+def with_wide_intervals(
+    null: list[np.ndarray], covariance: np.ndarray, unknowns: tuple[Unknown, ...]
+) -> list[np.ndarray]:
+    """Return the null directions, and those of unknowns whose 95 % interval by the covariance
+    (q, q) spans more than the factor."""
+    # Values between bounds of both signs have no factor.
+    far = [
+        i
+        for i, u in enumerate(unknowns)
+        if (u.logarithmic or u.symmetric) and covariance[i, i] > _FAR**2
+    ]
+    # The widest first. Its column is the regression of the others on it.
+    far.sort(key=lambda i: -covariance[i, i])
+    return with_new_directions(null, [covariance[:, i] for i in far])
+
+
+def with_new_directions(null: list[np.ndarray], others: list[np.ndarray]) -> list[np.ndarray]:
+    """Return the null directions, and those others whose largest component is in none of them."""
+    for v in map(unit_vector, others):
+        if all(abs(w[np.argmax(np.abs(v))]) <= TAKES_PART for w in null):
+            null = [*null, v]
+    return null
+
+
+class Nuisances(NamedTuple):
+    """Initial states, biases and input offsets, which may be exchangeable with parameters."""
+
+    free: np.ndarray
+    """(any, q) sensitivity to the unknowns with the nuisances free"""
+    fixed: np.ndarray
+    """(any, q) the same with the nuisances known"""
+    compensation: np.ndarray
+    """(k, q) change of the nuisances, in sds of their weak priors, that compensates a unit of each
+    unknown"""
+    names: tuple[FlightUnknown, ...]
+    """(k,)"""
+
+    def exchanged(self, v: np.ndarray) -> tuple[FlightUnknown, ...]:
+        """Return the nuisances that are exchangeable with a direction v (q,) of the unknowns; none
+        if it is no sharper with the nuisances known."""
+        known, free = (np.linalg.norm(rows @ v) for rows in (self.fixed, self.free))
+        if not self.names or known < max(NULL * np.linalg.norm(self.fixed), _SHARPER * free):
+            return ()
+        size = np.abs(self.compensation @ v)
+        moves = size > 0.1 * max(size.max(), 1e-300)
+        return tuple(n for n, m in zip(self.names, moves, strict=True) if m)
+
+
 _ROUGHLY = 0.5
 """relative sd above which a parameter is determined only roughly: its 95 % interval reaches further
 than a factor of 2.7 to either side"""
@@ -150,11 +249,12 @@ def verdict_of(
     compensation[seen] = -np.linalg.lstsq(N[:, seen], fixed, rcond=NULL)[0]
     named = flight_unknowns(layout, labels(problem.training))
     # The parameters of the disturbance and the noise's factors stand before the named nuisances.
-    nuisances = Nuisances(fixed, compensation[N.shape[1] - len(named) :], named)
+    free = projected(fixed, N[:, seen])
+    nuisances = Nuisances(free, fixed, compensation[N.shape[1] - len(named) :], named)
     to_relative = np.asarray(e.slopes, np.float64) * [u.sign / u.reference for u in unknowns]
     if around.reported is not None:
         around = around._replace(reported=around.reported * np.outer(to_relative, to_relative))
-    return analyse(projected(fixed, N[:, seen]), unknowns, nuisances=nuisances, around=around)
+    return analyse(free, unknowns, nuisances=nuisances, around=around)
 
 
 def analyse(
@@ -170,7 +270,7 @@ def analyse(
         sensitivity: (any, q) with the nuisances free, and without rows of priors. Weak priors of
             nuisances would bound a parameter that is exchangeable with a bias.
     """
-    nuisances = nuisances or Nuisances(sensitivity, np.zeros((0, len(unknowns))), ())
+    nuisances = nuisances or Nuisances(sensitivity, sensitivity, np.zeros((0, len(unknowns))), ())
     scale, own = np.array([u.scale for u in unknowns]), np.array([u.prior for u in unknowns])
     names = [u.name for u in unknowns]
     # A prior is a row with one over its sd.
@@ -195,9 +295,8 @@ def analyse(
     if not null and own.any():
         resting = with_wide_intervals(data.null, data.covariance, unknowns)
     dead = without_effect(nuisances.fixed, unknowns)
-    of_rows = (sensitivity, nuisances)
-    groups = _groups(null, reported, unknowns, of_rows, around, dead)
-    resting_groups = _groups(resting, reported, unknowns, of_rows, around)
+    groups = _groups(null, reported, unknowns, nuisances, around, dead)
+    resting_groups = _groups(resting, reported, unknowns, nuisances, around)
     moved = np.abs(null).max(axis=0) if null else np.zeros(len(unknowns))
     changed = {n for other in around.second for n in other.changed}
     undetermined = [
@@ -240,7 +339,7 @@ def _groups(
     null: list[np.ndarray],
     covariance: np.ndarray,
     unknowns: tuple[Unknown, ...],
-    of_rows: tuple[np.ndarray, Nuisances],
+    nuisances: Nuisances,
     around: Around,
     dead: tuple[str, ...] = (),
 ) -> tuple[Group, ...]:
@@ -255,14 +354,13 @@ def _groups(
     parts = (np.abs(rows) > TAKES_PART) & alive
     rows, parts = rows[parts.any(axis=1)], parts[parts.any(axis=1)]
     count, labels = connected_components((parts @ parts.T).astype(int))
-    sensitivity, nuisances = of_rows
     groups = []
     for k in range(count):
         mine, members = list(rows[labels == k]), parts[labels == k].any(axis=0)
         tied = ()
         if around.valley is not None:
             tied = around.valley.determined_combinations(mine, covariance, unknowns)
-        exchanged = [n for v in mine for n in nuisances.exchanged(v, sensitivity)]
+        exchanged = [n for v in mine for n in nuisances.exchanged(v)]
         names = tuple(unknowns[i].name for i in np.flatnonzero(members))
         groups.append(Group(names, len(mine), tied, tuple(dict.fromkeys(exchanged))))
     return tuple(groups)
