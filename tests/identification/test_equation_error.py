@@ -188,6 +188,28 @@ def test_a_parameter_that_something_is_divided_by(tmp_path, vehicle):
     assert found["K"] == pytest.approx(-terms["Lda"] / terms["Lp"], rel=1e-4)
 
 
+SUM = """
+name: sum
+states: {p: rad/s}
+inputs: {da: rad}
+outputs: {p: rad/s}
+parameters: {La: {value: -1, unit: 1/s}, Lb: {value: -2, unit: 1/s}, Lda: {value: 1, unit: 1/s^2}}
+A: {p: {p: La + Lb}}
+B: {p: {da: Lda}}
+"""
+
+
+def test_exchangeable_parameters_have_the_right_sum(tmp_path):
+    (tmp_path / "sum.yaml").write_text(SUM)
+    file = linear_model(tmp_path / "sum.yaml")
+    flight = record()
+    only = replace(flight, outputs={"p": flight.outputs["p"]})
+    free = dict.fromkeys(("La", "Lb", "Lda"), UNKNOWN)
+    found = values(equation_error_start(file.model, file.vehicle().params, [only], free))
+    assert found["La"] + found["Lb"] == pytest.approx(-4.0, rel=0.02)
+    assert found["Lda"] == pytest.approx(25.0, rel=0.02)
+
+
 class Total(NamedTuple):
     total: Annotated[Scalar, "rad", "of both states"]
 

@@ -350,16 +350,18 @@ def _projected(
 
 
 def _search(
-    regression: Regression, keep: np.ndarray
-) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, "n q"]]:
-    """Return the best of searches from zero, from the known values, and from one; and the
-    derivatives of the residuals there.
+    regression: Regression, free: Mapping[str, Free]
+) -> tuple[Float[np.ndarray, " q"], np.ndarray]:
+    """Return the best of searches from the known values, from zero, and from one; and (q,) True for
+    the parameters with an effect on the residuals.
 
-    Parameters with `keep` (q,) have a sign to keep and are searched in their logarithms.
+    Parameters with a sign to keep are searched in their logarithms.
     """
     from scipy.optimize import least_squares
 
-    at_hand = np.array([regression.base[n] for n in regression.names])
+    model, base = regression.model, regression.base
+    keep = [_keeps_sign(model, n, free[n].sign, base[n]) for n in regression.names]
+    at_hand = np.array([base[n] for n in regression.names])
     known = np.where(np.isfinite(at_hand) & (at_hand != 0), at_hand, 1.0)
 
     def values(z: np.ndarray) -> np.ndarray:
@@ -369,7 +371,7 @@ def _search(
         return np.concatenate([*regression.residuals(values(z)).values()])
 
     # Products of parameters may cause two optima, and a parameter may be a divisor.
-    starts = (np.zeros(known.size), known, np.ones(known.size))
+    starts = (known, np.zeros(known.size), np.ones(known.size))
     optima = [
         least_squares(
             residuals,
@@ -387,11 +389,9 @@ def _search(
             "start: equation-error: the equations are not finite at zero, one and the vehicle's "
             f"values of {', '.join(regression.names)}: expected a start of each free parameter"
         )
-    return values(best.x), best.jac
+    return values(best.x), best.jac.any(axis=0)
 
 
-_NULL = 1e-5
-"""Singular value of unit columns below which parameters are exchangeable."""
 Origin = Literal["equation error", "frequency error", "as stated", "vehicle"]
 
 
@@ -475,21 +475,18 @@ def equation_error_start(
     """
     flights = [f for f in flights if not f.hold_out]
     regression, width, reasons = _regression(model, vehicle, flights, free)
-    while True:
-        keep = [_keeps_sign(model, n, free[n].sign, regression.base[n]) for n in regression.names]
-        estimate, J = _search(regression, np.array(keep))
-        # Parameters are fixed one at a time: fixing one of two exchangeable parameters determines
-        # the other.
-        undetermined = _undetermined(regression, J)
-        if undetermined is None:
-            break
-        name, reasons[name] = undetermined
-        _require_value(regression.base, name, reasons[name])
-        regression = regression._replace(names=tuple(n for n in regression.names if n != name))
-        if not regression.names:
-            raise _no_regression("the equations determine none of the free parameters")
+    # Of exchangeable parameters all but one stay near the values at which the search begins.
+    estimate, effects = _search(regression, free)
+    estimates = {}
+    for name, value, effect in zip(regression.names, estimate.tolist(), effects, strict=True):
+        if effect:
+            estimates[name] = value
+        else:
+            reasons[name] = "no measured state or output moves with it"
+            _require_value(regression.base, name, reasons[name])
+    if not estimates:
+        raise _no_regression("the equations determine none of the free parameters")
     residuals = regression.residuals(estimate)
-    estimates = dict(zip(regression.names, estimate.tolist(), strict=True))
     states = naming.names(model.State)
     return EquationErrorStart(
         {n: _value(regression, n, free[n], estimates.get(n), reasons.get(n, "")) for n in free},
@@ -567,22 +564,6 @@ def _keeps_sign(model: Model, name: str, sign: Sign | None, at_hand: float) -> b
     known = positive or (math.isfinite(at_hand) and at_hand != 0)
     by_default = positive or of_helicopter(model.Params)
     return known and (sign == "keep" or (sign is None and by_default))
-
-
-def _undetermined(regression: Regression, J: Float[np.ndarray, "n q"]) -> tuple[str, str] | None:
-    """Return a parameter that the regression does not determine and the reason, or None."""
-    norms, names = np.linalg.norm(J, axis=0), regression.names
-    if not norms.all():
-        return names[int(np.argmin(norms))], "no measured state or output moves with it"
-    _, sizes, directions = np.linalg.svd(J / norms, full_matrices=False)
-    if sizes[-1] > _NULL * sizes[0]:
-        return None
-    part = np.abs(directions[-1])
-    involved = [i for i in np.argsort(-part) if part[i] > 0.1]
-    # A parameter with a known value is preferred, because it can keep that value.
-    first = ([i for i in involved if math.isfinite(regression.base[names[i]])] or involved)[-1]
-    others = ", ".join(names[i] for i in involved if i != first)
-    return names[first], f"the equations do not tell it from {others}"
 
 
 def _value(
