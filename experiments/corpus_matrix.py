@@ -33,11 +33,11 @@ class Ablation(NamedTuple):
     """Function of the same arguments that returns the neutral result."""
 
 
-def _untied(valley: Any, null: Any, spread: Any, unknowns: Any) -> Any:
+def _untied(valley: Any, null: Any, covariance: Any, unknowns: Any) -> Any:
     """Return the result from slopes alone, without values far from the optimum."""
-    from heli_jax.identification.identifiability.directions import combinations
+    from heli_jax.identification.identifiability.equivalents import combinations
 
-    return combinations(null, spread, unknowns)
+    return combinations(null, covariance, unknowns)
 
 
 ABLATIONS: tuple[Ablation, ...] = (

@@ -7,7 +7,7 @@ import scipy.signal
 from heli_jax import Flight, Free, Problem, fit, models
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.identifiability.analysis import Around, analyse
-from heli_jax.identification.identifiability.directions import combinations
+from heli_jax.identification.identifiability.equivalents import combinations
 from heli_jax.identification.identifiability.verdict import FACTOR, Z95, Unknown
 from heli_jax.identification.uncertainty.autocorrelated_residuals import residual_curvature
 from tests.identification.bench import BENCH, response, steps, vehicle
@@ -74,7 +74,7 @@ def test_the_residuals_part_of_the_hessian_is_that_of_finite_differences(found):
 
     h = 2e-3
     J = np.asarray(residual_and_jacobian(at.layout, at.data, at.noise, at.z).J)
-    hessian = J.T @ J + residual_curvature(at)
+    hessian = J.T @ J + residual_curvature(at, J)
     scale = np.linalg.norm(J, axis=0)
     for i, j in ((0, 0), (0, 2), (1, 2), (2, 4)):
         corners = [a * b * cost(i, j, a * h, b * h) for a in (1, -1) for b in (1, -1)]
@@ -90,7 +90,7 @@ def test_a_product_from_nothing_to_anything_is_not_determined(sd, determined):
     unknowns = tuple(Unknown(n, v, True, 1.0, 0.0) for n, v in (("Ixx", 0.05), ("a", 6.0)))
     null = np.array([1.0, 1.0]) / np.sqrt(2.0)
     across = np.array([1.0, -1.0])
-    found = combinations([null], lambda along: abs(along @ across) * sd / 2.0, unknowns)
+    found = combinations([null], 0.25 * sd**2 * np.outer(across, across), unknowns)
     assert [c.name for c in found] == determined * ["a/Ixx"]
     for c in found:
         assert c.upper95 / c.value == pytest.approx(np.exp(Z95 * sd), rel=1e-5)

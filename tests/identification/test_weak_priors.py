@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem, check, fit, models
-from heli_jax.identification.identifiability.analysis import analyse
-from heli_jax.identification.identifiability.directions import WithoutWeakPriors, projected
+from heli_jax.identification.identifiability.analysis import analyse, projected
 from heli_jax.identification.identifiability.verdict import Unknown
-from heli_jax.identification.unknowns.layout import FlightUnknown
 from tests.identification.bench import BENCH, record, vehicle
 
 DT, N, SD = 0.05, 200, 0.02
@@ -143,18 +141,6 @@ def test_dependent_nuisances_are_projected_out():
     # Effects of the nuisances are removed completely.
     within = N @ rng.standard_normal((3, 2))
     assert np.linalg.norm(projected(within, nuisances)) < 1e-8 * np.linalg.norm(within)
-
-
-def test_a_signed_parameter_that_weak_priors_narrow_tenfold_is_not_determined():
-    offset = Unknown("L0", 0.1, False, 1.0, 0.0)
-    for hold, identifiable in ((20.0, False), (2.0, True)):
-        bare = np.array([[0.5]])
-        without_weak = WithoutWeakPriors(
-            bare, np.array([[1.0]]), (FlightUnknown("flight 1/bias p", "bias", "p", 0),)
-        )
-        verdict = analyse(hold * bare, (offset,), without_weak=without_weak)
-        assert verdict.identifiable is identifiable
-        assert verdict.prior_share["L0"] == pytest.approx(1.0 if hold > 10 else 0.75)
 
 
 def test_the_prior_share_is_the_variance_that_all_priors_explain():

@@ -53,7 +53,7 @@ def sampled(white):
     statistics = {"diverging": diverging, "energy": rng.normal(size=shape)}
     convergence = {n: Convergence(1.002, 800.0) for n in fit.estimates}
     draws = gaussian_draws(fit, shape)
-    posterior = Posterior(draws, 1.002, 800.0, 1, convergence, nuisance, statistics)
+    posterior = Posterior(draws, convergence, 1, nuisance, statistics)
     booted = Bootstrap(gaussian_draws(fit, 90), 10, tuple(range(90)))
     by = {n: {"gaussian": (e.lower95, e.upper95)} for n, e in fit.estimates.items()}
     return Intervals(by, bootstrap=booted, posterior=posterior)

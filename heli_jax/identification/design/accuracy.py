@@ -14,15 +14,11 @@ from jaxtyping import Float
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.identification.estimation.evaluation import Evaluation, deviations
-from heli_jax.identification.identifiability.analysis import relative_rows
-from heli_jax.identification.identifiability.directions import projected
+from heli_jax.identification.identifiability.analysis import NO_EFFECT, projected, relative_rows
 from heli_jax.identification.identifiability.verdict import Unknown
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Layout
 from heli_jax.identification.unknowns.transforms import scale
-
-FREE = 1e-3
-"""weight of a weak prior that counts for nothing; not zero, where directions would be rounding"""
 
 
 class Sensitivity(NamedTuple):
@@ -42,21 +38,17 @@ class Sensitivity(NamedTuple):
 
 def sensitivity_at(problem: Problem, layout: Layout, e: Evaluation) -> Sensitivity:
     """Return the rows of the data of an evaluation."""
-    unknowns, rows = relative_rows(problem, layout, e)
+    unknowns, sensitivity, others = relative_rows(problem, layout, e)
     # The first of the other unknowns are shared by all flights.
     count = layout.first_nuisance - len(unknowns)
-    shared = np.hstack([rows.sensitivity, rows.nuisances[:, :count]])
-    return Sensitivity(unknowns, shared, rows.nuisances[:, count:])
+    shared = np.hstack([sensitivity, others[:, :count]])
+    return Sensitivity(unknowns, shared, others[:, count:])
 
 
 def triangle(s: Sensitivity) -> Float[np.ndarray, "s s"]:
-    """Return the factor of the information on the shared unknowns, with all others free but for
-    their weak priors."""
+    """Return the factor of the information on the shared unknowns, with all others free."""
     # Without the unknowns that have no effect on these rows: nearly all of a long record.
-    own = s.own[:, np.any(s.own != 0.0, axis=0)]
-    priors = np.eye(own.shape[1])
-    nothing = np.zeros((len(priors), s.shared.shape[1]))
-    return projected(np.vstack([s.shared, nothing]), np.vstack([own, priors]))
+    return projected(s.shared, s.own[:, np.linalg.norm(s.own, axis=0) > NO_EFFECT])
 
 
 def together(*triangles: np.ndarray) -> Float[np.ndarray, "s s"]:

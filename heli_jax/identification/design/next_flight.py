@@ -13,7 +13,6 @@ from jaxtyping import Float
 
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.design.accuracy import (
-    FREE,
     Sensitivity,
     expected_sd,
     sensitivity_at,
@@ -84,17 +83,12 @@ def plan_next_flight(problem: Problem, at: Solution, e: Evaluation) -> Plan | No
     candidates = _candidates(flight, m)
     if not candidates:
         return None
-    now, each = (
-        sensitivity_at(problem, at.layout, e),
-        _candidate_rows(problem, at, i, candidates, m),
-    )
+    now = sensitivity_at(problem, layout, e)
+    each = _candidate_rows(problem, at, i, candidates, m)
     flights = layout.objective.tags(layout, at.data, len(now.shared)).flight
     once_more = now.part(flights == i)
     lacking = verdict_of(problem, layout, e).not_identifiable
     absent = np.array([u.name in lacking for u in now.unknowns])
-    if lacking:
-        # Weak priors do not count.
-        now, *each = [s._replace(own=s.own / FREE) for s in (now, *each)]
     R, unknowns = triangle(now), now.unknowns
     before = expected_sd(unknowns, R)
     widest = int(np.argmax(np.where(absent, before, 0.0) if lacking else before))

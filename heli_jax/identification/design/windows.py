@@ -5,8 +5,8 @@ with filter error a window is its part of the one filter. One Jacobian at the st
 rows of all windows. The windows that add most information are taken, one after another (Mehra,
 1974).
 
-A window begins in the state of the record's simulation at that instant, and has the share of the
-weak priors that it has of the samples, so that windows have no more information than the record.
+A window begins in the state of the record's simulation at that instant. Its initial state and its
+biases are free.
 """
 
 import dataclasses
@@ -24,7 +24,6 @@ from heli_jax.flights.flight import Flight, labels
 from heli_jax.flights.parts import part
 from heli_jax.flights.signal_facts import DROP_SHARE
 from heli_jax.identification.design.accuracy import (
-    FREE,
     expected_sd,
     sensitivity_at,
     together,
@@ -176,7 +175,6 @@ def rank_windows(
             layout = dataclasses.replace(layout, windows=cut, initial_state=True)
             e = evaluate(layout, at.data, at.noise, _window_states(layout, at))
     s = sensitivity_at(problem, layout, e)
-    s = s._replace(own=s.own / _prior_weights(layout, flights, samples, shooting=shooting))
     unknown = np.array([u.name in lacking for u in s.unknowns])
     number, _, sample, _ = layout.objective.tags(layout, at.data, len(s.shared))
     windows = []
@@ -238,20 +236,6 @@ def _window_states(layout: Layout, at: Solution) -> Float[Array, " q"]:
         begun = np.asarray(run.states)[of_states][:, m * np.arange(count)]
         own += [(begun.T / scales).ravel(), z[places.constants]]
     return jnp.asarray(np.concatenate(own), at.z.dtype)
-
-
-def _prior_weights(
-    layout: Layout, flights: tuple[Flight, ...], samples: int, *, shooting: bool
-) -> Float[np.ndarray, " k"]:
-    """Return a window's share of the weak prior of each of its own unknowns, as 1 / sd."""
-    weights: list[np.ndarray] = []
-    for flight, places in zip(flights, flight_places(layout), strict=True):
-        # Without shooting only the first initial state has a prior.
-        states = np.full(places.states.shape, 1.0 if shooting else FREE)
-        states[:1] = 1.0
-        share = min(samples / flight.n_samples, 1.0) ** 0.5
-        weights += [states.ravel(), np.full(places.constants.size, share)]
-    return np.concatenate(weights)
 
 
 def _take_windows(

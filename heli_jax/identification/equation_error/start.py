@@ -4,12 +4,15 @@ Each state's derivative is regressed on states and inputs (Klein and Morelli, Ai
 Identification, 2006, chapter 5). Gusts, and measurement noise on the regressors, bias the result.
 It therefore only starts a fit.
 
+All signals are convolved with a Gaussian, and differentiated by convolution with its derivatives
+(modulating functions: M. Shinbrot, NACA TN 3288, 1954). A linear equation x' = A x + B u holds for
+the smoothed signals, for any width of the Gaussian.
+
 Hidden states are integrated by their own equations from the measured signals. Their initial values,
-and a constant for each equation and flight (trim, bias), are projected out. Levenberg-Marquardt
-minimises the sum of squares; if parameters enter linearly its first step is the regression.
+and a constant for each equation and flight (trim, bias), are projected out.
 """
 
-import functools
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple
@@ -19,26 +22,34 @@ import scipy.linalg
 from jaxtyping import Float
 
 from heli_jax import naming
+from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model, require_constants
 from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.equation_error.records import (
-    Record,
-    Segment,
-    Structure,
-    coefficients,
-    generic,
-    hidden_constants,
-    kernel_width,
-    record,
-    shortest,
-    structure,
-)
+from heli_jax.flights.holds import without_jumps
 from heli_jax.identification.problem import Free, Sign
+from heli_jax.numerics.white_noise import noise_guess
 from heli_jax.vehicle import of_helicopter
 
-_EVALUATIONS = 40
-"""Most evaluations of the residuals in one search."""
+_ORDERS = 3
+"""A signal, its first and its second derivative."""
+_WIDTHS = (1.2, 1.8, 2.4, 3.6, 4.8, 7.2, 9.6, 14.4, 19.2)
+"""Candidate standard deviations of the Gaussian [samples]."""
+_REACH = 5.0
+"""Half width of the Gaussian, over its standard deviation."""
+_MOST_LEFT_OUT = 0.05
+"""Largest part of a signal's sd that smoothing may remove besides the noise."""
+_SHORTEST = 20.0
+"""Shortest segment, over the standard deviation of the Gaussian."""
+_BRIDGED = 3
+"""Longest gap that is interpolated [samples]; longer gaps end a segment."""
+_LOST = 2.5
+"""Longest gap of a slow sensor that is interpolated [usual steps]: one lost sample, with jitter."""
+_SEGMENTS = 20
+"""Most segments of a flight (the longest count), because each adds initial values of hidden states.
+"""
+_DETERMINED = 1e-8
+"""Largest residual of a unit vector in the span of the measured outputs."""
 _SMALL = 1e-6
 """Relative decrease of the sum of squares, and relative step, that end the search."""
 _NOT_FINITE = 1e100
@@ -47,104 +58,226 @@ _DEPENDENT = 1e-9
 """Fraction of the largest singular value below which nuisances are dependent."""
 
 
-class Rows(NamedTuple):
-    """Weighted residuals of all flights and equations at one point."""
+def bridged(y: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+    """Return an output with its short gaps interpolated."""
+    seen = np.flatnonzero(np.isfinite(y))
+    if not 1 < seen.size < y.size:
+        return y
+    from scipy.interpolate import PchipInterpolator
 
-    r: Float[np.ndarray, " n"]
-    J: Float[np.ndarray, "n q"]
-    """Derivative of r."""
-    equation: np.ndarray
-    """Index of the equation in `Regression.equations`, (n,)."""
-
-    @property
-    def cost(self) -> float:
-        """Sum of squares."""
-        return float(self.r @ self.r)
-
-
-class Regression(NamedTuple):
-    """Equations, records and parameters of a regression."""
-
-    model: Model
-    base: Mapping[str, float]
-    """All parameters by name, SI."""
-    names: tuple[str, ...]
-    """Estimated parameters (q,)."""
-    records: tuple[Record, ...]
-
-    @property
-    def equations(self) -> tuple[str, ...]:
-        """States and outputs whose equations are regressed."""
-        return tuple(dict.fromkeys(e for r in self.records for e in r.structure.equations))
-
-    def rows(self, values: Float[np.ndarray, " q"], weights: Mapping[str, float]) -> Rows | None:
-        """Return residuals and derivatives at values (q,), SI; None if they are not finite
-        (division by zero)."""
-        parts = []
-        for flight in self.records:
-            equations = flight.structure.equations
-            weight = np.array([weights[n] for n in equations])[:, None, None]
-            known = {**self.base, **flight.known}
-            try:
-                with np.errstate(all="ignore"):
-                    matrices = coefficients(self.model, known, self.names, values)
-                    x = _flight_residuals(flight, matrices, weight)
-            except (ValueError, np.linalg.LinAlgError):  # infinite matrix or signal
-                return None
-            index = [self.equations.index(n) for n in equations]
-            parts.append(Rows(x[:, 0], x[:, 1:], np.repeat(index, x.shape[0] // len(index))))
-        rows = Rows(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-        with np.errstate(all="ignore"):
-            return rows if np.isfinite(rows.cost) and np.isfinite(rows.J).all() else None
+    # On a fast grid a slow sensor misses most samples.
+    filled = PchipInterpolator(seen, y[seen], extrapolate=False)(np.arange(y.size))
+    steps = np.diff(seen)
+    long = steps > 1 + max(_BRIDGED, _LOST * float(np.median(steps)))
+    filled[seen[0] : seen[-1]][np.repeat(long, steps)] = np.nan
+    filled[seen] = y[seen]
+    return filled
 
 
-def _flight_residuals(
-    record: Record, matrices: Float[np.ndarray, "r c 1+q"], weight: Float[np.ndarray, "e 1 1"]
-) -> Float[np.ndarray, "en 1+q"]:
-    """Return the weighted residuals of a flight and their derivatives, equation by equation."""
-    pairs = [_residual(segment, record.structure, matrices) for segment in record.segments]
-    residual = np.concatenate([r for r, _ in pairs], axis=1)
-    e, n, c = residual.shape
-    # Initial values and constants enter linearly and are projected out. J neglects that the
-    # responses to initial values depend on the parameters.
-    initial = [scipy.linalg.block_diag(*(free[i] for _, free in pairs)) for i in range(e)]
-    constants = np.broadcast_to(np.eye(e)[:, None, :], (e, n, e))
-    nuisances = weight * np.concatenate([np.array(initial), constants], axis=-1)
-    x, N = (weight * residual).reshape(e * n, c), nuisances.reshape(e * n, -1)
-    size = np.linalg.norm(N, axis=0)
-    N = N[:, size > 0] / size[size > 0]
-    # The columns of the constant and of a very slow free motion are nearly dependent.
-    return x - N @ np.linalg.lstsq(N, x, rcond=_DEPENDENT)[0]
+def smoothed(
+    y: Float[np.ndarray, " N"], dt: float, width: float, *, mode: Literal["constant", "nearest"]
+) -> Float[np.ndarray, "3 N"]:
+    """Return the smoothed signal and its derivatives per second.
+
+    Args:
+        y: signal; NaN where it is missing.
+        width: standard deviation of the Gaussian [samples].
+        mode: `constant` for NaN near the ends, `nearest` for a signal that is constant beyond them.
+    """
+    from scipy.ndimage import gaussian_filter1d
+
+    orders = range(_ORDERS)
+    signals = [
+        gaussian_filter1d(y, width, order=r, mode=mode, cval=np.nan, truncate=_REACH)
+        for r in orders
+    ]
+    return np.array(signals) / dt ** np.array(orders)[:, None]
+
+
+def _width(flights: Sequence[Flight]) -> float:
+    """Return the standard deviation of the widest Gaussian that removes little but noise
+    [samples]."""
+    signals = [
+        (bridged(y), flight.sd.get(n) or noise_guess(y))
+        for flight in flights
+        for n, y in flight.outputs.items()
+    ]
+
+    def passes(width: float) -> bool:
+        for y, sd in signals:
+            removed = y - smoothed(y, 1.0, width, mode="constant")[0]
+            # A short record needs a narrow kernel.
+            if np.isfinite(removed).sum() < _SHORTEST * width:
+                return False
+            if np.nanstd(removed) > np.hypot(sd, _MOST_LEFT_OUT * float(np.nanstd(y))):
+                return False
+        return True
+
+    return max([_WIDTHS[0], *itertools.takewhile(passes, _WIDTHS)])
+
+
+class Segment(NamedTuple):
+    """Smoothed segment without gaps, SI."""
+
+    known: Float[np.ndarray, "k n"]
+    """Measured states, then inputs."""
+    left: Float[np.ndarray, "e n"]
+    """Left-hand sides of the equations: derivatives per second, or outputs."""
+
+
+class Record(NamedTuple):
+    """A smoothed flight, its measured states, and the equations to regress."""
+
+    known: Mapping[str, float]
+    """Parameters of the flight."""
+    equations: tuple[str, ...]
+    """States and outputs (e,) on the left-hand sides."""
+    rows: list[int]
+    """Rows (e,) of `_matrix`."""
+    columns: list[int]
+    """Columns of `_matrix` that belong to `Segment.known`."""
+    hidden: list[int]
+    """States that no output determines."""
+    segments: tuple[Segment, ...]
+    step: float
+    """Time between samples [s]."""
+
+
+def _matrix(model: Model, values: Mapping[str, float]) -> Float[np.ndarray, "r c"]:
+    """Return [A B; C D] of a linear model: rows of states then outputs, columns of states then
+    inputs."""
+    params = model.Params(**{n: np.asarray(v, np.float64) for n, v in values.items()})
+    A, B, C, D = map(np.asarray, jacobians(model, params))
+    return np.block([[A, B], [C, D]])
+
+
+def _record(
+    model: Model,
+    flight: Flight,
+    value: Float[np.ndarray, "r c"],
+    depends: np.ndarray,
+    width: float,
+    late: Mapping[str, float],
+) -> Record:
+    """Return a smoothed flight with its measured states.
+
+    Args:
+        value: `_matrix` at generic values of the free parameters.
+        depends: (r, c) True for entries that depend on free parameters.
+        width: standard deviation of the Gaussian [samples].
+        late: delays of inputs [s].
+    """
+    flight = without_jumps(flight)
+    dt, states, outputs = flight.dt, naming.names(model.State), naming.names(model.Outputs)
+    n = len(states)
+    y = np.array(
+        [smoothed(bridged(v), dt, width, mode="constant") for v in flight.outputs.values()]
+    )
+    inputs = []
+    for name in naming.names(model.Inputs):
+        # A held input acts half a sample later than a linear one.
+        later = late.get(name, 0.0) + (0.5 * dt if flight.hold[name] == "zero-order" else 0.0)
+        acting = np.interp(flight.times - later, flight.times, flight.inputs[name])
+        inputs.append(smoothed(acting, dt, width, mode="nearest"))
+    u = np.array(inputs)
+    rows = [n + outputs.index(name) for name in flight.outputs]
+    shown = _measured(value, depends, rows, y, u)
+    hidden = [i for i in range(n) if i not in shown]
+    regressed = [i for i in shown if depends[i].any() or (value[i, hidden] != 0).any()]
+    left = [shown[i][1] for i in regressed] + [
+        y[k][0] for k, row in enumerate(rows) if depends[row].any()
+    ]
+    regressed += [row for row in rows if depends[row].any()]
+    signals = np.array([x[0] for x in shown.values()] + list(u[:, 0]))
+    seen = np.isfinite(signals).all(axis=0) & np.isfinite(y).all(axis=(0, 1))
+    parts = np.ma.clump_masked(np.ma.array(seen, mask=seen)) if left else []
+    parts = [p for p in parts if p.stop - p.start >= _SHORTEST * width]
+    parts = sorted(parts, key=lambda p: p.start - p.stop)[:_SEGMENTS]
+    # Adjacent values of the smoothed signal are strongly correlated.
+    every = max(1, int(width / _WIDTHS[0]))
+    return Record(
+        flight.known,
+        tuple((*states, *outputs)[i] for i in regressed),
+        regressed,
+        [*shown, *range(n, value.shape[1])],
+        hidden,
+        tuple(Segment(signals[:, p][:, ::every], np.array(left)[:, p][:, ::every]) for p in parts),
+        dt * every,
+    )
+
+
+def _measured(
+    value: Float[np.ndarray, "r c"],
+    depends: np.ndarray,
+    rows: list[int],
+    y: Float[np.ndarray, "p 3 N"],
+    u: Float[np.ndarray, "m 3 N"],
+) -> dict[int, Float[np.ndarray, "_ N"]]:
+    """Return each state that outputs determine with known coefficients, and its derivatives.
+
+    The derivative of a measured state, like the rate of an angle, is measured too.
+
+    Args:
+        value, depends: as in `_record`.
+        rows: rows of `value` that belong to the outputs y.
+        u: inputs, with derivatives as y.
+    """
+    n = value.shape[1] - len(u)
+    # y - D u = C x is used if its coefficients are known. Other outputs are regressed.
+    known = [k for k, row in enumerate(rows) if not depends[row].any()]
+    used = [rows[k] for k in known]
+    shown = _solved(value[used, :n], y[known] - np.tensordot(value[used, n:], u, 1))
+    # With measured k, x_i' - A_ik x_k - B_i u = A_ij x_j determines further states j.
+    rest = [j for j in range(n) if j not in shown]
+    equations = [i for i in shown if not depends[i].any() and np.any(value[i, rest] != 0)]
+    sides = [
+        shown[i][1:]
+        - sum(value[i, k] * x[:-1] for k, x in shown.items())
+        - np.tensordot(value[i, n:], u[:, :-1], 1)
+        for i in equations
+    ]
+    if sides:
+        # This is done only once because each derivative adds noise.
+        more = _solved(value[np.ix_(equations, rest)], np.array(sides))
+        shown |= {rest[j]: x for j, x in more.items()}
+    return shown
+
+
+def _solved(
+    left: Float[np.ndarray, "k n"], right: Float[np.ndarray, "k r N"]
+) -> dict[int, Float[np.ndarray, "r N"]]:
+    """Return the unknowns determined by left x = right, by index."""
+    inverse = np.linalg.pinv(left, rcond=1e-10)
+    # An unknown is determined if its row of A^+ A is that of the identity.
+    alone = np.abs(inverse @ left - np.eye(left.shape[1])).max(axis=1, initial=0.0) < _DETERMINED
+    solution = np.tensordot(inverse, right, axes=1)
+    return {int(i): solution[i] for i in np.flatnonzero(alone)}
 
 
 def _residual(
-    segment: Segment, structure: Structure, matrices: Float[np.ndarray, "r c 1+q"]
-) -> tuple[Float[np.ndarray, "e n 1+q"], Float[np.ndarray, "e n h"]]:
-    """Return residuals with their derivatives, and responses to initial hidden states."""
-    n, known = len(structure.states), segment.known
-    rows, hidden = list(structure.rows), list(structure.hidden)
-    columns = [*structure.shown, *range(n, matrices.shape[1])]
-    residual = -np.einsum("ekc,kN->eNc", matrices[np.ix_(rows, columns)], known)
-    residual[..., 0] += segment.left
+    record: Record, matrix: Float[np.ndarray, "r c"]
+) -> tuple[Float[np.ndarray, "e n"], Float[np.ndarray, "e n h"]]:
+    """Return the residuals, and the responses to the initial hidden states of each segment."""
+    rows, hidden = record.rows, record.hidden
+    known, through = matrix[np.ix_(rows, record.columns)], matrix[np.ix_(rows, hidden)]
+    residual = [s.left - known @ s.known for s in record.segments]
+    if not np.isfinite(matrix).all():
+        hidden = []  # `_projected` refuses the residuals
     if not hidden:
-        return residual, np.zeros((*residual.shape[:2], 0))
+        residual = np.concatenate(residual, axis=1)
+        return residual, np.zeros((*residual.shape, 0))
     # h' = A h + f starts from zero; the free motions are separate.
-    A, through = matrices[np.ix_(hidden, hidden)], matrices[np.ix_(rows, hidden)]
-    phi, first, second = _first_order_hold(A[..., 0], segment.step)
-    f = np.einsum("hkc,kN->Nhc", matrices[np.ix_(hidden, columns)], known)
-
-    def integrated(f: np.ndarray) -> np.ndarray:
-        return _recurrence(phi, np.concatenate([0.0 * f[:1], first @ f[:-1] + second @ f[1:]]))
-
-    h = integrated(f[..., :1])
-    # Sensitivities have the same dynamics, driven by the derivatives of A and f.
-    f[..., 1:] += np.einsum("hjq,Nj->Nhq", A[..., 1:], h[..., 0])
-    h = np.concatenate([h, integrated(f[..., 1:])], axis=-1)
-    residual -= np.einsum("eh,Nhc->eNc", through[..., 0], h)
-    residual[..., 1:] -= np.einsum("ehq,Nh->eNq", through[..., 1:], h[..., 0])
-    impulse = np.zeros((known.shape[1], len(hidden), len(hidden)))
-    impulse[0] = np.eye(len(hidden))
-    return residual, np.einsum("eh,Nhj->eNj", through[..., 0], _recurrence(phi, impulse))
+    phi, first, second = _first_order_hold(matrix[np.ix_(hidden, hidden)], record.step)
+    free = []
+    for r, segment in zip(residual, record.segments, strict=True):
+        f = matrix[np.ix_(hidden, record.columns)] @ segment.known
+        pushed = np.concatenate([0.0 * f[:, :1], first @ f[:, :-1] + second @ f[:, 1:]], axis=1)
+        r -= through @ _recurrence(phi, pushed.T[:, :, None])[:, :, 0].T
+        impulse = np.zeros((f.shape[1], *phi.shape))
+        impulse[0] = np.eye(len(phi))
+        free.append(np.moveaxis(through @ _recurrence(phi, impulse), 0, 1))
+    by_equation = [scipy.linalg.block_diag(*(f[i] for f in free)) for i in range(len(rows))]
+    return np.concatenate(residual, axis=1), np.array(by_equation)
 
 
 def _first_order_hold(A: Float[np.ndarray, "h h"], step: float) -> tuple[np.ndarray, ...]:
@@ -174,54 +307,91 @@ def _recurrence(
     return x
 
 
-def search(
-    regression: Regression,
-    start: Float[np.ndarray, " q"],
-    keep_sign: np.ndarray,
-    weights: Mapping[str, float],
-) -> "_Optimum | None":
-    """Minimise the equation error from `start` (q,), SI; return None if it is not finite there.
+class Regression(NamedTuple):
+    """Equations, records and parameters of a regression."""
 
-    Parameters with `keep_sign` (q,) are searched in their logarithms.
+    model: Model
+    base: Mapping[str, float]
+    """All parameters by name, SI."""
+    names: tuple[str, ...]
+    """Estimated parameters (q,)."""
+    records: tuple[Record, ...]
+    sizes: Mapping[str, float]
+    """Standard deviation of the left-hand side by equation."""
+
+    def residuals(self, values: Float[np.ndarray, " q"]) -> dict[str, Float[np.ndarray, " n"]]:
+        """Return the residuals over the sd of the left-hand side, by equation; they are huge where
+        the model is not finite."""
+        parts = {name: [] for name in self.sizes}
+        for record in self.records:
+            own = {**self.base, **record.known, **dict(zip(self.names, values, strict=True))}
+            weights = 1.0 / np.array([[self.sizes[n]] for n in record.equations])
+            with np.errstate(all="ignore"):
+                r, responses = _residual(record, _matrix(self.model, own))
+                left = _projected(weights * r, weights[..., None] * responses)
+            for name, r in zip(record.equations, left, strict=True):
+                parts[name].append(r)
+        return {name: np.concatenate(of) for name, of in parts.items()}
+
+
+def _projected(
+    residual: Float[np.ndarray, "e n"], responses: Float[np.ndarray, "e n h"]
+) -> Float[np.ndarray, "e n"]:
+    """Return the residuals without initial values and constants."""
+    e, n = residual.shape
+    constants = np.broadcast_to(np.eye(e)[:, None, :], (e, n, e))
+    N = np.concatenate([responses, constants], axis=-1).reshape(e * n, -1)
+    size = np.linalg.norm(N, axis=0)
+    if not (np.isfinite(residual).all() and np.isfinite(size).all()):
+        return np.full((e, n), _NOT_FINITE)
+    N, x = N[:, size > 0] / size[size > 0], residual.ravel()
+    # The columns of the constant and of a very slow free motion are nearly dependent.
+    return (x - N @ np.linalg.lstsq(N, x, rcond=_DEPENDENT)[0]).reshape(e, n)
+
+
+def _search(
+    regression: Regression, free: Mapping[str, Free]
+) -> tuple[Float[np.ndarray, " q"], np.ndarray]:
+    """Return the best of searches from the known values, from zero, and from one; and (q,) True for
+    the parameters with an effect on the residuals.
+
+    Parameters with a sign to keep are searched in their logarithms.
     """
     from scipy.optimize import least_squares
 
-    first = regression.rows(start, weights)
-    if first is None:
-        return None
+    model, base = regression.model, regression.base
+    keep = [_keeps_sign(model, n, free[n].sign, base[n]) for n in regression.names]
+    at_hand = np.array([base[n] for n in regression.names])
+    known = np.where(np.isfinite(at_hand) & (at_hand != 0), at_hand, 1.0)
 
     def values(z: np.ndarray) -> np.ndarray:
-        return np.where(keep_sign, start * np.exp(np.clip(z, -50.0, 50.0)), z)
-
-    @functools.lru_cache(maxsize=2)
-    def at(z: tuple[float, ...]) -> Rows | None:
-        return regression.rows(values(np.array(z)), weights)
+        return np.where(keep, known * np.exp(np.clip(z, -50.0, 50.0)), z)
 
     def residuals(z: np.ndarray) -> np.ndarray:
-        rows = at(tuple(z))
-        return np.full(first.r.shape, _NOT_FINITE) if rows is None else rows.r
+        return np.concatenate([*regression.residuals(values(z)).values()])
 
-    def slopes(z: np.ndarray) -> np.ndarray:
-        return (at(tuple(z)) or first).J * np.where(keep_sign, values(z), 1.0)
+    # Products of parameters may cause two optima, and a parameter may be a divisor.
+    starts = (known, np.zeros(known.size), np.ones(known.size))
+    optima = [
+        least_squares(
+            residuals,
+            np.where(keep, 0.0, start),
+            method="lm",
+            x_scale="jac",
+            ftol=_SMALL,
+            xtol=_SMALL,
+        )
+        for start in starts
+    ]
+    best = min(optima, key=lambda o: o.cost)
+    if best.cost >= _NOT_FINITE:
+        raise ValueError(
+            "start: equation-error: the equations are not finite at zero, one and the vehicle's "
+            f"values of {', '.join(regression.names)}: expected a start of each free parameter"
+        )
+    return values(best.x), best.jac.any(axis=0)
 
-    z = np.where(keep_sign, 0.0, start)
-    end = least_squares(
-        residuals,
-        z,
-        slopes,  # pyright: ignore[reportArgumentType]
-        method="lm",
-        x_scale="jac",
-        ftol=_SMALL,
-        xtol=_SMALL,
-        max_nfev=_EVALUATIONS,
-    ).x
-    return _Optimum(values(end), at(tuple(end)) or first, weights)
 
-
-_ROUNDS = 3
-"""Rounds of regression; each takes its weights from the previous residuals."""
-_NULL = 1e-5
-"""Singular value of unit columns below which parameters are exchangeable."""
 Origin = Literal["equation error", "frequency error", "as stated", "vehicle"]
 
 
@@ -262,10 +432,8 @@ class EquationErrorStart(NamedTuple):
             "explained": [e.r_squared for e in self.equations],
             "half_width": self.half_width,
         }
-        out = [found("start.equation-error", "note", names=names or ["nothing"], **explained)]
-        if self.hidden:
-            out.append(found("start.hidden-states", "note", names=self.hidden))
-        return out + reasons_of(self.values)
+        taken = found("start.equation-error", "note", names=names or ["nothing"], **explained)
+        return [taken, *reasons_of(self.values)]
 
 
 def reasons_of(values: Mapping[str, StartValue]) -> list[Finding]:
@@ -306,36 +474,32 @@ def equation_error_start(
         ValueError: nothing can be regressed, or a parameter has no start.
     """
     flights = [f for f in flights if not f.hold_out]
-    regression, half, reasons = _regression(model, vehicle, flights, free)
-    keep = {n for n in regression.names if _keeps_sign(model, n, free[n].sign, regression.base[n])}
-    optimum = _optimum(regression, keep)
-    # Parameters are fixed one at a time: fixing one of two exchangeable parameters determines the
-    # other.
-    while (out := _undetermined(regression, optimum.rows)) is not None:
-        name, reasons[name] = out
-        _require_value(regression.base, name, reasons[name])
-        regression = regression._replace(names=tuple(n for n in regression.names if n != name))
-        if not regression.names:
-            raise _no_regression("the equations determine none of the free parameters")
-        optimum = _optimum(regression, keep)
-    structures, rows = [one.structure for one in regression.records], optimum.rows
-    equations = []
-    for i, (name, size) in enumerate(_sizes(regression).items()):
-        left = float(np.mean((rows.r[rows.equation == i] / optimum.weights[name]) ** 2))
-        equations.append(Equation(name, 1.0 - left / size**2))
-    estimates = dict(zip(regression.names, optimum.values.tolist(), strict=True))
+    regression, width, reasons = _regression(model, vehicle, flights, free)
+    # Of exchangeable parameters all but one stay near the values at which the search begins.
+    estimate, effects = _search(regression, free)
+    estimates = {}
+    for name, value, effect in zip(regression.names, estimate.tolist(), effects, strict=True):
+        if effect:
+            estimates[name] = value
+        else:
+            reasons[name] = "no measured state or output moves with it"
+            _require_value(regression.base, name, reasons[name])
+    if not estimates:
+        raise _no_regression("the equations determine none of the free parameters")
+    residuals = regression.residuals(estimate)
+    states = naming.names(model.State)
     return EquationErrorStart(
         {n: _value(regression, n, free[n], estimates.get(n), reasons.get(n, "")) for n in free},
-        tuple(equations),
-        half * flights[0].dt,
-        tuple(dict.fromkeys(s.states[i] for s in structures for i in s.hidden)),
+        tuple(Equation(name, 1.0 - float(np.mean(r**2))) for name, r in residuals.items()),
+        _REACH * width * flights[0].dt,
+        tuple(dict.fromkeys(states[i] for one in regression.records for i in one.hidden)),
     )
 
 
 def _regression(
     model: Model, vehicle: Any, flights: Sequence[Flight], free: Mapping[str, Free]
-) -> tuple[Regression, int, dict[str, str]]:
-    """Return the regression, the kernel's half width [samples], and the reason for each
+) -> tuple[Regression, float, dict[str, str]]:
+    """Return the regression, the Gaussian's standard deviation [samples], and the reason for each
     undetermined parameter."""
     if not model.linear:
         raise ValueError(
@@ -344,40 +508,42 @@ def _regression(
         )
     stated = {n: f.start for n, f in free.items() if math.isfinite(f.start)}
     base = {n: float(np.asarray(v)) for n, v in naming.asdict(vehicle).items()} | stated
-    # Free parameters get generic numbers, so NaN remains only where a constant is missing.
-    some = base | dict(zip(free, generic(len(free)), strict=True))
-    structures = []
+    # At random values no terms cancel.
+    generic = dict(zip(free, np.random.default_rng(11).uniform(0.5, 1.5, len(free)), strict=True))
+    delays, width, records = dict(model.delays), _width(flights), []
+    reasons = {n: "a delay is found by no regression" for n in free if n in delays.values()}
     for flight in flights:
-        require_constants(model, model.Params(**{**some, **flight.known}))
-        both = coefficients(model, {**some, **flight.known}, list(free), generic(len(free)))
-        structures.append(structure(model, both, list(flight.outputs)))
-    delays, constants = dict(model.delays), hidden_constants(model, some, structures)
-    reasons = {
-        n: "a delay is found by no regression"
-        if n in delays.values()
-        else "it is a time constant or frequency of states that are not measured"
-        for n in free
-        if n in constants
-    }
-    names = tuple(n for n in free if n not in constants)
-    if not any(s.rows for s in structures):
+        some = {**base, **generic, **flight.known}
+        require_constants(model, model.Params(**some))
+        value = _matrix(model, some)
+        depends = {n: _matrix(model, {**some, n: 2.0 * generic[n]}) != value for n in free}
+        late = {u: {**base, **flight.known}[p] for u, p in delays.items()}
+        changes = np.any([*depends.values()], axis=0)
+        one = _record(model, flight, value, changes, width, late)
+        records.append(one)
+        for n, entries in depends.items():
+            if entries[one.hidden, one.hidden].any():
+                reasons[n] = "it is a time constant of states that are not measured"
+    names = tuple(n for n in free if n not in reasons)
+    if not any(one.rows for one in records):
         measured = ", ".join({n: None for f in flights for n in f.outputs})
         raise _no_regression(f"no equation of a state that {measured} show has a free parameter")
     if not names:
         raise _no_regression("all that is free are delays, or time constants of hidden states")
     for n, why in reasons.items():
         _require_value(base, n, why)
-    half, records = kernel_width(flights), []
-    for flight, shown in zip(flights, structures, strict=True):
-        late = {u: {**base, **flight.known}[p] for u, p in delays.items()}
-        records.append(record(model, flight, shown, half, late))
-    records = tuple(one for one in records if one.segments and one.structure.rows)
+    records = tuple(one for one in records if one.segments and one.rows)
     if not records:
         raise _no_regression(
             "no stretch without missing samples is as long as the smoothing needs "
-            f"({shortest(half)} samples)"
+            f"({math.ceil((_SHORTEST + 2.0 * _REACH) * width)} samples)"
         )
-    return Regression(model, base, names, records), half, reasons
+    left: dict[str, list[np.ndarray]] = {}
+    for one in records:
+        for k, name in enumerate(one.equations):
+            left.setdefault(name, []).extend(s.left[k] - s.left[k].mean() for s in one.segments)
+    sizes = {n: max(float(np.std(np.concatenate(v))), 1e-300) for n, v in left.items()}
+    return Regression(model, base, names, records, sizes), width, reasons
 
 
 def _no_regression(why: str) -> ValueError:
@@ -392,80 +558,12 @@ def _require_value(base: Mapping[str, float], name: str, why: str) -> None:
         raise ValueError(f"free.{name}.start: missing, expected a value to begin with: {why}")
 
 
-class _Optimum(NamedTuple):
-    values: np.ndarray
-    rows: Rows
-    weights: Mapping[str, float]
-
-
 def _keeps_sign(model: Model, name: str, sign: Sign | None, at_hand: float) -> bool:
     """True if a parameter has a known sign to keep."""
     positive = name in model.positive
     known = positive or (math.isfinite(at_hand) and at_hand != 0)
     by_default = positive or of_helicopter(model.Params)
     return known and (sign == "keep" or (sign is None and by_default))
-
-
-def _optimum(regression: Regression, keep_sign: set[str]) -> _Optimum:
-    """Return the weighted least squares; weights are the inverse residual rms of each equation."""
-    keep = np.array([n in keep_sign for n in regression.names], bool)
-    # The first weights are the inverse sd of the left-hand sides.
-    weights = {n: 1.0 / size for n, size in _sizes(regression).items()}
-    optimum = _first_search(regression, keep, weights)
-    for _ in range(_ROUNDS - 1):
-        rows = optimum.rows
-        weights = {
-            name: w / max(float(np.sqrt(np.mean(rows.r[rows.equation == i] ** 2))), 1e-9)
-            for i, (name, w) in enumerate(weights.items())
-        }
-        again = search(regression, optimum.values, keep, weights)
-        if again is None:
-            break
-        optimum = again
-    return optimum
-
-
-def _first_search(
-    regression: Regression, keep: np.ndarray, weights: Mapping[str, float]
-) -> _Optimum:
-    """Return the best of searches from zero, from the known values, and from one."""
-    at_hand = np.array([regression.base[n] for n in regression.names])
-    known = np.where(np.isfinite(at_hand) & (at_hand != 0), at_hand, 1.0)
-    # Products of parameters may cause two optima, and a parameter may be a divisor.
-    starts = [np.where(keep, known, 0.0), known, np.where(keep, known, 1.0)]
-    runs = [search(regression, start, keep, weights) for start in starts]
-    finite = [run for run in runs if run is not None]
-    if not finite:
-        raise ValueError(
-            "start: equation-error: the equations are not finite at zero, one and the vehicle's "
-            f"values of {', '.join(regression.names)}: expected a start of each free parameter"
-        )
-    return min(finite, key=lambda run: run.rows.cost)
-
-
-def _sizes(regression: Regression) -> dict[str, float]:
-    """Return the standard deviation of each equation's left-hand side."""
-    left = {name: [] for name in regression.equations}
-    for one in regression.records:
-        for k, name in enumerate(one.structure.equations):
-            left[name] += [s.left[k] - s.left[k].mean() for s in one.segments]
-    return {n: max(float(np.std(np.concatenate(v))), 1e-300) for n, v in left.items()}
-
-
-def _undetermined(regression: Regression, rows: Rows) -> tuple[str, str] | None:
-    """Return a parameter that the regression does not determine and the reason, or None."""
-    norms, names = np.linalg.norm(rows.J, axis=0), regression.names
-    if not norms.all():
-        return names[int(np.argmin(norms))], "no measured state or output moves with it"
-    _, sizes, directions = np.linalg.svd(rows.J / norms, full_matrices=False)
-    if sizes[-1] > _NULL * sizes[0]:
-        return None
-    part = np.abs(directions[-1])
-    involved = [i for i in np.argsort(-part) if part[i] > 0.1]
-    # A parameter with a known value is preferred, because it can keep that value.
-    first = ([i for i in involved if math.isfinite(regression.base[names[i]])] or involved)[-1]
-    others = ", ".join(names[i] for i in involved if i != first)
-    return names[first], f"the equations do not tell it from {others}"
 
 
 def _value(
@@ -479,16 +577,12 @@ def _value(
     if estimate is None:
         origin: Origin = "as stated" if math.isfinite(free.start) else "vehicle"
         return StartValue(regression.base[name], unit, origin, reason)
-    inside = _inside(free, estimate)
-    moved = "" if inside == estimate else f"{estimate:.4g} lies outside its bounds"
-    return StartValue(inside, unit, "equation error", moved)
-
-
-def _inside(free: Free, value: float) -> float:
-    """Return the value; if outside its bounds, move it inside by 1 % of their span."""
     low = -math.inf if free.lower is None else free.lower
     high = math.inf if free.upper is None else free.upper
-    if low < value < high:
-        return value
-    span = high - low if math.isfinite(high - low) else max(abs(low if value <= low else high), 1.0)
-    return low + 0.01 * span if value <= low else high - 0.01 * span
+    if low < estimate < high:
+        return StartValue(estimate, unit, "equation error", "")
+    # A value outside its bounds is moved inside, by 1 % of their span.
+    bound, inwards = (low, 1.0) if estimate <= low else (high, -1.0)
+    span = high - low if math.isfinite(high - low) else max(abs(bound), 1.0)
+    moved = f"{estimate:.4g} lies outside its bounds"
+    return StartValue(bound + 0.01 * inwards * span, unit, "equation error", moved)

@@ -1,7 +1,8 @@
 """Identifiability analysis: rank, covariance and null directions of the free parameters.
 
 It works in relative coordinates: log |value| for parameters of one sign, value over a scale for
-those that may be zero. Initial states and biases are projected out first.
+those that may be zero. Initial states and biases are projected out first. A null direction has a
+singular value below rounding, or makes a 95 % interval that reaches further than a factor of ten.
 """
 
 import math
@@ -13,19 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from heli_jax.flights.flight import labels
 from heli_jax.identification.estimation.evaluation import NULL, Evaluation
-from heli_jax.identification.identifiability.directions import (
-    TAKES_PART,
-    Spread,
-    WithoutWeakPriors,
-    directions,
-    projected,
-    row_reduced,
-    unit_vector,
-    with_new_directions,
-    with_wide_intervals,
-    without_effect,
-)
-from heli_jax.identification.identifiability.equivalents import Valley
+from heli_jax.identification.identifiability.equivalents import Valley, row_reduced, unit_vector
 from heli_jax.identification.identifiability.verdict import (
     FACTOR,
     Z95,
@@ -37,13 +26,22 @@ from heli_jax.identification.identifiability.verdict import (
 )
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.unknowns import transforms
-from heli_jax.identification.unknowns.layout import Layout, flight_unknowns
+from heli_jax.identification.unknowns.layout import FlightUnknown, Layout, flight_unknowns
 
+TAKES_PART = 0.01
+"""component of a unit null direction from which on an unknown takes part in it"""
+_FAR = math.log(FACTOR) / Z95
+"""sd in relative coordinates of an interval that reaches as far as the factor"""
+_SHARPER = 100.0
+"""sensitivity with known nuisances over that with free ones from which on a direction is
+exchangeable with nuisances"""
+_DEAD = 1e-12
+"""norm of a column without effect, over the largest"""
 _NEAR_ZERO = 1e-2
 """value over its reference below which a parameter is in no product of powers"""
 _AT_END = 1e-3
 """distance to the largest time shift, over that, of a shift at its end"""
-_NO_EFFECT = 1e-6
+NO_EFFECT = 1e-6
 """norm of a nuisance's column [sds of the noise] below which it is left out"""
 
 
@@ -88,34 +86,121 @@ def _parameter(problem: Problem, name: str, value: float) -> Unknown:
     return Unknown(name, value, log, scale, prior, True, reference, symmetric, at_bound=at_bound)
 
 
-class RelativeRows(NamedTuple):
-    """The Jacobian without the rows of the parameters' priors."""
-
-    sensitivity: np.ndarray
-    """(n, q) rows of the data by the parameters of interest, in relative coordinates"""
-    nuisances: np.ndarray
-    """(n, k) rows of the data by all other unknowns"""
-    weak: np.ndarray
-    """(w, k) rows of the nuisances' weak priors"""
-
-
 def relative_rows(
     problem: Problem, layout: Layout, e: Evaluation
-) -> tuple[tuple[Unknown, ...], RelativeRows]:
-    """Return the parameters of interest, and the Jacobian's rows in relative coordinates."""
+) -> tuple[tuple[Unknown, ...], np.ndarray, np.ndarray]:
+    """Return the parameters of interest, and the rows (n, q) and (n, k) of the data by them, in
+    relative coordinates, and by all other unknowns."""
     unknowns = unknowns_of(problem, layout, e)
     J = np.asarray(e.J, dtype=np.float64)
     q, p = len(layout.of_interest), len(layout.free)
-    count = layout.size - layout.first_nuisance
-    # The last rows are the weak priors, before them the parameters' priors; defects between windows
-    # count as data.
-    data = J[: J.shape[0] - count - p]
+    # The last rows are the nuisances' weak priors, before them the parameters' priors; defects
+    # between windows count as data.
+    data = J[: J.shape[0] - (layout.size - layout.first_nuisance) - p]
     slopes = np.asarray(e.slopes, dtype=np.float64)
     factor = np.divide(
         [u.reference for u in unknowns], slopes, out=np.zeros_like(slopes), where=slopes != 0
     )
     sensitivity = data[:, :q] * np.abs(factor) * np.sign(slopes) * [u.sign for u in unknowns]
-    return unknowns, RelativeRows(sensitivity, data[:, q:], J[J.shape[0] - count :, q:])
+    return unknowns, sensitivity, data[:, q:]
+
+
+def projected(J: np.ndarray, nuisances: np.ndarray) -> np.ndarray:
+    """Return whitened rows (any, q) of the information on the unknowns with the nuisances free.
+
+    Args:
+        J: (n, q) whitened Jacobian by the unknowns.
+        nuisances: (n, k) that by the nuisances, which may be dependent.
+    """
+    # Orthogonal factors, no normal equations: singular values down to 1e-8 of the largest count,
+    # and their squares are below rounding.
+    k = nuisances.shape[1]
+    R = np.linalg.qr(np.hstack([nuisances, J]), mode="r")
+    N, S = R[:, :k], R[:, k:]
+    norms = np.linalg.norm(N, axis=0)
+    left, singular, _ = np.linalg.svd(N / np.where(norms > 0, norms, 1.0), full_matrices=False)
+    spanned = left[:, singular > NULL * max(singular.max(initial=0.0), 1e-300)]
+    for _ in range(2):  # the second time takes off the rounding of the first
+        S = S - spanned @ (spanned.T @ S)
+    return np.linalg.qr(S, mode="r")
+
+
+class Directions(NamedTuple):
+    """Rank and covariance of the unknowns by a whitened sensitivity."""
+
+    singular: np.ndarray
+    """(q,) 1 / sd along orthogonal directions, each unknown in units of its scale; largest first"""
+    rank: int
+    null: list[np.ndarray]
+    """null directions, as unit vectors (q,) in relative coordinates"""
+    covariance: np.ndarray
+    """(q, q) in relative coordinates, without the null directions"""
+
+
+def directions(rows: np.ndarray, scale: np.ndarray) -> Directions:
+    """Return rank and covariance by rows (any, q), of unknowns of a size (q,)."""
+    # Rows of zeros: the decomposition has all q directions.
+    padded = np.vstack([rows * scale, np.zeros((scale.size, scale.size))])
+    _, singular, right = np.linalg.svd(padded, full_matrices=False)
+    kept = singular > NULL * max(singular[0], 1e-300)
+    V = scale[:, None] * right[kept].T / singular[kept]
+    null = [unit_vector(scale * v) for v in right[~kept]]
+    return Directions(singular, int(kept.sum()), null, V @ V.T)
+
+
+def without_effect(sensitivity: np.ndarray, unknowns: tuple[Unknown, ...]) -> tuple[str, ...]:
+    """Return the unknowns without any effect."""
+    sizes = np.linalg.norm(sensitivity, axis=0) * np.array([u.scale for u in unknowns])
+    least = _DEAD * max(sizes.max(), 1e-300)
+    return tuple(u.name for u, s in zip(unknowns, sizes, strict=True) if not s > least)
+
+
+def with_wide_intervals(
+    null: list[np.ndarray], covariance: np.ndarray, unknowns: tuple[Unknown, ...]
+) -> list[np.ndarray]:
+    """Return the null directions, and those of unknowns whose 95 % interval by the covariance
+    (q, q) spans more than the factor."""
+    # Values between bounds of both signs have no factor.
+    far = [
+        i
+        for i, u in enumerate(unknowns)
+        if (u.logarithmic or u.symmetric) and covariance[i, i] > _FAR**2
+    ]
+    # The widest first. Its column is the regression of the others on it.
+    far.sort(key=lambda i: -covariance[i, i])
+    return with_new_directions(null, [covariance[:, i] for i in far])
+
+
+def with_new_directions(null: list[np.ndarray], others: list[np.ndarray]) -> list[np.ndarray]:
+    """Return the null directions, and those others whose largest component is in none of them."""
+    for v in map(unit_vector, others):
+        if all(abs(w[np.argmax(np.abs(v))]) <= TAKES_PART for w in null):
+            null = [*null, v]
+    return null
+
+
+class Nuisances(NamedTuple):
+    """Initial states, biases and input offsets, which may be exchangeable with parameters."""
+
+    free: np.ndarray
+    """(any, q) sensitivity to the unknowns with the nuisances free"""
+    fixed: np.ndarray
+    """(any, q) the same with the nuisances known"""
+    compensation: np.ndarray
+    """(k, q) change of the nuisances, in sds of their weak priors, that compensates a unit of each
+    unknown"""
+    names: tuple[FlightUnknown, ...]
+    """(k,)"""
+
+    def exchanged(self, v: np.ndarray) -> tuple[FlightUnknown, ...]:
+        """Return the nuisances that are exchangeable with a direction v (q,) of the unknowns; none
+        if it is no sharper with the nuisances known."""
+        known, free = (np.linalg.norm(rows @ v) for rows in (self.fixed, self.free))
+        if not self.names or known < max(NULL * np.linalg.norm(self.fixed), _SHARPER * free):
+            return ()
+        size = np.abs(self.compensation @ v)
+        moves = size > 0.1 * max(size.max(), 1e-300)
+        return tuple(n for n, m in zip(self.names, moves, strict=True) if m)
 
 
 _ROUGHLY = 0.5
@@ -154,57 +239,53 @@ def verdict_of(
             "the simulation is not finite at the given values: the model is unstable there over "
             "the length of this record; start elsewhere or use a shorter window"
         )
-    unknowns, rows = relative_rows(problem, layout, e)
+    unknowns, sensitivity, others = relative_rows(problem, layout, e)
     unknowns = tuple(u._replace(aliased=u.name in around.aliased) for u in unknowns)
     q = len(unknowns)
-    R = np.linalg.qr(np.hstack([rows.sensitivity, rows.nuisances]), mode="r")
-    S, N = R[:, :q], R[:, q:]
-    held = np.vstack([N, rows.weak])
-    shown = np.linalg.norm(held, axis=0) > _NO_EFFECT
-    sensitivity = projected(np.vstack([S, np.zeros((len(rows.weak), q))]), held[:, shown])
-    # Without the weak priors. Their sds are the units of these columns.
-    seen = np.linalg.norm(N, axis=0) > _NO_EFFECT
+    R = np.linalg.qr(np.hstack([sensitivity, others]), mode="r")
+    fixed, N = R[:, :q], R[:, q:]
+    seen = np.linalg.norm(N, axis=0) > NO_EFFECT
     compensation = np.zeros((N.shape[1], q))
-    compensation[seen] = -np.linalg.lstsq(N[:, seen], S, rcond=NULL)[0]
+    compensation[seen] = -np.linalg.lstsq(N[:, seen], fixed, rcond=NULL)[0]
     named = flight_unknowns(layout, labels(problem.training))
     # The parameters of the disturbance and the noise's factors stand before the named nuisances.
-    without_weak = WithoutWeakPriors(
-        projected(S, N[:, seen]), compensation[N.shape[1] - len(named) :], named
-    )
+    free = projected(fixed, N[:, seen])
+    nuisances = Nuisances(free, fixed, compensation[N.shape[1] - len(named) :], named)
     to_relative = np.asarray(e.slopes, np.float64) * [u.sign / u.reference for u in unknowns]
     if around.reported is not None:
         around = around._replace(reported=around.reported * np.outer(to_relative, to_relative))
-    return analyse(sensitivity, unknowns, without_weak=without_weak, around=around)
+    return analyse(free, unknowns, nuisances=nuisances, around=around)
 
 
 def analyse(
     sensitivity: np.ndarray,
     unknowns: tuple[Unknown, ...],
     *,
-    without_weak: WithoutWeakPriors | None = None,
+    nuisances: Nuisances | None = None,
     around: Around = Around(),
 ) -> Verdict:
     """Return the analysis of a whitened sensitivity in relative coordinates.
 
     Args:
-        sensitivity: (any, q) with the nuisances free but for their weak priors, and without rows of
-            the unknowns' priors.
-        without_weak: the same without the weak priors; if not given, these count as data.
+        sensitivity: (any, q) with the nuisances free, and without rows of priors. Weak priors of
+            nuisances would bound a parameter that is exchangeable with a bias.
     """
-    bare = sensitivity if without_weak is None else without_weak.sensitivity
+    nuisances = nuisances or Nuisances(sensitivity, sensitivity, np.zeros((0, len(unknowns))), ())
     scale, own = np.array([u.scale for u in unknowns]), np.array([u.prior for u in unknowns])
     names = [u.name for u in unknowns]
-    # The rank is that without the weak priors, which would bound a parameter that is exchangeable
-    # with a bias. A prior is a row with one over its sd.
-    total, data = directions(np.vstack([bare, np.diag(own)]), scale), directions(bare, scale)
-    covariance = total.covariance
-    if not total.null:
-        # The intervals are those of the fit, with the weak priors.
-        covariance = directions(np.vstack([sensitivity, np.diag(own)]), scale, 0.0).covariance
-    null = with_wide_intervals(total.null, total.covariance, unknowns)
-    null = with_new_directions(
-        null, _additional_null_directions(total.covariance, covariance, unknowns, around)
+    # A prior is a row with one over its sd.
+    total, data = (
+        directions(np.vstack([sensitivity, np.diag(own)]), scale),
+        directions(sensitivity, scale),
     )
+    covariance = total.covariance
+    null = with_wide_intervals(total.null, covariance, unknowns)
+    # Directions whose intervals by the slopes are short: aliased parameters, and the regression on
+    # a one-sided parameter of those that are one-sided too.
+    aliased = [v for v, u in zip(np.eye(len(unknowns)), unknowns, strict=True) if u.aliased]
+    open_ = np.array([u.name in around.one_sided for u in unknowns])
+    one_sided = [np.where(open_, covariance[:, i], 0.0) for i in np.flatnonzero(open_)]
+    null = with_new_directions(null, [*aliased, *one_sided])
     reported = covariance
     if around.reported is not None:
         reported = around.reported
@@ -213,20 +294,9 @@ def analyse(
     resting = []
     if not null and own.any():
         resting = with_wide_intervals(data.null, data.covariance, unknowns)
-    dead = without_effect(sensitivity, unknowns)
-    of_rows = (sensitivity, without_weak)
-
-    def spread(C: np.ndarray) -> Spread:
-        """Return the sd of a sum, as much wider as the reported one is."""
-
-        def sd(along: np.ndarray) -> float:
-            wider = (along @ reported @ along) / max(along @ covariance @ along, 1e-300)
-            return math.sqrt(max(0.0, float(wider * (along @ C @ along))))
-
-        return sd
-
-    groups = _groups(null, spread(covariance), unknowns, of_rows, around, dead)
-    resting_groups = _groups(resting, spread(data.covariance), unknowns, of_rows, around)
+    dead = without_effect(nuisances.fixed, unknowns)
+    groups = _groups(null, reported, unknowns, nuisances, around, dead)
+    resting_groups = _groups(resting, reported, unknowns, nuisances, around)
     moved = np.abs(null).max(axis=0) if null else np.zeros(len(unknowns))
     changed = {n for other in around.second for n in other.changed}
     undetermined = [
@@ -238,7 +308,7 @@ def analyse(
     correlation = np.clip(covariance / np.outer(sizes, sizes), -1.0, 1.0)
     np.fill_diagonal(correlation, 1.0)
     # The data have no information on a parameter that is exchangeable with a nuisance.
-    share = dict(zip(names, _prior_share(covariance, bare).tolist(), strict=True))
+    share = dict(zip(names, _prior_share(covariance, sensitivity).tolist(), strict=True))
     share |= dict.fromkeys((n for g in groups if g.exchanged for n in g.names), 1.0)
     return Verdict(
         unknowns=unknowns,
@@ -265,30 +335,11 @@ def analyse(
     )
 
 
-def _additional_null_directions(
-    bare: np.ndarray, covariance: np.ndarray, unknowns: tuple[Unknown, ...], around: Around
-) -> list[np.ndarray]:
-    """Return null directions whose intervals are short, by covariances (q, q) without the weak
-    priors (`bare`) and with them."""
-    # Weak priors alone bound a parameter that may be zero if its sd without them is beyond its
-    # scale and ten times that with them.
-    weakly = [
-        bare[:, i]
-        for i, u in enumerate(unknowns)
-        if not u.logarithmic and bare[i, i] > max(1.0, FACTOR**2 * covariance[i, i])
-    ]
-    aliased = [v for v, u in zip(np.eye(len(unknowns)), unknowns, strict=True) if u.aliased]
-    # The regression on a one-sided parameter, of those that are one-sided too.
-    open_ = np.array([u.name in around.one_sided for u in unknowns])
-    one_sided = [np.where(open_, covariance[:, i], 0.0) for i in np.flatnonzero(open_)]
-    return [*weakly, *aliased, *one_sided]
-
-
 def _groups(
     null: list[np.ndarray],
-    spread: Spread,
+    covariance: np.ndarray,
     unknowns: tuple[Unknown, ...],
-    of_rows: tuple[np.ndarray, WithoutWeakPriors | None],
+    nuisances: Nuisances,
     around: Around,
     dead: tuple[str, ...] = (),
 ) -> tuple[Group, ...]:
@@ -298,21 +349,18 @@ def _groups(
     null = [v for v in null if np.abs(v[alive]).max(initial=0.0) > TAKES_PART]
     if not null:
         return ()
-
     # The reduced basis of the null space has the most zeros.
     rows = np.array([unit_vector(v) for v in row_reduced(np.array(null), unknowns)[0]])
     parts = (np.abs(rows) > TAKES_PART) & alive
     rows, parts = rows[parts.any(axis=1)], parts[parts.any(axis=1)]
     count, labels = connected_components((parts @ parts.T).astype(int))
-    sensitivity, without_weak = of_rows
     groups = []
     for k in range(count):
         mine, members = list(rows[labels == k]), parts[labels == k].any(axis=0)
-        tied, exchanged = (), []
+        tied = ()
         if around.valley is not None:
-            tied = around.valley.determined_combinations(mine, spread, unknowns)
-        if without_weak is not None:
-            exchanged = [n for v in mine for n in without_weak.exchanged(v, sensitivity)]
+            tied = around.valley.determined_combinations(mine, covariance, unknowns)
+        exchanged = [n for v in mine for n in nuisances.exchanged(v)]
         names = tuple(unknowns[i].name for i in np.flatnonzero(members))
         groups.append(Group(names, len(mine), tied, tuple(dict.fromkeys(exchanged))))
     return tuple(groups)
@@ -326,10 +374,10 @@ def _pairs(correlation: np.ndarray, names: list[str], undetermined: list[str]) -
     return tuple(sorted(pairs, key=lambda p: -abs(p.correlation)))
 
 
-def _prior_share(covariance: np.ndarray, bare: np.ndarray) -> np.ndarray:
-    """Return the share (q,) of the variance by all priors."""
-    # P = P (B'B + R) P is the sum of the parts of the data, with rows B, and of all priors R.
+def _prior_share(covariance: np.ndarray, sensitivity: np.ndarray) -> np.ndarray:
+    """Return the share (q,) of the variance by priors."""
+    # P = P (B'B + R) P is the sum of the parts of the data, with rows B, and of the priors R.
     variance = np.diag(covariance)
-    of_data = np.sum((bare @ covariance) ** 2, axis=0)
+    of_data = np.sum((sensitivity @ covariance) ** 2, axis=0)
     share = 1.0 - of_data / np.where(variance > 0, variance, 1.0)
     return np.clip(np.where(variance > 0, share, 0.0), 0.0, 1.0)

@@ -1,9 +1,9 @@
-"""Other parameter values with the same residuals as those of an optimum.
+"""Other parameter values with the same residuals as those of an optimum, and the combinations of
+parameters that are equal at all of them.
 
 One search serves all: some values are set elsewhere, all other unknowns follow (`Valley.visit`),
 and the sum of squares shows whether the point fits as well. The values come from null directions
-(`Valley.determined_combinations`), from an exchange of two modes (`second_solutions`), or from the
-aliases of a fast mode (`validation.logging_rate`).
+(`Valley.determined_combinations`), or from an exchange of two modes (`second_solutions`).
 """
 
 import itertools
@@ -20,8 +20,12 @@ from heli_jax.analysis.linear import linearize
 from heli_jax.analysis.operating_point import operating_point
 from heli_jax.identification.estimation.evaluation import Evaluation, named
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
-from heli_jax.identification.identifiability.directions import Spread, combinations
-from heli_jax.identification.identifiability.verdict import Combination, SecondSolution, Unknown
+from heli_jax.identification.identifiability.verdict import (
+    Z95,
+    Combination,
+    SecondSolution,
+    Unknown,
+)
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Solution
@@ -93,6 +97,127 @@ def descend(
         else:
             ridge *= 10.0
     return z, squares - promised
+
+
+# Products of powers, such as a/Ixx, and sums, such as La + Lb, that do not change along the null
+# directions at one point.
+
+_ROUNDED = 0.02
+"""distance of a power or factor from a multiple of a quarter that is noise"""
+_LARGEST_FACTOR = 4.0
+"""of a parameter in a sum"""
+_LARGEST = 700.0
+"""log of the largest value: exp overflows at 709"""
+
+
+def unit_vector(v: np.ndarray) -> np.ndarray:
+    """Return the vector with length one, its largest part positive."""
+    v = v / np.linalg.norm(v)
+    return v if v[np.argmax(np.abs(v))] > 0 else -v
+
+
+def combinations(
+    null: Sequence[np.ndarray],
+    covariance: np.ndarray,
+    unknowns: tuple[Unknown, ...],
+    units: Mapping[str, str | None] | None = None,
+) -> tuple[Combination, ...]:
+    """Return the products of powers that do not change along the null directions (q,), or with
+    `units` the sums of parameters of one unit; with sds by a covariance (q, q)."""
+    # From a relative coordinate to log |value|, or for sums to the value.
+    to = np.array([u.per_log for u in unknowns])
+    if units is not None:
+        to = to * [u.value if u.logarithmic else 0.0 for u in unknowns]
+    moved = [v * to for v in null]
+    if not moved or not all(np.linalg.norm(v) > 0 for v in moved):
+        return ()
+    W, pivots = row_reduced(np.array([unit_vector(v) for v in moved]), unknowns)
+    found = []
+    for i in range(W.shape[1]):
+        if i in pivots or not np.any(abs(W[:, i]) >= (0.1 if units is None else _ROUNDED)):
+            continue
+        # W has the identity in the pivots' columns: unknown i less W[:, i] times the pivots is
+        # constant along the null directions.
+        weights = np.zeros(W.shape[1])
+        weights[i] = 1.0
+        weights[pivots] = -W[:, i]
+        weights = np.array([_rounded(w, units is not None) for w in weights])
+        members = [unknowns[k] for k in np.flatnonzero(weights)]
+        if not all(u.logarithmic for u in members):
+            continue
+        if units is None:
+            # a/Ixx rather than Ixx/a
+            weights = -weights if weights[pivots].sum() < 0 else weights
+        elif (
+            len(members) < 2
+            or np.abs(weights).max() > _LARGEST_FACTOR
+            or len({units.get(u.name, u.name) for u in members}) > 1
+        ):
+            continue
+        by_name = {u.name: float(w) for u, w in zip(unknowns, weights, strict=True) if w}
+        values = {u.name: u.value for u in members}
+        made = _product if units is None else _sum
+        along = weights * to
+        sd = math.sqrt(max(0.0, float(along @ covariance @ along)))
+        found.append(made(by_name, values, sd))
+    return tuple(c for c in found if c.is_bounded)
+
+
+def row_reduced(W: np.ndarray, unknowns: tuple[Unknown, ...]) -> tuple[np.ndarray, list[int]]:
+    """Row-reduce the null directions; pivots are late parameters, so that ratios read a/Ixx."""
+    W, pivots = W.copy(), []
+    for k in range(W.shape[0]):
+        size = np.max(np.abs(W[k:]), axis=0)
+        size[pivots] = 0.0
+        # Half of the largest pivot is stable enough.
+        near = [i for i in range(W.shape[1]) if size[i] >= 0.5 * size.max()]
+        # The pivot is in the denominator.
+        proper = [i for i in near if unknowns[i].is_parameter and unknowns[i].logarithmic]
+        pivot = (proper or near)[-1]
+        row = k + int(np.argmax(np.abs(W[k:, pivot])))
+        W[[k, row]] = W[[row, k]]
+        W[k] /= W[k, pivot]
+        for other in range(W.shape[0]):
+            if other != k:
+                W[other] -= W[other, pivot] * W[k]
+        pivots.append(pivot)
+    return W, pivots
+
+
+def _rounded(weight: float, simple: bool) -> float:
+    """Return the nearest quarter if the weight is near it or of a sum, else two digits."""
+    quarter = round(weight * 4) / 4
+    if abs(weight) < _ROUNDED and simple:
+        return 0.0
+    return quarter if simple or abs(weight - quarter) < _ROUNDED else round(weight, 2)
+
+
+def _product(powers: dict[str, float], values: dict[str, float], sd: float) -> Combination:
+    """Return a product of powers; `sd` is that of its logarithm."""
+    log = sum(e * math.log(abs(values[n])) for n, e in powers.items())
+    value = math.exp(log) if abs(log) < _LARGEST else math.inf
+    factor = math.exp(min(Z95 * sd, _LARGEST))
+
+    def power(name: str, e: float) -> str:
+        return name if e == 1 else f"{name}^{e:g}"
+
+    over = " * ".join(power(n, e) for n, e in powers.items() if e > 0) or "1"
+    under = [power(n, -e) for n, e in powers.items() if e < 0]
+    below = under[0] if len(under) == 1 else f"({' * '.join(under)})"
+    name = f"{over}/{below}" if under else over
+    return Combination(name, powers, value, value * sd, value / factor, value * factor)
+
+
+def _sum(factors: dict[str, float], values: dict[str, float], sd: float) -> Combination:
+    def term(name: str, factor: float) -> str:
+        size = "" if abs(factor) == 1 else f"{abs(factor):g} "
+        return f"{'-' if factor < 0 else '+'} {size}{name}"
+
+    value = sum(w * values[n] for n, w in factors.items())
+    name = " ".join(term(n, w) for n, w in factors.items())
+    name = name.removeprefix("+ ") if name.startswith("+") else name.replace("- ", "-", 1)
+    ends = (value - Z95 * sd, value + Z95 * sd)
+    return Combination(name, factors, value, sd, *ends, kind="sum")
 
 
 # Slopes at one point do not distinguish a product from a sum: La + Lb has the slope of La Lb if
@@ -175,15 +300,15 @@ class Valley(NamedTuple):
         return Point({n: float(v) for n, v in zip(names, values, strict=True)}, excess, expected)
 
     def determined_combinations(
-        self, null: Sequence[np.ndarray], spread: Spread, unknowns: tuple[Unknown, ...]
+        self, null: Sequence[np.ndarray], covariance: np.ndarray, unknowns: tuple[Unknown, ...]
     ) -> tuple[Combination, ...]:
         """Return the products of powers, else the sums, that are constant along null directions,
         at the optimum and far from it."""
         params = self.problem.model.Params
         units = {u.name: naming.unit(params, u.name) for u in unknowns if u.is_parameter}
         found = [
-            *combinations(null, spread, unknowns),
-            *combinations(null, spread, unknowns, units),
+            *combinations(null, covariance, unknowns),
+            *combinations(null, covariance, unknowns, units),
         ]
         points = self._far_points(null, unknowns) if found else []
         stays = [c for c in found if _stays(c, unknowns, points)]
@@ -239,6 +364,8 @@ def _stays(
 
 _APART = 9.0
 """squares predicted by the slopes below which two solutions are one"""
+_COMPENSATED = 0.2
+"""excess over the squares predicted by the slopes above which nothing compensates an exchange"""
 _CHANGED = 0.05
 """relative change of a parameter that counts"""
 _RATIO = 1.1
@@ -247,8 +374,6 @@ _MAKES = 0.05
 """smallest singular value over the largest, and smallest logarithm, of an exchange"""
 _REACH = math.log(300.0)
 """largest change of a parameter's logarithm"""
-_VISITS = 3
-"""searches of all unknowns after an exchange"""
 _DIFFERENCE = 1e-5
 """relative step of a parameter"""
 
@@ -271,21 +396,15 @@ def second_solutions(
         return ()
     valley, solutions = Valley(problem, at, e), []
     for held in _exchanged_modes(problem, here):
-        # First with the exchanged values held, then all together until they settle.
-        before, point = here, valley.visit(held, {}, same=not optimum, priors=True)
-        for _ in range(_VISITS):
-            if point is None:
-                break
-            before = {n: point.values[n] for n in here}
-            point = valley.visit({}, before, same=not optimum, priors=True)
-            if point is not None and all(_alike(v, point.values[n]) for n, v in here.items()):
-                break
+        # First with the exchanged values held, then all together.
+        point = valley.visit(held, {}, same=not optimum, priors=True)
+        if point is not None and point.excess <= _COMPENSATED * point.expected:
+            guess = {n: point.values[n] for n in here}
+            point = valley.visit({}, guess, same=not optimum, priors=True)
         # A point within the interval by the slopes is no other solution.
         if point is None or not (point.excess <= SAME and point.expected > _APART):
             continue
         there = {n: point.values[n] for n in here}
-        if not all(map(_alike, before.values(), there.values())):
-            continue
         changed = tuple(n for n, v in here.items() if not _alike(v, there[n]))
         known = (all(map(_alike, s.values.values(), there.values())) for s in solutions)
         if changed and not any(known):

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.special
 
 from heli_jax.identification.estimation.evaluation import Evaluation, pseudoinverse
-from heli_jax.identification.identifiability.analysis import unknowns_of
+from heli_jax.identification.estimation.levenberg_marquardt import measured_count
 from heli_jax.identification.identifiability.equivalents import (
     Rows,
     descend,
@@ -154,7 +154,7 @@ def profile_wide_intervals(
     J[:, [i for i, n in enumerate(verdict.names) if n in lacking]] = 0.0
     wide = [
         (i, u)
-        for i, u in enumerate(unknowns_of(problem, at.layout, e))
+        for i, u in enumerate(verdict.unknowns)
         if not (u.name in lacking or u.at_bound or reaches[i] >= _INFLATED * Z95)
         and _is_wide(problem, u, float(sds[i] * reaches[i]))
     ]

@@ -129,7 +129,7 @@ class Verdict:
     """(q, q) in relative coordinates, without the null directions"""
     correlation: np.ndarray
     prior_share: dict[str, float]
-    """share (P R P)_ii / P_ii of the posterior variance P that all priors, whose information is R,
+    """share (P R P)_ii / P_ii of the posterior variance P that the priors, whose information is R,
     explain; 1 if the data have no information"""
     groups: tuple[Group, ...]
     """of parameters that are not identifiable"""

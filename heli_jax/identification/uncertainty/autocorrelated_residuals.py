@@ -126,7 +126,7 @@ def _part(
     return _Part(meat, variance, np.maximum(freedom, 1.0))
 
 
-def residual_curvature(at: Solution) -> Float[np.ndarray, "q q"]:
+def residual_curvature(at: Solution, J: Float[np.ndarray, "n q"]) -> Float[np.ndarray, "q q"]:
     """Return the sum of r_k r_k'', which the Hessian of r'r/2 has beside J'J, (q, q).
 
     By central differences of J'r along the unknowns of interest; zero if it is not finite. For a
@@ -134,7 +134,6 @@ def residual_curvature(at: Solution) -> Float[np.ndarray, "q q"]:
     and dead bands.
     """
     least = float(np.finfo(np.asarray(at.z).dtype).eps) ** 0.25
-    _, J = rows_at(at, at.z)
     q, k = J.shape[1], len(at.layout.of_interest)
     curvature = np.zeros((q, q))
     steps = np.full(k, least)

@@ -19,7 +19,7 @@ from heli_jax.identification.estimation.multistart import Search
 from heli_jax.identification.estimation.noise_covariance import relax_noise_covariance
 from heli_jax.identification.result import Fit
 from heli_jax.identification.uncertainty.autocorrelated_residuals import drawn
-from heli_jax.identification.unknowns.layout import Data, Layout, Solution, unpack, value_of
+from heli_jax.identification.unknowns.layout import Data, Solution, unpack, value_of
 
 _STEPS = 200
 """steps of the optimiser in frequency, at most"""
@@ -131,8 +131,9 @@ def _fit_by_lines(
     unknowns and convergence."""
     z, converged = [], []
     begun = Optimum(at.z, 0.0, 0, True)
+    problem: Any = None  # the search needs none from an optimum
     for mean, data in zip(means, _spectrum_records(at, rng), strict=False):
-        search = _FromOptimum(at.layout, data._replace(prior_mean=mean))
+        search = Search(problem, at.layout, data._replace(prior_mean=mean), _STEPS)
         # The outer stage counts records.
         with stages.stage("one record", shown=False):
             best = relax_noise_covariance(search, at.noise, begun).best
@@ -140,15 +141,6 @@ def _fit_by_lines(
         converged.append(bool(best.converged))
         stages.advance()
     return np.array(z), np.array(converged)
-
-
-class _FromOptimum(Search):
-    """The search in the final coordinates of a fit, with other data."""
-
-    def __init__(self, layout: Layout, data: Data) -> None:
-        self.problem: Any = None
-        self.layout = layout
-        self.data, self.max_steps = data, _STEPS
 
 
 def _spectrum_records(at: Solution, rng: np.random.Generator) -> Iterator[Data]:

@@ -39,7 +39,9 @@ class Convergence(NamedTuple):
     """Agreement of the chains on one parameter."""
 
     rhat: float
+    """potential scale reduction (Gelman and Rubin); 1 where the chains agree"""
     effective: float
+    """effective number of draws"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,19 +50,25 @@ class Posterior:
 
     draws: dict[str, np.ndarray]
     """by free parameter, (chains, draws)"""
-    rhat: float
-    """the largest potential scale reduction (Gelman and Rubin); 1 where the chains agree"""
-    effective: float
-    """the smallest effective number of draws"""
-    divergent: int
-    convergence: dict[str, Convergence] = field(default_factory=dict)
+    convergence: dict[str, Convergence]
     """by free parameter, in the optimiser's coordinates"""
+    divergent: int
     nuisance: dict[str, np.ndarray] = field(default_factory=dict)
     """draws of the other unknowns by the names of `Fit.nuisance`, and of 'noise factor OUTPUT'; the
     scale of the noise is integrated out"""
     statistics: dict[str, np.ndarray] = field(default_factory=dict)
     """by draw (chains, draws), by arviz' names: `diverging`, `energy`, `acceptance_rate`, `n_steps`
     (of the integrator), `tree_depth`, `lp` (log density but for a constant), `step_size`"""
+
+    @property
+    def rhat(self) -> float:
+        """Largest potential scale reduction."""
+        return max(c.rhat for c in self.convergence.values())
+
+    @property
+    def effective(self) -> float:
+        """Smallest effective number of draws."""
+        return min(c.effective for c in self.convergence.values())
 
     @property
     def trusted(self) -> bool:
@@ -204,10 +212,8 @@ def _posterior(
     agreed = [Convergence(float(r), float(n)) for r, n in zip(rhat, effective, strict=True)]
     return Posterior(
         {name: np.asarray(u.params[name]) for name in layout.free},
-        float(np.max(rhat)),
-        float(np.min(effective)),
-        int(np.sum(statistics["diverging"])),
         dict(zip(layout.free, agreed, strict=True)),
+        int(np.sum(statistics["diverging"])),
         {name: np.asarray(v) for name, v in nuisance.items()},
         statistics,
     )

@@ -130,7 +130,7 @@ def _by_slopes(
         # Rows that are weighed by the noise's spectrum allow for its colour.
         allowed = usable and not white and objective.noise_model == "spectrum"
         return StandardErrors(verdict, np.ones(layout.size), quantiles, allowed)
-    errors = sandwich(layout, at.data, e, residual_curvature(at))
+    errors = sandwich(layout, at.data, e, residual_curvature(at, np.asarray(e.J, np.float64)))
     quantiles = np.maximum(errors.quantile, quantile)
     # The analysis takes 1.96 standard deviations for a 95 % interval.
     k = len(layout.of_interest)
