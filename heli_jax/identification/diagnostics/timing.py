@@ -1,6 +1,5 @@
 """Findings on sampling rates, and on signals at another time than in the log."""
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -88,22 +87,6 @@ def loop_between_samples(c: Context) -> Iterator[Finding]:
                 )
 
 
-def modes_past_nyquist(c: Context) -> Iterator[Finding]:
-    """Find modes that the samples cannot show, whose aliases fit equally well."""
-    for mode in c.fast_modes:
-        yield found(
-            "timing.mode-past-nyquist",
-            "doubt",
-            mode.flight,
-            value=mode.frequency,
-            distrusts=mode.undetermined,
-            flight=mode.flight,
-            hz=mode.frequency / (2.0 * math.pi),
-            nyquist=mode.nyquist,
-            nyquist_hz=mode.nyquist / (2.0 * math.pi),
-        )
-
-
 def rates_enough(c: Context) -> Iterator[Finding]:
     """Compare rates of inputs and outputs with the fastest mode that matters."""
     if c.fitted:
@@ -125,39 +108,36 @@ def of_rates(
     """
     where = "start values" if params is None else "estimates"
     params = problem.start_params() if params is None else params
-    enough: list[tuple[float, Finding]] = []
-    bad: list[Finding] = []
     training = problem.training
-    for label, flight, noise in zip(labels(training), training, sd, strict=True):
-        for one in rates_against_modes(problem, params, flight, noise):
-            severity: Severity = "doubt"
-            if one.samples >= RATE.enough:
-                severity = "ok"
-            elif one.samples < one.least:
-                severity = "refuse"
-            finding = found(
-                "timing.logging-rate",
-                severity,
-                value=one.samples,
-                flight=label,
-                signals=one.signals,
-                rate=one.hz,
-                hz=one.mode.hz,
-                output=one.mode.output,
-                where=where,
-                low="" if severity == "ok" else f"{RATE.enough * one.mode.hz:.3g} Hz",
-                enough=RATE.enough,
-                least=one.least,
-            )
-            bad += [finding] if finding.bad else []
-            enough += [(one.samples, finding)]
-    yield from bad or (f for _, f in sorted(enough, key=lambda pair: pair[0])[:1])
+    rates = [
+        (label, one)
+        for label, flight, noise in zip(labels(training), training, sd, strict=True)
+        for one in rates_against_modes(problem, params, flight, noise)
+    ]
+    low = [(label, one) for label, one in rates if one.samples < RATE.enough]
+    for label, one in low or sorted(rates, key=lambda pair: pair[1].samples)[:1]:
+        severity: Severity = "ok"
+        if low:
+            severity = "refuse" if one.samples < one.least else "doubt"
+        yield found(
+            "timing.logging-rate",
+            severity,
+            value=one.samples,
+            flight=label,
+            signals=one.signals,
+            rate=one.hz,
+            hz=one.mode.hz,
+            output=one.mode.output,
+            where=where,
+            low=f"{RATE.enough * one.mode.hz:.3g} Hz" if low else "",
+            enough=RATE.enough,
+            least=one.least,
+        )
 
 
 DIAGNOSTICS = (
     signals_shifted,
     loop_between_samples,
-    modes_past_nyquist,
     rates_enough,
 )
 """Diagnostics of timing, causes first."""
