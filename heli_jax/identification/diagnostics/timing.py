@@ -24,10 +24,6 @@ _CODES = {
     "response": "timing.late-response",
     "hold": "timing.likelier-hold",
 }
-_NAMED = 3
-"""Largest number of parameters in a sentence."""
-_SEEN = 1e-3
-"""Least relative change of a parameter that is named; with a prior alone it is rounding."""
 
 
 def signals_shifted(c: Context) -> Iterator[Finding]:
@@ -41,9 +37,6 @@ def signals_shifted(c: Context) -> Iterator[Finding]:
     closer = any(x.drive.kind == "input" and x.gain > one.gain for x in c.unmodelled[0])
     if one.kind == "response" and closer:
         return
-    parts = {n: v / c.named[n] for n, v in one.moved.items() if c.named[n]}
-    most = sorted(parts, key=lambda n: -abs(parts[n]))[:_NAMED]
-    shown = [n for n in most if n == most[0] or abs(parts[n]) >= _SEEN]
     yield found(
         _CODES[one.kind],
         "doubt",
@@ -53,7 +46,6 @@ def signals_shifted(c: Context) -> Iterator[Finding]:
         names=one.names,
         ms=1e3 * one.seconds,
         gain=one.gain,
-        moves=[f"{n} by {100 * parts[n]:+.2g} %" for n in shown],
         limit=SHIFT.clear,
     )
 
