@@ -1,4 +1,4 @@
-"""Results of fits to sixty records with a known fault and forty without.
+"""Results of fits to seventy-five records with a known fault and forty without.
 
     .venv/bin/python experiments/misfits.py [--quick] [--only WORDS] [--size N]
 
@@ -71,6 +71,8 @@ class Roll(NamedTuple):
     actuator: Callable[[np.ndarray], np.ndarray] = lambda d: d
     lag: float = 0.0
     """Time constant of a servo [s]."""
+    slew: float = 0.0
+    """Largest rate of the servo [1/s]; 0 for any rate."""
     drag: float = 0.0
     """Factor of -drag p |p| [1/rad]."""
     gust: float = 0.0
@@ -130,9 +132,10 @@ def flown(roll: Roll, rng: np.random.Generator, seconds: float = SECONDS) -> Rec
             held = asked[k] - roll.feedback * (p + NOISE * white[k] * (k % EVERY == 0))
         d[k], P[k], PHI[k] = held, seen, phi
         # In the middle of a step, a moving stick is at the mean of its ends.
-        moved = 0.5 * (asked[min(k + 1, n - 1)] - asked[k]) if roll.smooth else 0.0
-        u = float(roll.actuator(np.asarray(held + moved)))
-        servo += H / roll.lag * (u - servo) if roll.lag else u - servo
+        half_step = 0.5 * (asked[min(k + 1, n - 1)] - asked[k]) if roll.smooth else 0.0
+        u = float(roll.actuator(np.asarray(held + half_step)))
+        moved = H / roll.lag * (u - servo) if roll.lag else u - servo
+        servo += np.clip(moved, -H * roll.slew, H * roll.slew) if roll.slew else moved
         gust = decay * gust + shaping * white[k - 1]
         drive = servo
         if roll.mode:
@@ -190,6 +193,18 @@ def one(roll: Roll, *outputs: str, **more: Any) -> Make:
     def make(rng: np.random.Generator) -> Case:
         hold, dt = more.get("hold", "zero-order"), more.get("dt", DT)
         return Case(problem(flight(flown(roll, rng), *outputs, hold=hold, dt=dt)), TRUTH)
+
+    return make
+
+
+def late_output(name: str, *outputs: str) -> Make:
+    """Return a function that makes a flight with an output that is logged four samples late."""
+
+    def make(rng: np.random.Generator) -> Case:
+        r = flown(Roll(), rng)
+        y = getattr(r, name)
+        r = r._replace(**{name: np.concatenate([np.full(4, y[0]), y[:-4]])})
+        return Case(problem(flight(r, *outputs)), TRUTH)
 
     return make
 
@@ -259,6 +274,12 @@ UNSOUND: dict[str, Make] = {
     "strong gusts": one(Roll(gust=60.0), "p", "phi"),
     "angle that wanders": wandering,
     "servo of 60 ms in gusts": one(Roll(lag=0.06, gust=5.0), "p"),
+    "output p logged 80 ms late": late_output("p", "p"),
+    "output phi logged 80 ms late": late_output("phi", "p", "phi"),
+    "servo that saturates in rate": one(Roll(slew=2.5), "p"),
+    "servo that saturates in rate, smooth stick": one(
+        Roll(slew=2.5, smooth=True), "p", hold="linear"
+    ),
 }
 
 

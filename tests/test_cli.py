@@ -78,10 +78,6 @@ def test_fit_writes_a_whole_run_directory(bench, capsys):
     assert result["status"] == "converged"
     assert result["identifiable"] is True
     assert (result["adequate"], result["exit_code"]) == (True, 0)
-    # The gusts of this short record are larger than the response.
-    assert ["roll"] in [
-        f["subjects"] for f in result["findings"] if f["code"] == "adequacy.disturbance-hides"
-    ]
     assert result["adequacy"]["judged"][0]["output"] == "roll"
     assert {c["name"] for c in result["determined_combinations"]} == {"a/Ixx", "a/If"}
     assert result["parameters"]["a"]["prior_share"] > 0.95

@@ -16,7 +16,6 @@ from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.diagnostics.excitation import (
     NOTHING_FOLLOWS,
     gusts_guessed,
-    inputs_together,
     nothing_follows,
 )
 from heli_jax.identification.diagnostics.timing import of_rates, rates_enough
@@ -109,7 +108,7 @@ def context_of(problem: Problem, guess: FirstGuess | None = None) -> Context:
     second = second_solutions(problem, at, guess.e, optimum=False)
     around = Around(second=second, valley=Valley(problem, at, guess.e))
     verdict = verdict_of(problem, guess.layout, guess.e, around)
-    return Context(problem, at, guess.e, guess.e, verdict)
+    return Context(problem, at, guess.e, verdict)
 
 
 def rates(problem: Problem) -> tuple[Finding, ...]:
@@ -134,10 +133,10 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
     guess = _with_likely_gusts(problem)
     at = Solution(*guess[:4])
     ranking = rank_windows(problem, at, guess.e, length)
-    c = Context(problem, at, guess.e, guess.e, verdict_of(problem, guess.layout, guess.e))
+    c = Context(problem, at, guess.e, verdict_of(problem, guess.layout, guess.e))
     notes = tuple(gusts_guessed(c))
     # A record that is mostly at rest may still have a good window.
-    asked = (rates_enough, nothing_follows, inputs_together)
+    asked = (rates_enough, nothing_follows)
     record = tuple(
         f._replace(severity="doubt") if f.code == NOTHING_FOLLOWS else f
         for diagnostic in asked
@@ -201,7 +200,7 @@ def _where_ended(
 
     def context() -> Context:
         at = Solution(layout, data, optimum.noise, optimum.best.z)
-        return Context(problem, at, e, guess.e, before, optimum)
+        return Context(problem, at, e, before, optimum)
 
     c = context()
     if c.rounding:

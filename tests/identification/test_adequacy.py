@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from heli_jax import Flight, Free, Problem
 from heli_jax.finding import Distrust, Finding, distrusted, exit_code, weighed
 from heli_jax.identification.diagnostics import adequacy
 from heli_jax.identification.diagnostics.context import HeldOut
-from heli_jax.identification.validation.adequacy import Evidence, Record, assess
+from heli_jax.identification.validation.adequacy import assess
 from heli_jax.identification.validation.metrics import metrics, whiteness
-from tests.identification.lag import LAG, Params, response
+from tests.identification.lag import response
 
 N, DT = 400, 0.05
 
@@ -26,20 +25,11 @@ SLOW /= SLOW.std()
 
 
 def judged(measured, simulated, *, against=None, ahead=None):
-    params = Params(-2.0, 5.0)
-    flight = Flight(dt=DT, inputs={"d": D}, outputs={"p": measured})
-    problem = Problem(LAG, params, [flight], {"Lp": Free(-2.0)})
-    record = Record("flight 1", {"p": measured}, {"p": simulated})
+    pairs = [({"p": measured}, {"p": simulated})]
+    agreement = {"p": metrics(measured, simulated)}
     white = {"flight 1/p": whiteness(measured - simulated)}
     against = None if against is None else {"p": against}
-    evidence = Evidence(
-        (record,),
-        {"p": metrics(measured, simulated)},
-        white,
-        against,
-        ahead=ahead,
-    )
-    return Judged(problem, assess(problem, params, evidence))
+    return Judged(assess(pairs, agreement, white, against, ahead))
 
 
 class Judged:
@@ -47,13 +37,12 @@ class Judged:
 
     fitted, free = True, ("Lp",)
 
-    def __init__(self, problem, adequacy):
-        self.problem, self.adequacy = problem, adequacy
+    def __init__(self, adequacy):
+        self.adequacy = adequacy
 
     @property
     def findings(self):
-        asked = (adequacy.outputs_explained, adequacy.outputs_unmoved)
-        return [f for one in (*asked, adequacy.simulation_as_expected) for f in one(self)]
+        return list(adequacy.outputs_explained(self))
 
 
 def denied(found):
@@ -70,10 +59,6 @@ def test_a_good_fit_with_coloured_residuals_is_adequate():
     assert 0.97 < found.adequacy.judged[0].vaf < 0.99
     assert not found.adequacy.judged[0].white
     assert found.findings == []
-    worse = judged(P + 0.35 * P.std() * SLOW, P)
-    [low] = worse.findings
-    assert (low.code, low.severity, low.denies) == ("adequacy.below-gate", "note", False)
-    assert 0.8 < low.value < 0.9
     assert judged(P + 0.14 * P.std() * SLOW, P, against=1.0).findings == []
 
 
@@ -106,12 +91,12 @@ def test_filter_error_that_simulates_worse_than_the_mean_is_adequate_by_what_gus
     other = np.random.default_rng(9).standard_normal(N)
     found = judged(WHITE, 0.9 * other, against=1.2)
     assert not denied(found)
-    assert ("adequacy.disturbance-hides", ("p",)) in [(f.code, f.subjects) for f in found.findings]
+    assert found.adequacy.judged[0].vaf < 0
 
 
 def test_an_unstable_machine_is_judged_by_what_is_predicted_ahead():
     good = judged(P + 0.05 * WHITE, P, against=1.0, ahead=2.0)
-    assert [f.code for f in good.findings] == ["adequacy.judged-ahead"]
+    assert good.findings == []
     assert good.adequacy.ahead == 2.0
     assert judged(P + 5.0 * SLOW, P, against=20.0, ahead=2.0).adequacy.denied
 

@@ -23,7 +23,7 @@ def swept(n=4000, noise=0.02):
 
 def test_holes_hardly_change_what_follows():
     f = swept()
-    y, shares = f.outputs["phi"], []
+    y = f.outputs["phi"]
     sparse = np.full(y.size, np.nan)
     sparse[::5] = y[::5]
     for hole in (slice(0, 0), slice(0, 17), slice(2000, 2100)):
@@ -31,10 +31,8 @@ def test_holes_hardly_change_what_follows():
         cut[hole] = np.nan
         found = excitation_of(problem(replace(f, outputs={"phi": cut, "p": sparse})))
         # An output that is mostly missing is left out.
-        assert list(found.outputs) == ["phi"]
-        shares.append(found.outputs["phi"].explained)
-    np.testing.assert_allclose(shares, shares[0], atol=0.15)
-    assert shares[0] > 0.8
+        assert list(found) == ["phi"]
+        assert found["phi"] < 1e-10
 
 
 def test_modes_that_do_not_swing_ask_for_a_rate_too():
@@ -59,19 +57,3 @@ def test_modes_that_do_not_swing_ask_for_a_rate_too():
         [guessed] = of_rates(replace(asked, flights=(replace(slow, sd={}),)), [{"phi": 1.0}])
         assert guessed.severity == severity
         assert not list(of_rates(asked, [{"phi": 1.0}]))
-
-
-def test_flights_in_which_the_sticks_rest_say_nothing_of_whether_they_move_together():
-    rng = np.random.default_rng(0)
-    sos = scipy.signal.butter(2, 1.5, fs=1 / DT, output="sos")
-
-    def moved(n, size):
-        u, v = size * scipy.signal.sosfilt(sos, rng.standard_normal((2, n)))
-        y = response(u, v)[0] + 1e-3 * rng.standard_normal(n)
-        return replace(flight(n=n), inputs={"u": u, "v": v}, outputs={"phi": y})
-
-    short = moved(500, 1.0)
-    for resting in (0, 8):
-        found = excitation_of(problem(short, *(moved(1500, 0.0) for _ in range(resting))))
-        [together] = found.pairs
-        assert together.coherence < 0.5

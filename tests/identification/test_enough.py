@@ -1,7 +1,6 @@
 """Sufficiency of logs: each defect is found, and only where it is."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -14,10 +13,8 @@ from heli_jax.dynamics.onboard.filters import Filter
 from heli_jax.flights import Signal, read_flight
 from heli_jax.flights.signal_facts import quantum, signal_facts
 from heli_jax.identification.design.next_flight import plan_next_flight
-from heli_jax.identification.diagnostics import excitation
 from heli_jax.identification.diagnostics.timing import of_rates
-from heli_jax.identification.fit import check
-from heli_jax.identification.validation.excitation import excitation_of
+from heli_jax.identification.fit import check, fit
 from heli_jax.identification.validation.logging_rate import input_rate
 from heli_jax.models import with_filters
 from heli_jax.naming import Scalar
@@ -92,16 +89,6 @@ def problem(*flights, **more):
     return Problem(SWING, TRUTH, flights, FREE, Nuisance(bias=False), **more)
 
 
-def found_of(diagnostic, *flights, sd=1.0):
-    """Return the findings of one diagnostic of records, before a fit."""
-    named = [(f"flight {i}", f) for i, f in enumerate(flights)]
-    noise = {f"{label}/{n}": sd for label, f in named for n in f.outputs}
-    found = excitation_of(problem(*flights))
-    return list(
-        diagnostic(SimpleNamespace(flights=named, fitted=False, noise=noise, excitation=found))
-    )
-
-
 def rails(x):
     return signal_facts(DT * np.arange(x.size), x).shares
 
@@ -139,56 +126,15 @@ def test_steps_of_the_log_are_held_against_the_noise():
     assert quantum(coarse) == pytest.approx(0.04 * np.pi / 180)
 
 
-def test_sticks_that_move_together_are_named_with_their_coherence():
-    rng, f = np.random.default_rng(0), flight(3, 4000, still=False)
-    u, n = f.inputs["u"], 4000
-    mixed = 0.6 * u + 0.005 * rng.standard_normal(n)
-    (found,) = found_of(excitation.inputs_together, replace(f, inputs={"u": u, "v": mixed}))
-    assert (found.code, found.severity) == ("excitation.inputs-together", "doubt")
-    _, c = scipy.signal.coherence(u, mixed, 1 / DT, nperseg=400)
-    power = scipy.signal.welch(u, 1 / DT, nperseg=400)[1]
-    other = scipy.signal.welch(mixed, 1 / DT, nperseg=400)[1]
-    weights = np.minimum(power / power.sum(), other / other.sum())
-    assert found.value == pytest.approx(np.average(c, weights=weights), abs=0.05)
-    # A second flight in which one input moves alone separates them.
-    alone = replace(f, inputs={"u": steps(rng, n), "v": np.zeros(n)})
-    (pair,) = excitation_of(problem(replace(f, inputs={"u": u, "v": u}), alone)).pairs
-    assert pair.coherence < 0.8
-
-
-@pytest.mark.parametrize("n", [600, 3000])
-def test_sticks_that_move_apart_are_no_alarm(n):
-    records = (flight(seed, n, still=False) for seed in range(25))
-    assert sum(bool(found_of(excitation.inputs_together, f)) for f in records) <= 1
-
-
-def test_the_band_that_a_stick_excites():
-    rng, n = np.random.default_rng(0), 6000
-    sos = scipy.signal.butter(6, [0.5, 2.0], "band", fs=1 / DT, output="sos")
-    u = scipy.signal.sosfilt(sos, rng.standard_normal(n))
-    phi, _ = response(u, np.zeros(n))
-    y = phi + 0.05 * np.std(phi) * rng.standard_normal(n)
-    f = replace(flight(n=n), inputs={"u": u, "v": np.zeros(n)}, outputs={"phi": y})
-    (found,) = found_of(excitation.excited_bands, f)
-    assert (found.code, found.severity) == ("excitation.excited-band", "ok")
-    assert excitation_of(problem(f)).powers["u"] == pytest.approx((0.5, 2.0), rel=0.2)
-    noise = replace(f, outputs={"phi": 0.1 * rng.standard_normal(n)})
-    # A doubt has no tick beside it.
-    assert not found_of(excitation.excited_bands, noise)
-    assert excitation_of(problem(noise)).outputs["phi"].explained < 0.05
-
-
 def test_the_rate_of_an_input_that_moved_between_its_samples():
     n, k = 4000, 10
     t = np.arange(n) * 0.01
     smooth = scipy.signal.chirp(t, 0.1, 40.0, 2.0)
     stairs = np.repeat(smooth[::k], k)
-    line = np.interp(t, t[::k], smooth[::k])
     rates = []
     for u, hold, reason in (
         (smooth, "linear", {"u": "moves"}),
         (stairs, "zero-order", {"u": "jumps"}),
-        (line, "linear", {"u": "moves"}),
         (stairs, "zero-order", {}),
         (steps(np.random.default_rng(0), n), "zero-order", {"u": "jumps"}),
         (np.repeat(np.tile([0.0, 1.0, -1.0, 0.0], 25), 40), "zero-order", {"u": "jumps"}),
@@ -198,7 +144,7 @@ def test_the_rate_of_an_input_that_moved_between_its_samples():
             dt=0.01, inputs={"u": u}, outputs={"phi": smooth}, hold={"u": hold}, hold_reason=reason
         )
         rates.append(input_rate(f, "u", u))
-    assert rates == [100.0, pytest.approx(10.0), pytest.approx(10.0), None, None, None, None]
+    assert rates == [100.0, pytest.approx(10.0), None, None, None, None]
 
 
 @pytest.mark.parametrize("rate", [9.8, 80.0])
@@ -216,10 +162,6 @@ def test_the_rate_of_an_input_is_that_of_its_own_clock(tmp_path, rate):
         rate=100.0,
     )
     assert input_rate(f, "u", f.inputs["u"]) == pytest.approx(rate, rel=0.01)
-    # If the log was interpolated to the grid before, only slow straight lines show it.
-    if rate < 40:
-        alone = replace(f, source=None)
-        assert input_rate(alone, "u", f.inputs["u"]) == pytest.approx(rate, rel=0.01)
     found = flight_responses([f], Settings(band=(0.5, 45.0)))
     hz, H = found.omega / (2 * np.pi), found.outputs["p"].pairs["u"].H
     assert hz[np.isfinite(H)].max() == pytest.approx(min(rate / 2, 45.0), rel=0.05)
@@ -244,7 +186,20 @@ def in_gusts(seed, n=2000, vaf=0.2):
     return u, phi + gust * phi.std() / gust.std() * np.sqrt(1.0 / vaf - 1.0)
 
 
-@pytest.mark.parametrize(("made", "refused"), [(on_the_ground, True), (in_gusts, False)])
+def at_rest(seed, n=2000):
+    """A stick that moves nothing, and noise."""
+    rng = np.random.default_rng(seed)
+    return steps(rng, n), 0.05 * rng.standard_normal(n)
+
+
+def test_a_rate_loop_on_the_ground_is_no_response():
+    u, phi = on_the_ground(2)
+    f = Flight(dt=DT, inputs={"u": u, "v": np.zeros(u.size)}, outputs={"phi": phi})
+    found = fit(problem(f))
+    assert found.exit_code == 3
+
+
+@pytest.mark.parametrize(("made", "refused"), [(at_rest, True), (in_gusts, False)])
 def test_where_no_output_follows_any_input_nothing_is_determined(made, refused):
     u, phi = made(2)
     f = Flight(dt=DT, inputs={"u": u, "v": np.zeros(u.size)}, outputs={"phi": phi})
@@ -294,8 +249,8 @@ def test_what_to_fly_next_does_what_is_promised():
 
 def test_findings_stand_once():
     result = check(problem(flight(0, 2000, still=False)))
-    codes = {f.code for f in result.findings}
-    assert "excitation.excited-band" in codes
+    codes = [f.code for f in result.findings]
+    assert len(codes) == len(set(codes))
     assert not any(f.bad for f in result.findings)
 
 

@@ -14,7 +14,6 @@ from heli_jax import config as configuration
 from heli_jax.config.logs import read_flights
 from heli_jax.flights.flight import Signal, Source
 from heli_jax.identification.diagnostics import quality, units
-from heli_jax.identification.validation.signal_signs import angle_over_rate, oversized
 
 TREX = Path(__file__).parents[3] / "shared" / "data" / "trex550"
 DT, N = 0.02, 1000
@@ -164,7 +163,7 @@ def test_a_roll_that_was_flown_is_no_wrong_unit(every):
 def test_nothing_is_wrong_with_the_sticks_and_angles_of_a_real_log(name):
     log = np.genfromtxt(TREX / name, delimiter=",", names=True)
     for angle, rate in (("phi", "p"), ("theta", "q"), ("psi", "r")):
-        ratio = angle_over_rate(log[angle], log[rate], 0.01)
+        ratio = units.angle_over_rate(log[angle], log[rate], 0.01)
         assert ratio is None or ratio.factor > 0
 
 
@@ -179,13 +178,13 @@ def test_the_shaft_of_a_motor_may_turn(load):
     )
     # It is neither an attitude nor a body rate, so its plausible speed is unknown.
     motor = dataclasses.replace(models.roll_on_stand, axes=(), Params=Motor)
-    assert list(oversized(motor, renamed)) == []
-    # The angle of a pendulum that goes over the top is not an attitude either, whatever its name.
+    assert list(units.in_degrees(motor, "", renamed)) == []
+    # Nor is the angle of a pendulum that goes over the top an attitude, whatever it is called.
     turning = {"phi": Signal("phi", "rad", "rad")}
     flight = Flight(
         dt=DT, inputs={"lat": U}, outputs={"phi": 6.0 * T}, source=Source("a", "", outputs=turning)
     )
     swing = dataclasses.replace(motor, axes=ROLL_AXES, linear=False)
-    assert list(oversized(swing, flight)) == []
+    assert list(units.in_degrees(swing, "", flight)) == []
     helicopter = dataclasses.replace(swing, Params=models.roll_on_stand.Params)
-    assert [one[-1] for one in oversized(helicopter, flight)] == [True]
+    assert [f.denies for f in units.in_degrees(helicopter, "", flight)] == [True]

@@ -35,38 +35,24 @@ DIAGNOSTICS: tuple[Diagnostic, ...] = (
     loop.weak_instruments,
     dynamics.unmodelled_dynamics,
     dynamics.inputs_ask_otherwise,
-    adequacy.outputs_follow_excitation,
     adequacy.outputs_explained,
     adequacy.responses_explained,
     adequacy.residual_follows_excitation,
-    adequacy.outputs_unmoved,
-    adequacy.simulation_as_expected,
     adequacy.held_out_predicted,
     noise.residuals_white,
-    noise.residuals_correlated,
     noise.disturbance_shows,
-    search.search_told,
+    search.search_notes,
     search.prior_contradicted,
     search.profile_intervals,
     search.band_unused,
 )
 """All diagnostics, causes first: among equally severe findings this order decides."""
 
-MOOT: dict[str, tuple[str, ...]] = {
-    "units.in-doubt": ("signs.rate-against-angle",),
-    "signs.against-start": ("signs.rate-against-angle",),
-    "timing.mode-past-nyquist": ("timing.logging-rate",),
-}
-"""Codes that replace a finding if they are more than a note, since they are more certain."""
-
 
 def diagnose(c: Context) -> tuple[Finding, ...]:
     """Return all findings at a point, the most severe first."""
     findings = once(weighed((f for d in DIAGNOSTICS for f in d(c)), c.estimates))
-    sure = {f.code for f in findings if f.bad}
-    # Keep every finding that changes the conclusion on a fit.
-    kept = [f for f in findings if f.denies or f.distrusts or not sure & set(MOOT.get(f.code, ()))]
-    return tuple(sorted(kept, key=lambda f: _rank(f, c)))
+    return tuple(sorted(findings, key=lambda f: _rank(f, c)))
 
 
 def _rank(f: Finding, c: Context) -> int:

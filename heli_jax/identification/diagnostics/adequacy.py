@@ -9,7 +9,6 @@ from heli_jax.identification.agreement import pooled_metrics
 from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.validation.adequacy import (
     EXPLAINED,
-    GATE,
     WORSE,
 )
 from heli_jax.identification.validation.excitation import LEVEL
@@ -17,61 +16,21 @@ from heli_jax.identification.validation.excitation import LEVEL
 
 def outputs_explained(c: Context) -> Iterator[Finding]:
     """Find outputs that the simulation, or predictions ahead, do not explain."""
-    if not c.fitted or c.adequacy.by_chance:
-        return
-    doubted = [o for o in c.adequacy.judged if not o.adequate or o.doubtful]
-    for output in doubted:
+    for output in c.adequacy.judged if c.fitted else ():
+        if output.adequate:
+            continue
         yield found(
-            "adequacy.below-gate" if output.adequate else "adequacy.output-not-explained",
-            "note" if output.adequate else "doubt",
+            "adequacy.output-not-explained",
+            "doubt",
             output.output,
             value=output.vaf,
-            denies=not output.adequate,
+            denies=True,
             output=output.output,
-            gate=GATE,
             expected=EXPLAINED,
-            explained=max(output.explained, 0.0),
             lag1=output.lag1,
             times=f"{np.sqrt(ratio):.2g}" if (ratio := output.against_disturbance) else "",
             ahead=f"up to {c.adequacy.ahead:g} s ahead" if c.adequacy.ahead else "",
         )
-
-
-def simulation_as_expected(c: Context) -> Iterator[Finding]:
-    """Find outputs with a low VAF that the estimated disturbance explains."""
-    if not c.fitted or c.adequacy.by_chance:
-        return
-    if c.adequacy.ahead is not None:
-        yield found(
-            "adequacy.judged-ahead",
-            "note",
-            seconds=c.adequacy.ahead,
-            outputs=[o.output for o in c.adequacy.judged],
-            vafs=[o.vaf for o in c.adequacy.judged],
-        )
-        return
-    for output in c.adequacy.judged:
-        if output.disturbed_below_mean:
-            yield found("adequacy.disturbance-hides", "note", output.output, value=output.vaf)
-
-
-def outputs_unmoved(c: Context) -> Iterator[Finding]:
-    """Find records without a response above the noise, and outputs that never move."""
-    if not c.fitted:
-        return
-    if c.adequacy.by_chance and c.adequacy.judged:
-        yield found(
-            "adequacy.by-chance",
-            "refuse",
-            *(o.output for o in c.adequacy.judged),
-            value=max(o.vaf for o in c.adequacy.judged),
-            denies=True,
-            distrusts=c.free,
-            vafs=[o.vaf for o in c.adequacy.judged],
-        )
-        return
-    for name in c.adequacy.still:
-        yield found("quality.never-moves", "doubt", name)
 
 
 def responses_explained(c: Context) -> Iterator[Finding]:
@@ -103,7 +62,8 @@ def residual_follows_excitation(c: Context) -> Iterator[Finding]:
     """Find residuals in frequency that still follow the excitation."""
     if not c.fitted or c.unrelated:
         return
-    level, failed = LEVEL / max(len(c.followed), 1), c.failed
+    level = LEVEL / max(len(c.followed), 1)
+    failed = {n: f for n, f in c.followed.items() if f.p_value < level}
     if failed:
         bad = any(not f.explained >= EXPLAINED for f in failed.values())
         least = min(f.p_value for f in failed.values())
@@ -118,27 +78,6 @@ def residual_follows_excitation(c: Context) -> Iterator[Finding]:
             explained=[max(f.explained, 0.0) for f in failed.values()],
             level=level,
         )
-
-
-def outputs_follow_excitation(c: Context) -> Iterator[Finding]:
-    """Find records in which no output follows the excitation.
-
-    A residual that does not follow it is then no sign of a good model.
-    """
-    if not c.unrelated:
-        return
-    least = min(c.unrelated.values())
-    yield found(
-        "excitation.no-output-follows",
-        "refuse",
-        *c.unrelated,
-        value=least,
-        denies=True,
-        distrusts=c.free,
-        what="excitation" if c.instruments else "inputs",
-        p_values=list(c.unrelated.values()),
-        level=LEVEL / len(c.unrelated),
-    )
 
 
 # Held-out flights.

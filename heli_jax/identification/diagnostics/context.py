@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from heli_jax.analysis.response_agreement import ResponseAgreement
@@ -21,6 +22,7 @@ from heli_jax.identification.estimation.filter_error import (
     predictions_ahead,
 )
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
+from heli_jax.identification.estimation.frequency_lines import errors_of_lines
 from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
 from heli_jax.identification.identifiability.equivalents import second_solutions
 from heli_jax.identification.identifiability.verdict import Verdict
@@ -35,14 +37,10 @@ from heli_jax.identification.uncertainty.estimates import (
 from heli_jax.identification.uncertainty.standard_errors import StandardErrors, standard_errors
 from heli_jax.identification.unknowns.layout import Solution, scales_of
 from heli_jax.identification.validation.adequacy import (
+    EXPECTED,
     Adequacy,
-    Evidence,
-    Record,
     assess,
-    inputs_explain_nothing,
     is_unstable,
-    joined_metrics,
-    misses,
 )
 from heli_jax.identification.validation.closed_loop_trust import (
     held_poles,
@@ -50,10 +48,9 @@ from heli_jax.identification.validation.closed_loop_trust import (
 )
 from heli_jax.identification.validation.excitation import (
     LEVEL,
-    Excitation,
     Followed,
+    errors_against_excitation,
     excitation_of,
-    residual_against_excitation,
 )
 from heli_jax.identification.validation.follows_response import Feedback, feedback_of
 from heli_jax.identification.validation.held_out import (
@@ -62,11 +59,10 @@ from heli_jax.identification.validation.held_out import (
     validate_in_frequency,
 )
 from heli_jax.identification.validation.logging_rate import (
-    FastMode,
-    fast_modes,
+    aliased_parameters,
     measurement_noise,
 )
-from heli_jax.identification.validation.metrics import Metrics, Whiteness
+from heli_jax.identification.validation.metrics import Metrics, Whiteness, metrics
 from heli_jax.identification.validation.unmodelled import Unmodelled, unmodelled
 from heli_jax.messages import sentence
 
@@ -91,8 +87,6 @@ class Context:
     at: Solution
     e: Evaluation
     """Evaluation at the point."""
-    start: Evaluation
-    """Evaluation at the start values."""
     before: Verdict
     """Identifiability at the start values."""
     optimum: RelaxedOptimum | None = None
@@ -130,11 +124,6 @@ class Context:
         """The vehicle with the values of the free parameters in place."""
         return self.problem.params_with({n: v for n, v in self.named.items() if n in self.free})
 
-    @cached_property
-    def excitation(self) -> Excitation:
-        """Frequencies that the inputs excite, and outputs that follow them."""
-        return excitation_of(self.problem)
-
     # Residuals of the record.
 
     @cached_property
@@ -152,20 +141,15 @@ class Context:
         """Whiteness of the innovations, or else of the residuals, by 'flight/output'."""
         return whiteness_of(self.signals, self.e, self.problem.training, self.at.layout)
 
-    @cached_property
-    def correlated(self) -> dict[str, float]:
-        """Correlation of the residuals by pair of outputs."""
-        return correlated_residuals(self.signals)
-
     @property
     def white(self) -> bool:
         """True if the residuals, or innovations, of each output are white."""
         return all(w.white for w in self.whiteness.values())
 
-    @property
+    @cached_property
     def independent(self) -> bool:
         """True if the residuals, or innovations, are white and not correlated between outputs."""
-        return self.white and not self.correlated
+        return self.white and not correlated_residuals(self.signals)
 
     # Feedback to the inputs.
 
@@ -222,13 +206,8 @@ class Context:
         objective = self.at.layout.objective
         if objective.noise_model != "spectrum" or objective.fits_responses:
             return {}
-        return residual_against_excitation(self.problem, self.at)
-
-    @property
-    def failed(self) -> dict[str, Followed]:
-        """Outputs of `followed` whose residual follows the excitation beyond chance."""
-        level = LEVEL / max(len(self.followed), 1)
-        return {n: f for n, f in self.followed.items() if f.p_value < level}
+        errors = jax.device_get(errors_of_lines(*self.at).errors)
+        return errors_against_excitation(self.problem.training, self.at, errors, self.instruments)
 
     @cached_property
     def expected_error(self) -> dict[str, float] | None:
@@ -251,7 +230,7 @@ class Context:
         expected = self.expected_error
         return expected is not None and (
             is_unstable(self.problem, self.params)
-            or (not self.problem.model.linear and self.white and misses(expected))
+            or (not self.problem.model.linear and self.white and max(expected.values()) > EXPECTED)
         )
 
     @cached_property
@@ -269,39 +248,46 @@ class Context:
 
     @cached_property
     def adequacy(self) -> Adequacy:
-        """Adequacy of the fitted outputs in time; empty for a fit in frequency."""
+        """Adequacy of the fitted outputs in time.
+
+        Empty for a fit in frequency, or if no output follows the excitation.
+        """
         if self.responses is not None or self.followed or self.unrelated:
             return Adequacy(by_chance=bool(self.unrelated))
-        return assess(self.problem, self.params, self._evidence)
+        if self.ahead:
+            return self._adequacy_ahead()
+        pairs = [(s.measured, s.simulated) for s in self.signals]
+        return assess(pairs, self.metrics, self.whiteness, self.expected_error)
 
     @cached_property
     def unrelated(self) -> dict[str, float]:
-        """Probability that each output follows the excitation by chance, in frequency.
+        """Probability that each output follows the excitation by chance.
 
-        Empty if any output follows it significantly.
+        Empty if any output follows it significantly, or if no input moves.
         """
-        if not (self.fitted and self.at.layout.noise_model == "spectrum"):
-            return {}
-        p_values = {n: f.p_value for n, f in self.excitation.outputs.items()}
+        p_values = excitation_of(self.problem)
         return {} if any(p < LEVEL / len(p_values) for p in p_values.values()) else p_values
 
-    @cached_property
-    def _evidence(self) -> Evidence:
-        if not self.ahead:
-            records = tuple(Record(s.flight, s.measured, s.simulated) for s in self.signals)
-            expected, unknowns = self.expected_error, self.at.layout.determined
-            return Evidence(records, self.metrics, self.whiteness, expected, unknowns)
-        # Predictions from the filter's states in place of a simulation.
-        records, error, expected = [], {}, {}
-        for (label, flight), ahead in zip(self.flights, predictions_ahead(self.at), strict=True):
-            predicted = {n: flight.outputs[n] - np.asarray(v) for n, v in ahead.error.items()}
-            records.append(Record(label, flight.outputs, predicted))
-            for n, v in ahead.error.items():
-                error[n] = error.get(n, 0.0) + float(np.nansum(np.square(v)))
-                expected[n] = expected.get(n, 0.0) + float(np.nansum(ahead.variance[n]))
-        agreement = {n: joined_metrics(n, records) for n in error}
-        against = {n: error[n] / expected[n] if expected[n] > 0 else np.inf for n in error}
-        return Evidence(tuple(records), agreement, self.whiteness, against, ahead=SECONDS)
+    def _adequacy_ahead(self) -> Adequacy:
+        """Return the adequacy of predictions from the filter's states, in place of a simulation."""
+        predictions = predictions_ahead(self.at)
+        pairs = [
+            (flight.outputs, {n: flight.outputs[n] - np.asarray(v) for n, v in p.error.items()})
+            for (_, flight), p in zip(self.flights, predictions, strict=True)
+        ]
+        error, expected, agreement = {}, {}, {}
+        for n in self.metrics:
+            have = [
+                (y[n], predicted[n], np.asarray(p.variance[n]))
+                for (y, predicted), p in zip(pairs, predictions, strict=True)
+                if n in y
+            ]
+            measured, predicted, variance = (np.concatenate(v) for v in zip(*have, strict=True))
+            agreement[n] = metrics(measured, predicted)
+            error[n] = float(np.nansum(np.square(measured - predicted)))
+            expected[n] = float(np.nansum(variance))
+        ratio = {n: error[n] / expected[n] if expected[n] > 0 else np.inf for n in error}
+        return assess(pairs, agreement, self.whiteness, ratio, ahead=SECONDS)
 
     # Estimates and their uncertainty.
 
@@ -311,32 +297,22 @@ class Context:
         return () if self.optimum is None else self.optimum.absent
 
     @cached_property
-    def fast_modes(self) -> list[FastMode]:
-        """Mode that a flight's samples cannot show, by flight, after a fit."""
-        if not self.fitted:
-            return []
-        noise = measurement_noise(self.problem, self.at.noise.sd)
-        modes = fast_modes(self.problem, self.named, noise)
-        return [mode for mode in modes if mode.undetermined]
-
-    @cached_property
     def errors(self) -> StandardErrors:
         """Standard errors of the estimates; none if the model explains nothing."""
+        noise = measurement_noise(self.problem, self.at.noise.sd)
         errors = standard_errors(
             self.problem,
             self.at,
             self.e,
             self.before,
             white=self.white if self.e.innovations else self.independent,
-            aliased=frozenset(n for mode in self.fast_modes for n in mode.undetermined),
+            aliased=aliased_parameters(self.problem, self.named, noise),
             second=second_solutions(self.problem, self.at, self.e) if self.arrived else (),
             optimum=self.arrived,
         )
-        if not self.arrived:
+        if not self.arrived or self.explains:
             return errors
-        verdict = inputs_explain_nothing(self.at, self.e, errors.verdict)
-        if self.explains:
-            return errors._replace(verdict=verdict)
+        verdict = errors.verdict
         outputs = [o.output for o in self.adequacy.judged]
         words = sentence("verdict.model-explains-nothing", names=verdict.names, outputs=outputs)
         return errors._replace(verdict=verdict.nothing(words), limits={})

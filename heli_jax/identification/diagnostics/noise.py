@@ -37,13 +37,6 @@ def residuals_white(c: Context) -> Iterator[Finding]:
     )
 
 
-def residuals_correlated(c: Context) -> Iterator[Finding]:
-    """Find correlated residuals of several outputs, for which the intervals allow."""
-    if c.fitted and c.errors.coloured and c.correlated:
-        pairs, rho = list(c.correlated), list(c.correlated.values())
-        yield found("noise.outputs-correlated", "note", *pairs, correlations=rho)
-
-
 def disturbance_shows(c: Context) -> Iterator[Finding]:
     """Find disturbances that were estimated and are not significant."""
     if c.optimum is None:

@@ -26,7 +26,7 @@ def search_stopped(c: Context) -> Iterator[Finding]:
         yield found(STOPPED, "doubt", value=float(sum(s for s, _ in c.optimum.trace)))
 
 
-def search_told(c: Context) -> Iterator[Finding]:
+def search_notes(c: Context) -> Iterator[Finding]:
     """Report notes of the search and of the method on the optimum."""
     if c.optimum is not None:
         names = [label for label, _ in c.flights]
@@ -65,9 +65,9 @@ def band_unused(c: Context) -> Iterator[Finding]:
 
 def log_cautions(c: Context) -> Iterator[Finding]:
     """Report cautions of the logs on signals that bias a fit, each sentence once."""
-    said: dict[str, Finding] = {}
+    by_sentence: dict[str, Finding] = {}
     flights = tuple(c.problem.flights)
     for label, flight in zip(labels(flights), flights, strict=True):
         for caution in flight.source.cautions if flight.source else ():
-            said.setdefault(caution.sentence, caution.of(label))
-    yield from said.values()
+            by_sentence.setdefault(caution.sentence, caution.of(label))
+    yield from by_sentence.values()

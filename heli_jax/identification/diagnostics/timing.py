@@ -1,6 +1,5 @@
 """Findings on sampling rates, and on signals at another time than in the log."""
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -25,10 +24,6 @@ _CODES = {
     "response": "timing.late-response",
     "hold": "timing.likelier-hold",
 }
-_NAMED = 3
-"""Largest number of parameters in a sentence."""
-_SEEN = 1e-3
-"""Least relative change of a parameter that is named; with a prior alone it is rounding."""
 
 
 def signals_shifted(c: Context) -> Iterator[Finding]:
@@ -42,9 +37,6 @@ def signals_shifted(c: Context) -> Iterator[Finding]:
     closer = any(x.drive.kind == "input" and x.gain > one.gain for x in c.unmodelled[0])
     if one.kind == "response" and closer:
         return
-    parts = {n: v / c.named[n] for n, v in one.moved.items() if c.named[n]}
-    most = sorted(parts, key=lambda n: -abs(parts[n]))[:_NAMED]
-    shown = [n for n in most if n == most[0] or abs(parts[n]) >= _SEEN]
     yield found(
         _CODES[one.kind],
         "doubt",
@@ -54,7 +46,6 @@ def signals_shifted(c: Context) -> Iterator[Finding]:
         names=one.names,
         ms=1e3 * one.seconds,
         gain=one.gain,
-        moves=[f"{n} by {100 * parts[n]:+.2g} %" for n in shown],
         limit=SHIFT.clear,
     )
 
@@ -88,22 +79,6 @@ def loop_between_samples(c: Context) -> Iterator[Finding]:
                 )
 
 
-def modes_past_nyquist(c: Context) -> Iterator[Finding]:
-    """Find modes that the samples cannot show, whose aliases fit equally well."""
-    for mode in c.fast_modes:
-        yield found(
-            "timing.mode-past-nyquist",
-            "doubt",
-            mode.flight,
-            value=mode.frequency,
-            distrusts=mode.undetermined,
-            flight=mode.flight,
-            hz=mode.frequency / (2.0 * math.pi),
-            nyquist=mode.nyquist,
-            nyquist_hz=mode.nyquist / (2.0 * math.pi),
-        )
-
-
 def rates_enough(c: Context) -> Iterator[Finding]:
     """Compare rates of inputs and outputs with the fastest mode that matters."""
     if c.fitted:
@@ -125,39 +100,36 @@ def of_rates(
     """
     where = "start values" if params is None else "estimates"
     params = problem.start_params() if params is None else params
-    enough: list[tuple[float, Finding]] = []
-    bad: list[Finding] = []
     training = problem.training
-    for label, flight, noise in zip(labels(training), training, sd, strict=True):
-        for one in rates_against_modes(problem, params, flight, noise):
-            severity: Severity = "doubt"
-            if one.samples >= RATE.enough:
-                severity = "ok"
-            elif one.samples < one.least:
-                severity = "refuse"
-            finding = found(
-                "timing.logging-rate",
-                severity,
-                value=one.samples,
-                flight=label,
-                signals=one.signals,
-                rate=one.hz,
-                hz=one.mode.hz,
-                output=one.mode.output,
-                where=where,
-                low="" if severity == "ok" else f"{RATE.enough * one.mode.hz:.3g} Hz",
-                enough=RATE.enough,
-                least=one.least,
-            )
-            bad += [finding] if finding.bad else []
-            enough += [(one.samples, finding)]
-    yield from bad or (f for _, f in sorted(enough, key=lambda pair: pair[0])[:1])
+    rates = [
+        (label, one)
+        for label, flight, noise in zip(labels(training), training, sd, strict=True)
+        for one in rates_against_modes(problem, params, flight, noise)
+    ]
+    low = [(label, one) for label, one in rates if one.samples < RATE.enough]
+    for label, one in low or sorted(rates, key=lambda pair: pair[1].samples)[:1]:
+        severity: Severity = "ok"
+        if low:
+            severity = "refuse" if one.samples < one.least else "doubt"
+        yield found(
+            "timing.logging-rate",
+            severity,
+            value=one.samples,
+            flight=label,
+            signals=one.signals,
+            rate=one.hz,
+            hz=one.mode.hz,
+            output=one.mode.output,
+            where=where,
+            low=f"{RATE.enough * one.mode.hz:.3g} Hz" if low else "",
+            enough=RATE.enough,
+            least=one.least,
+        )
 
 
 DIAGNOSTICS = (
     signals_shifted,
     loop_between_samples,
-    modes_past_nyquist,
     rates_enough,
 )
 """Diagnostics of timing, causes first."""

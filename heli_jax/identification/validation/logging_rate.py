@@ -20,7 +20,6 @@ from heli_jax.analysis.operating_point import OperatingPoint, operating_point
 from heli_jax.dynamics.onboard.filters import states_behind
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Problem
-from heli_jax.numerics.jumps import split
 from heli_jax.numerics.white_noise import white_part
 
 
@@ -40,8 +39,6 @@ class _Limits:
     """Least share of a staircase's steps with the usual length, for a slow clock."""
     slower: float = 1.05
     """Sample interval over the grid's, from which on a signal is slower than the grid."""
-    bends: int = 8
-    """Longest run of samples at which straight lines bend; in a longer run each is a sample."""
     levels: int = 10
     """Fewest distinct values of a staircase; commanded steps have fewer."""
     steps: int = 20
@@ -152,9 +149,9 @@ def rates_against_modes(
     rates = []
     for name, u in flight.inputs.items():
         rate = input_rate(flight, name, u)
-        felt = [mode for mode in modes if mode.input == name]
-        if rate is not None and felt:
-            rates.append(Rate((name,), rate, felt[-1], RATE.hopeless))
+        driven = [mode for mode in modes if mode.input == name]
+        if rate is not None and driven:
+            rates.append(Rate((name,), rate, driven[-1], RATE.hopeless))
     of = {y: output_rate(flight, y) for y in flight.outputs}
     fastest = max(of.values())
     # A decay has no alias, but it may end between two samples.
@@ -201,8 +198,7 @@ def input_rate(flight: Flight, name: str, u: Float[np.ndarray, " N"]) -> float |
     # The clock of a slower signal is known; the grid interpolates it by straight lines.
     slower = 1.0 / step if step > RATE.slower * flight.dt else None
     if flight.hold[name] != "zero-order":
-        moving = split(u)[1] if flight.hold[name] == "mixed" else u
-        return slower or _corner_rate(flight.dt, moving)
+        return slower or 1.0 / flight.dt
     # With a hold that the user stated the input is known at all times.
     if name not in flight.hold_reason:
         return None
@@ -216,25 +212,6 @@ def input_rate(flight: Flight, name: str, u: Float[np.ndarray, " N"]) -> float |
     if usual < 2 or regular < RATE.regular:
         return None
     return min(1.0 / (usual * flight.dt), slower or np.inf)
-
-
-def _corner_rate(dt: float, u: np.ndarray) -> float:
-    """Return the rate of the samples between which an input follows straight lines."""
-    bends = np.abs(np.diff(u, 2))
-    # Quantiles, since one outlier would make all corners look like rounding.
-    low, high = np.quantile(u, [0.01, 0.99])
-    corners = np.flatnonzero(bends > 1e-6 * ((high - low) or np.ptp(u)))
-    if corners.size < RATE.steps:
-        return 1.0 / dt
-    # A corner between two samples of the new clock bends at both of them.
-    begins = np.flatnonzero(np.diff(corners, prepend=-2) > 1)
-    sizes = np.diff(begins, append=corners.size)
-    if np.median(np.repeat(sizes, sizes)) > RATE.bends:
-        return 1.0 / dt
-    within = np.arange(corners.size) - np.repeat(begins, sizes)
-    steps = np.diff(corners[within % 2 == 0])
-    # A resting input has no corners: leave out the long steps.
-    return 1.0 / (float(np.mean(steps[steps <= 1.5 * np.median(steps)])) * dt)
 
 
 def output_rate(flight: Flight, name: str) -> float:
@@ -273,8 +250,6 @@ def power_between_samples(flight: Flight, name: str) -> tuple[float, float] | No
 
 _NEAR = 0.8
 """Share of the Nyquist frequency from which on an alias of a mode fits equally well."""
-_MOVED = 1e-6
-"""Relative change of a mode over that of a parameter, below which the mode is known."""
 _TURNED = 0.2
 """Least relative change of the frequency over that of a parameter that can move it to an alias.
 
@@ -283,18 +258,6 @@ _SWINGS = 10.0
 """Frequency over decay, above which a mode oscillates even if it decays within a sample."""
 _STEP = 1e-4
 """Relative step of the parameters for these changes."""
-
-
-class FastMode(NamedTuple):
-    """Mode of a flight at or past the Nyquist frequency that depends on free parameters."""
-
-    flight: str
-    frequency: float
-    """[rad/s]"""
-    nyquist: float
-    """[rad/s]"""
-    undetermined: tuple[str, ...]
-    """Free parameters that can move the mode to an alias, if it is visible in an output."""
 
 
 def measurement_noise(
@@ -308,49 +271,44 @@ def measurement_noise(
     )
 
 
-def fast_modes(
-    problem: Problem,
-    values: Mapping[str, float],
-    noise: Sequence[Mapping[str, Any]] | None = None,
-) -> list[FastMode]:
-    """Return by flight the fastest unknown mode that its samples cannot show.
+def aliased_parameters(
+    problem: Problem, values: Mapping[str, float], noise: Sequence[Mapping[str, Any]]
+) -> frozenset[str]:
+    """Return the free parameters that can move a visible mode to an alias past Nyquist.
 
     Args:
         values: values of the free parameters [SI]; gains and shifts among them move no mode.
-        noise: sd by flight and output [SI]; None leaves `undetermined` empty.
+        noise: sd by flight and output [SI].
     """
-    fast = []
-    for i, flight in enumerate(problem.training):
+    aliased = set[str]()
+    for flight, sd in zip(problem.training, noise, strict=True):
         here = {**{n: v for n, v in values.items() if n in problem.free}, **flight.known}
-        modes, nyquist = _modes_of(problem, problem.params_with(here), flight), np.pi / flight.dt
+        modes = _modes_of(problem, problem.params_with(here), flight)
         if modes is None:
             continue
         # Only the imaginary part counts: a fast decay without oscillation has no alias.
         swing, decay = np.imag(modes.eigenvalues), -np.real(modes.eigenvalues)
-        if not np.any(swing >= _NEAR * nyquist):
-            continue
-        slopes = _relative_slopes(problem, here, [n for n in here if n not in flight.known], modes)
-        # A filter or servo with known constants is simulated as it is and has no alias.
-        past = swing >= _NEAR * nyquist
-        past &= np.any([np.abs(s) > _MOVED for s in slopes.values()], axis=0)
-        if not past.any():
-            continue
+        past = swing >= _NEAR * np.pi / flight.dt
         # A mode that decays within a sample has no visible alias, unless it oscillates many times.
-        lost = past & ((decay * flight.dt < 1.0) | (swing > decay * _SWINGS))
-        lost &= [
-            noise is not None and modes.strongest(k, problem, flight, noise[i])[0] >= RATE.shows
-            for k in range(lost.size)
+        past &= (decay * flight.dt < 1.0) | (swing > decay * _SWINGS)
+        lost = [
+            k
+            for k in np.flatnonzero(past)
+            if modes.strongest(k, problem, flight, sd)[0] >= RATE.shows
         ]
+        if not lost:
+            continue
         # A prior excludes the alias; the modes of a delay are those of its approximation.
-        undetermined = tuple(
+        names = [
             n
-            for n, s in slopes.items()
-            if problem.free[n].prior is None and n not in problem.model.delay_parameters
-            if np.any(np.abs(np.imag(s[lost])) > _TURNED)
-        )
-        name, fastest = flight.name or "the flight", float(np.max(swing[past]))
-        fast.append(FastMode(name, fastest, nyquist, undetermined))
-    return fast
+            for n in here
+            if n not in flight.known
+            and problem.free[n].prior is None
+            and n not in problem.model.delay_parameters
+        ]
+        slopes = _relative_slopes(problem, here, names, modes)
+        aliased |= {n for n, s in slopes.items() if np.any(np.abs(np.imag(s[lost])) > _TURNED)}
+    return frozenset(aliased)
 
 
 def _relative_slopes(

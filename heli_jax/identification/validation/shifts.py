@@ -82,15 +82,15 @@ def shift_in_time(
     found = {one: best for one, best in found.items() if best[1] > SHIFT.clear}
     if not found:
         return None
-    kind, surest = max(found, key=lambda one: found[one][1])
-    together = {one for one in found if one[0] == kind != "output"} | {(kind, surest)}
+    kind, best = max(found, key=lambda one: found[one][1])
+    together = {one for one in found if one[0] == kind != "output"} | {(kind, best)}
     places = {one[1]: found[one][0] for one in found if one in together}
     dt, there = float(at.data.flights[0].dt), at.data
     for name, place in places.items():
         there = _moved(there, kind, name, place * dt)
     first = max(places.values(), key=abs)
     names = tuple(n for n, place in places.items() if place * first > 0)
-    gain, moved = found[kind, surest][1], _change(at, e, *_rows(at, there))
+    gain, moved = found[kind, best][1], _change(at, e, *_rows(at, there))
     late = "response" if kind == "input" and first > 0 else kind
     return Shift(late, names, abs(first) * dt, gain, moved)
 
@@ -124,10 +124,10 @@ def _best_place(at: Solution, e: Evaluation, kind: str, name: str) -> tuple[floa
     farthest = max(1, round(SHIFT.farthest / dt))
     # Innovations are correlated over a few samples only, so the gain may stay flat until close to
     # the right delay: start from several delays.
-    begun = [2**k for k in range(farthest.bit_length())] if e.innovations else [1]
+    delays = [2**k for k in range(farthest.bit_length())] if e.innovations else [1]
     # An output cannot be logged before it was measured.
-    later = begun if kind == "input" else []
-    place = max((0, *later, *(-k for k in begun)), key=gained)
+    later = delays if kind == "input" else []
+    place = max((0, *later, *(-k for k in delays)), key=gained)
     for step in (1, -1):
         while place and abs(place + step) <= farthest and gained(place + step) > gained(place):
             place += step
