@@ -15,7 +15,6 @@ import numpy as np
 import scipy.special
 
 from heli_jax.identification.estimation.evaluation import Evaluation, pseudoinverse
-from heli_jax.identification.estimation.levenberg_marquardt import measured_count
 from heli_jax.identification.identifiability.equivalents import (
     Rows,
     descend,
