@@ -146,7 +146,7 @@ class Problem:
         object.__setattr__(self, "free", free)
         _check_method(self)
         if not self.free:
-            raise ValueError("nothing is free: name at least one parameter to estimate")
+            raise ValueError("no parameter is free: name at least one to estimate")
         for name, free in self.free.items():
             _check_free(name, free, self.model)
         _check_possible(self)
@@ -280,8 +280,8 @@ def _check_method(problem: Problem) -> None:
     if model.noise_intensity is None:
         raise ValueError(
             f"method {problem.method}: model {model.name} has no disturbance, expected a model "
-            "made with with_disturbance (in a configuration: a `disturbance`) or with a "
-            "noise_intensity of its own"
+            "from with_disturbance (in a configuration: a `disturbance`) or one with its own "
+            "noise_intensity"
         )
     estimated = [n for d in disturbances_of(model) for n in (d.sigma, d.tau)]
     if not all(n in (*estimated, "sigma_y") for n in problem.fixed_noise):
@@ -291,7 +291,9 @@ def _check_method(problem: Problem) -> None:
         )
     for name in estimated:
         if name in problem.free:
-            raise ValueError(f"free.{name}: {problem.method} estimates it by itself, leave it out")
+            raise ValueError(
+                f"free.{name}: {problem.method} always estimates it, remove it from free"
+            )
         value = float(getattr(problem.vehicle, name))
         if name in problem.fixed_noise and not (math.isfinite(value) and value > 0):
             raise ValueError(f"disturbance: fixed {name} must be above zero, got {value:g}")
@@ -365,7 +367,7 @@ def _check_flight(flight: Flight, problem: Problem) -> None:
             f"{nearest(unknown[0], naming.names(model.Outputs))}"
         )
     if not flight.outputs:
-        raise ValueError(f"{where} has no output: nothing can be compared with the model")
+        raise ValueError(f"{where} has no output to compare with the model")
     for name, y in flight.outputs.items():
         # Most samples may be missing, as with a slow sensor, but the noise needs more than a few.
         if (seen := int(np.isfinite(y).sum())) < FEWEST_SEEN:
@@ -432,8 +434,8 @@ def _check_free(name: str, free: Free, model: Model) -> None:
         )
     if math.isnan(start):
         raise ValueError(
-            f"free.{name}.start: missing, expected a number to begin with (or, for a linear model, "
-            "start: equation-error, which finds one)"
+            f"free.{name}.start: missing, expected a start value (or, for a linear model, start: "
+            "equation-error)"
         )
     for key, value in _numbers(free).items():
         if not math.isfinite(value):
@@ -546,9 +548,9 @@ def _warn_of_degrees(outputs: type, flights: Sequence[Flight]) -> None:
         largest = float(np.nanmax(np.abs(y), initial=0.0))
         if largest > _FURTHEST or (largest > _HALF_TURN and fastest > _FASTEST):
             warnings.warn(
-                f"{flight.name or 'a flight'}: {name} reaches {largest:.3g} rad and "
-                f"{fastest:.2g} rad/s, farther or faster than helicopters turn; angles are in "
-                "radians here: np.radians(degrees)",
+                f"{flight.name or 'a flight'}: {name} reaches {largest:.3g} rad and {fastest:.2g} "
+                "rad/s, implausible for a helicopter; angles here are in radians: "
+                "np.radians(degrees)",
                 UserWarning,
                 stacklevel=4,
             )

@@ -168,7 +168,7 @@ def choose(
         responses = objective_of(problem.method).fits_responses
         if problem.noise_model == "spectrum" and not responses and instruments_of(problem):
             raise ValueError(
-                f"{name}: an estimate by instrument has no likelihood to be compared by, expected "
+                f"{name}: an estimate by instrument has no likelihood for a comparison, expected "
                 "instrument=() or method='filter-error'"
             )
     report = progress or (lambda _: None)
@@ -219,31 +219,31 @@ def _sentences(ranked: tuple[Candidate, ...], compared: list[Nested]) -> list[st
     if converged:
         first, by_bic = converged[0], min(converged, key=lambda c: c.bic)
         both = f"AIC and BIC prefer: {first.name}."
-        apart = f"AIC prefers: {first.name}; BIC, which asks more of it: {by_bic.name}."
+        apart = f"AIC prefers {first.name}; BIC, which is stricter, prefers {by_bic.name}."
         sentences.append(both if first.name == by_bic.name else apart)
         # Burnham and Anderson (2002): models within 2 of the best have substantial support.
         if close := [c.name for c in converged[1:] if c.aic - first.aic < 2.0]:
             sentences.append(f"Hardly worse (AIC within 2): {', '.join(close)}.")
         if not first.white:
             sentences.append(
-                "Not even the preferred one leaves white residuals: something is missing."
+                "Even the preferred one leaves coloured residuals: the model lacks something."
             )
     failed = [c.name for c in ranked if c.status == "not-converged"]
     if failed:
-        sentences.append(f"Did not converge, so not compared: {', '.join(failed)}.")
+        sentences.append(f"Did not converge, hence not compared: {', '.join(failed)}.")
     sentences += [
         f"{t.large} ends below {t.small}, which is nested in it: its optimum was not found."
         for t in compared
         if t.ratio < -2.0 * _BELOW
     ]
     sentences += [
-        f"{t.small} within {t.large}: twice the log-likelihood gained is {t.ratio:.3g} for "
+        f"{t.small} within {t.large}: gain in twice the log-likelihood {t.ratio:.3g} for "
         f"{t.degrees} more unknown{'s' if t.degrees > 1 else ''} (p {p_value(t.p_value)})."
         for t in compared
         if t.degrees > 0 and t.ratio >= -2.0 * _BELOW and not {t.small, t.large} & set(failed)
     ]
     return sentences + [
-        f"{t.small} within {t.large}: the larger one has no unknown more, so there is no test."
+        f"{t.small} within {t.large}: the larger one has no more unknowns, so there is no test."
         for t in compared
         if t.degrees <= 0
     ]
@@ -337,7 +337,7 @@ class MethodComparison(NamedTuple):
             if apart:
                 said.append(
                     f"{other.label} and {main.label} differ in {', '.join(apart)} joint standard "
-                    "deviations: what one of them takes for granted does not hold of this record."
+                    "deviations: an assumption of one of them is violated in this record."
                 )
             elif known:
                 said.append(

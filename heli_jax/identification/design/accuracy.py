@@ -69,7 +69,7 @@ def expected_sd(
     return deviations(rows[:, felt])[:q]
 
 
-GUESSED = "guessed: too small where the log was smoothed; state the output's sd"
+GUESSED = "guessed: too small if the log was smoothed; state the output's sd"
 """remark on a noise that nobody stated"""
 
 

@@ -482,7 +482,7 @@ def equation_error_start(
         if effect:
             estimates[name] = value
         else:
-            reasons[name] = "no measured state or output moves with it"
+            reasons[name] = "it affects no measured state or output"
             _require_value(regression.base, name, reasons[name])
     if not estimates:
         raise _no_regression("the equations determine none of the free parameters")
@@ -511,7 +511,7 @@ def _regression(
     # At random values no terms cancel.
     generic = dict(zip(free, np.random.default_rng(11).uniform(0.5, 1.5, len(free)), strict=True))
     delays, width, records = dict(model.delays), _width(flights), []
-    reasons = {n: "a delay is found by no regression" for n in free if n in delays.values()}
+    reasons = {n: "a regression cannot estimate a delay" for n in free if n in delays.values()}
     for flight in flights:
         some = {**base, **generic, **flight.known}
         require_constants(model, model.Params(**some))
@@ -527,15 +527,15 @@ def _regression(
     names = tuple(n for n in free if n not in reasons)
     if not any(one.rows for one in records):
         measured = ", ".join({n: None for f in flights for n in f.outputs})
-        raise _no_regression(f"no equation of a state that {measured} show has a free parameter")
+        raise _no_regression(f"no equation of a state that {measured} measure has a free parameter")
     if not names:
-        raise _no_regression("all that is free are delays, or time constants of hidden states")
+        raise _no_regression("only delays, or time constants of hidden states, are free")
     for n, why in reasons.items():
         _require_value(base, n, why)
     records = tuple(one for one in records if one.segments and one.rows)
     if not records:
         raise _no_regression(
-            "no stretch without missing samples is as long as the smoothing needs "
+            "no part without missing samples is long enough for the smoothing "
             f"({math.ceil((_SHORTEST + 2.0 * _REACH) * width)} samples)"
         )
     left: dict[str, list[np.ndarray]] = {}
@@ -548,8 +548,8 @@ def _regression(
 
 def _no_regression(why: str) -> ValueError:
     return ValueError(
-        f"start: equation-error: nothing can be regressed, since {why}: expected a start of each "
-        "free parameter"
+        f"start: equation-error: no regression is possible, because {why}: expected a start of "
+        "each free parameter"
     )
 
 

@@ -149,7 +149,7 @@ def instrument_notes(data: Data) -> list[Finding]:
         return []
     words = (
         f"By instrument ({', '.join(inputs_by_instrument(data))}): the estimates solve equations "
-        "and have no likelihood, so that there is no AIC or BIC; a profile is that of the "
-        "equations' sum of squares, which has the same limits."
+        "and have no likelihood, so there is no AIC or BIC; a profile uses the equations' sum of "
+        "squares, which has the same limits."
     )
     return [note("frequency.by-instrument", words, *inputs_by_instrument(data))]

@@ -156,8 +156,7 @@ def cut_notes(layout: Layout, data: Data, names: Sequence[str]) -> list[Finding]
         words = (
             f"{names[i] if len(data.flights) > 1 else 'The flight'} was cut where samples of "
             f"{', '.join(lacking)} are missing: {used * facts.dt:.4g} of {n * facts.dt:.4g} s are "
-            f"used, in {len(facts.parts)} {'parts' if len(facts.parts) > 1 else 'part'} with ends "
-            "of their own."
+            f"used, in {len(facts.parts)} separate {'parts' if len(facts.parts) > 1 else 'part'}."
         )
         notes.append(note("frequency.flight-cut", words, *lacking))
     return notes

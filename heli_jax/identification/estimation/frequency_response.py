@@ -219,7 +219,7 @@ class FrequencyResponse(Objective):
         if not problem.model.linear:
             return (
                 f"model {problem.model.name} is not linear; expected frequency-error, which "
-                "takes it linear about where it flies, output-error or filter-error"
+                "linearises it, output-error or filter-error"
             )
         refused = absent_instrument(problem)
         if refused is not None:
@@ -284,7 +284,7 @@ class FrequencyResponse(Objective):
         freedom = max(2.0 * weights.numbers - taken - ends, 1.0)
         low, high = expected_interval(freedom, weights.numbers_of_noise)
         pairs = pair_agreements(w, used, H, E, weights.variance(), weights.coherence)
-        left_out = [f"{n}: its responses take no part, {why}." for n, why in w.left_out.items()]
+        left_out = [f"{n}: its responses are not used, {why}." for n, why in w.left_out.items()]
         return ResponseAgreement(
             pairs,
             2.0 * float(np.sum(np.abs(white) ** 2)) / freedom,

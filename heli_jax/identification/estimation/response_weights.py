@@ -304,8 +304,8 @@ def first_weights(problem: Problem, flights: Sequence[Flight]) -> ResponseWeight
     at = averages(w)
     if len(w.inputs) > 1 and not at.sound.any():
         raise ValueError(
-            f"frequency: {' and '.join(w.inputs)} move as one, so that no response tells what each "
-            "of them does; expected inputs that move apart, or one of them"
+            f"frequency: {' and '.join(w.inputs)} move together, so that their responses cannot "
+            "be separated; expected inputs that move independently, or one of them"
         )
     coherence = partial_coherence(w, at)
     used = pairs_used(w, options, coherence) & at.sound[:, None, None]

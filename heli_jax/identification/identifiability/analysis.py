@@ -236,8 +236,8 @@ def verdict_of(
     """
     if not bool(np.all(np.isfinite(e.J))):
         raise ValueError(
-            "the simulation is not finite at the given values: the model is unstable there over "
-            "the length of this record; start elsewhere or use a shorter window"
+            "the simulation is not finite at the given values: the model is unstable over this "
+            "record; use other start values or a shorter window"
         )
     unknowns, sensitivity, others = relative_rows(problem, layout, e)
     unknowns = tuple(u._replace(aliased=u.name in around.aliased) for u in unknowns)

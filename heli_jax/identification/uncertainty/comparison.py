@@ -62,7 +62,7 @@ def intervals(
         ValueError: a parameter that is not free, or a missing extra.
         TypeError: `fit` is no Fit.
     """
-    require_kind("fit", fit, Fit, "a Fit, as heli_jax.fit(problem) returns it")
+    require_kind("fit", fit, Fit, "a Fit from heli_jax.fit(problem)")
     report = progress or (lambda _: None)
     profiled, booted, posterior, findings = {}, None, None, []
     missing = [n for n in profiles or () if n not in fit.estimates]
