@@ -314,7 +314,7 @@ def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Floa
         for record, W in records_of_group(layout, noise, members):
             e, J, Z = _errors_of_record(model, at, record, W, y, instruments)
             products.append((e @ e, Z.T @ e, Z.T @ Z, Z.T @ J))
-    ee, Ze, ZZ, ZJ = (sum(each) for each in zip(*products, strict=True))
+    ee, Ze, ZZ, ZJ = jax.tree.map(lambda *v: sum(v), *products)
     S = orthonormal(ZZ)
     r, M = S.T @ Ze, S.T @ ZJ
     left = jnp.zeros_like(ee) if instruments else jnp.sqrt(jnp.maximum(ee - r @ r, 0.0))

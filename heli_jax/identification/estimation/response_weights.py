@@ -77,24 +77,24 @@ def averages(w: Windowed) -> Averages:
     z, u = (np.mean(np.abs(v) ** 2, axis=0) for v in (w.Z, w.U))
     P = inverse(_cross(w.Z, w.U), z, u)
     sound, P = np.isfinite(P).all((1, 2)), np.nan_to_num(P)
-    share = np.ones(P.shape[:2])
-    # One over the sum of an error's correlations with the lines around it.
-    for d in range(min(_NEIGHBOURS + 1, len(g))):
-        correlations = _correlations(g, d, w.step)
-        V, k = _spread(w, correlations), len(g) - d
-        C = np.einsum("kxa,kab,kyb->kxy", P[:k], V, np.conj(P[d:]), optimize=True)
-        own = np.real(np.einsum("kxx->kx", C))
-        if d == 0:
-            covariance, size = C, np.sqrt(np.maximum(own, 1e-300))
-            # Subtracting the mean removes part of the white noise at the first line.
-            power = len(w.Z) * np.real(correlations[0])
-            taken = len(w.Z) * np.real(np.einsum("kab,kba->k", _inverse_power(w), V))
-            continue
+    near = [_correlations(g, d, w.step) for d in range(min(_NEIGHBOURS + 1, len(g)))]
+    spreads = [_spread(w, c) for c in near]
+    # Covariances of a response's errors with those at the d-th line after it.
+    C = [
+        np.einsum("kxa,kab,kyb->kxy", P[: len(V)], V, np.conj(P[d:]), optimize=True)
+        for d, V in enumerate(spreads)
+    ]
+    own = [np.real(np.einsum("kxx->kx", v)) for v in C]
+    size, total = np.sqrt(np.maximum(own[0], 1e-300)), np.ones(P.shape[:2])
+    for d, v in enumerate(own[1:], 1):
         # Negative correlations are ignored, because no response varies that fast.
-        rho = np.maximum(own / (size[:k] * size[d:]), 0.0)
-        share[:k] += rho
-        share[d:] += rho
-    return Averages(P, sound, covariance, 1.0 / share, np.maximum(power - taken, 0.5))
+        rho = np.maximum(v / (size[: len(v)] * size[d:]), 0.0)
+        total[: len(v)] += rho
+        total[d:] += rho
+    # Subtracting the mean removes part of the white noise at the first line.
+    power = np.real(near[0][0])
+    taken = np.real(np.einsum("kab,kba->k", _inverse_power(w), spreads[0]))
+    return Averages(P, sound, C[0], 1.0 / total, np.maximum(len(w.Z) * (power - taken), 0.5))
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -287,8 +287,7 @@ class ResponseWeights(NamedTuple):
 
     def variance(self) -> np.ndarray:
         """Variance of the complex error of each response (k, p, m)."""
-        C = covariance(self.averages, self.density)
-        return np.real(np.einsum("kixix->kix", C))
+        return np.real(np.einsum("kxx,kii->kix", self.averages.covariance, self.density))
 
 
 def first_weights(problem: Problem, flights: Sequence[Flight]) -> ResponseWeights:
