@@ -49,8 +49,7 @@ class Prepared(NamedTuple):
 def prepared(flights: list[Flight], **more: Any) -> Prepared:
     of, flights_ = problem(flights, **more), tuple(flights)
     layout, data = layout_of(of, flights_), data_of(of, flights_)
-    # Only the ratios matter: they are unknowns with starts here, and the scale is concentrated out
-    # of the likelihood.
+    # The factor of each noise is an unknown that starts here.
     sd = tuple({n: np.float64(NOISE[n]) for n in sorted(f.outputs)} for f in flights)
     z = jnp.asarray(start_vector(layout, data, of))
     noise = Noise(sd, np.zeros(()))

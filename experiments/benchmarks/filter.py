@@ -72,8 +72,7 @@ def compared(taus: bool) -> None:
     arguments = (data, Noise(sd, np.zeros(())), jnp.asarray(start_vector(layout, data, of)))
     frozen = timed(layout, arguments)
     exact = timed(dataclasses.replace(layout, one_covariance=()), arguments)
-    # One noise is the common factor, which is concentrated out of the likelihood.
-    print(f"{layout.size + 1} unknowns, {sum(f.n_samples for f in flights)} samples")
+    print(f"{layout.size} unknowns, {sum(f.n_samples for f in flights)} samples")
     print("                       cold [s]   warm [s]")
     for name, way in (("exact, each record", exact), ("shared, gain freezes", frozen)):
         print(f"  {name:21} {way.cold:8.1f}   {way.warm:8.3f}")

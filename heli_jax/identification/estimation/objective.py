@@ -165,17 +165,17 @@ class Objective(abc.ABC):
     def log_density(self, layout: Layout, data: Data, rows: Float[Array, " n"]) -> Array:
         """Return the log density of the rows up to a constant; traced.
 
-        Estimated scales are integrated out under Jeffreys' prior.
+        The scales of white noise are integrated out under Jeffreys' prior.
         """
+        if self.noise_model != "white":
+            return -0.5 * jnp.sum(rows**2)
         # The integral over sd of sd^-(n+1) exp(-S / (2 sd^2)) is proportional to S^(-n/2). Rows of
         # missing samples are zero, and n excludes them.
-        if self.noise_model == "white":
-            counts = [jnp.sum(jnp.isfinite(y)) for f in data.flights for y in f.outputs.values()]
-            n = jnp.stack(counts).astype(rows.dtype)
-            numbers = signal_numbers(layout, data)
-            S = jnp.zeros(n.size, rows.dtype).at[numbers].add(rows[: numbers.size] ** 2)
-            return -0.5 * jnp.sum(n * jnp.log(S))
-        return -0.5 * jnp.sum(rows**2)
+        counts = [jnp.sum(jnp.isfinite(y)) for f in data.flights for y in f.outputs.values()]
+        n = jnp.stack(counts).astype(rows.dtype)
+        numbers = signal_numbers(layout, data)
+        S = jnp.zeros(n.size, rows.dtype).at[numbers].add(rows[: numbers.size] ** 2)
+        return -0.5 * jnp.sum(n * jnp.log(S))
 
     def numbers(self, layout: Layout, data: Data, noise: Noise) -> int:
         """Return the number of independent values that the noise is estimated from."""

@@ -224,8 +224,8 @@ def log_posterior(
 ) -> Float[Array, ""]:
     """Return the log density of z but for a constant.
 
-    The scale of the noise is integrated out under Jeffreys' prior unless it is fixed: that of each
-    flight and output with output error, the common one with filter error.
+    With output error the noise scale of each flight and output is integrated out under Jeffreys'
+    prior. With filter error z holds the logarithms of all noises, each with a flat prior.
     """
     # Draws integrate over the parameters of the mean, which the restricted likelihood allows for.
     scales = layout.model.input_scales
