@@ -27,7 +27,11 @@ from heli_jax.identification.estimation.multistart import FirstGuess, StartRow
 from heli_jax.identification.estimation.noise_covariance import first_noise
 from heli_jax.identification.estimation.objective import noise_unknowns
 from heli_jax.identification.identifiability.analysis import Around, verdict_of
-from heli_jax.identification.identifiability.equivalents import Valley, second_solutions
+from heli_jax.identification.identifiability.equivalents import (
+    Valley,
+    own_record,
+    second_solutions,
+)
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status
@@ -105,8 +109,11 @@ def context_of(problem: Problem, guess: FirstGuess | None = None) -> Context:
     guess = guess or first_guess(problem)
     # Other parameters may be identifiable far from the optimum. The fit repeats the analysis there.
     at = Solution(*guess[:4])
-    second = second_solutions(problem, at, guess.e, optimum=False)
-    around = Around(second=second, valley=Valley(problem, at, guess.e))
+    # The record is the model's own, because any step from start values is an improvement.
+    own = own_record(at, guess.e)
+    # Rows that are sums over frequencies change with the record.
+    second = second_solutions(problem, *own) if guess.layout.noise_model == "white" else ()
+    around = Around(second=second, valley=Valley(problem, *own))
     verdict = verdict_of(problem, guess.layout, guess.e, around)
     return Context(problem, at, guess.e, verdict)
 

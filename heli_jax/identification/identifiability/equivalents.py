@@ -8,18 +8,17 @@ and the sum of squares shows whether the point fits as well. The values come fro
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
 from heli_jax.analysis.linear import linearize
 from heli_jax.analysis.operating_point import operating_point
-from heli_jax.identification.estimation.evaluation import Evaluation, named
-from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
+from heli_jax.identification.estimation.evaluation import Evaluation, evaluate, named
+from heli_jax.identification.estimation.levenberg_marquardt import measured_count, optimise
 from heli_jax.identification.identifiability.verdict import (
     Z95,
     Combination,
@@ -30,73 +29,24 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Solution
 
-
-class Rows(NamedTuple):
-    """Residuals at a point, whitened, and their derivatives."""
-
-    r: np.ndarray
-    """(n,)"""
-    J: np.ndarray
-    """(n, q)"""
+_STEPS = 20
+"""evaluations of one search"""
 
 
-def rows_at(at: Solution, z: np.ndarray | jax.Array) -> Rows:
-    """Return the rows of the fit at z (q,)."""
-    made = residual_and_jacobian(at.layout, at.data, at.noise, jnp.asarray(z, at.z.dtype))
-    return Rows(*(np.asarray(v, np.float64) for v in jax.device_get((made.r, made.J))))
-
-
-def squares_of(r: np.ndarray) -> float:
-    """Return the sum of squares; infinite or NaN where one is."""
-    r = np.asarray(r, np.float64)
-    with np.errstate(all="ignore"):
-        return float(r @ r)
-
-
-_RIDGE = 1.0 / 3.0
-"""one over the largest step in a direction without effect, in coordinates of the search"""
-_ENOUGH = 0.05
-"""predicted gain of a further step [squares] at which a search stops"""
-_STEPS = 10
-_HUGE = 1e50
-"""squares and slopes of a simulation that diverges"""
-
-
-def descend(
-    rows: Callable[[np.ndarray], Rows], z: np.ndarray, moving: np.ndarray
-) -> tuple[np.ndarray, float]:
-    """Return the least-squares point (q,) near z (q,) by Levenberg-Marquardt, and the sum there
-    less the predicted gain of a further step; infinite if nothing finite is found.
-
-    Args:
-        moving: (q,) True for coordinates that may change.
-    """
-    now, ridge, promised = rows(z), _RIDGE, math.inf
-    squares = squares_of(now.r)
-    for _ in range(_STEPS):
-        J = now.J[:, moving]
-        if not (squares < _HUGE and np.abs(J).max(initial=0.0) < _HUGE):
-            return z, math.inf
-        Q, R = np.linalg.qr(J)
-        left = -(Q.T @ now.r)
-        damped = np.vstack([R, ridge * np.eye(R.shape[1])])
-        target = np.concatenate([left, np.zeros(R.shape[1])])
-        step = np.zeros(z.size)
-        step[moving] = np.linalg.lstsq(damped, target, rcond=None)[0]
-        promised = float(left @ left - np.sum((left - R @ step[moving]) ** 2))
-        if promised < _ENOUGH:
-            break
-        then = rows(z + step)
-        gained = squares - squares_of(then.r)
-        # False if the sum is not finite.
-        if gained > 0:
-            z, now, squares = z + step, then, squares - gained
-            ridge = max(_RIDGE, ridge / 10.0)
-        elif ridge > _RIDGE * 1e4:
-            break
-        else:
-            ridge *= 10.0
-    return z, squares - promised
+def own_record(at: Solution, e: Evaluation) -> tuple[Solution, Evaluation]:
+    """Return the point with the record that the model itself simulates there, with the same samples
+    missing: its residuals are those of the priors alone."""
+    flights = tuple(
+        flight._replace(
+            outputs={
+                n: jnp.where(jnp.isfinite(y), jnp.asarray(run[n], jnp.asarray(y).dtype), jnp.nan)
+                for n, y in flight.outputs.items()
+            }
+        )
+        for flight, run in zip(at.data.flights, e.simulated, strict=True)
+    )
+    at = at._replace(data=at.data._replace(flights=flights))
+    return at, evaluate(*at)
 
 
 # Products of powers, such as a/Ixx, and sums, such as La + Lb, that do not change along the null
@@ -253,24 +203,17 @@ class Valley(NamedTuple):
     e: Evaluation
 
     def visit(
-        self,
-        held: Mapping[str, float],
-        guess: Mapping[str, float],
-        *,
-        same: bool = False,
-        priors: bool = False,
+        self, held: Mapping[str, float], guess: Mapping[str, float], *, priors: bool = False
     ) -> Point | None:
         """Return the best point with some values held; None if no finite one is found.
 
         Args:
             held: fixed values, SI.
-            guess: values of other unknowns of interest at which the search begins; the optimum's
-                unless named.
-            same: True to search the same residuals in place of the least squares, as at start
-                values.
+            guess: values of other unknowns of interest at which the search begins; those of the
+                solution unless named.
             priors: True to count the parameters' priors.
         """
-        layout = self.at.layout
+        layout, data = self.at.layout, self.at.data
         names, z = layout.of_interest, np.array(self.at.z, np.float64)
         for name, value in {**guess, **held}.items():
             at = value
@@ -280,24 +223,21 @@ class Valley(NamedTuple):
             if at is None:
                 return None
             z[names.index(name)] = at
-        moving = np.array([i >= len(names) or names[i] not in held for i in range(layout.size)])
-        # The rows of the parameters' priors stand before those of the nuisances.
-        last = self.e.r.size - (layout.size - layout.first_nuisance)
-        own = slice(0) if priors else slice(last - len(layout.free), last)
-        here = np.delete(np.asarray(self.e.r, np.float64), own)
-        base = here if same else np.zeros(here.size)
-
-        def rows(z: np.ndarray) -> Rows:
-            r, J = rows_at(self.at, z)
-            return Rows(np.delete(r, own) - base, np.delete(J, own, axis=0))
-
-        z, squares = descend(rows, z, moving)
-        excess = squares - squares_of(here - base)
+        fixed = np.array([i < len(names) and names[i] in held for i in range(layout.size)])
+        here = np.asarray(self.e.r, np.float64)
+        if not priors:
+            data = data._replace(prior_sd=jnp.full_like(data.prior_sd, jnp.inf))
+            # The rows of the parameters' priors stand before those of the nuisances.
+            last = here.size - (layout.size - layout.first_nuisance)
+            here = np.delete(here, slice(last - len(layout.free), last))
+        optimum = optimise(layout, data, self.at.noise, z, _STEPS, held=fixed)
+        excess = optimum.cost * measured_count(data) - float(here @ here)
         if not math.isfinite(excess):
             return None
-        values, _ = named(layout, self.at.data, jnp.asarray(z, self.at.z.dtype))
-        expected = squares_of(np.asarray(self.e.J, np.float64) @ (z - np.asarray(self.at.z)))
-        return Point({n: float(v) for n, v in zip(names, values, strict=True)}, excess, expected)
+        values, _ = named(layout, data, jnp.asarray(optimum.z, self.at.z.dtype))
+        predicted = np.asarray(self.e.J, np.float64) @ np.asarray(optimum.z - self.at.z)
+        by_name = {n: float(v) for n, v in zip(names, values, strict=True)}
+        return Point(by_name, excess, float(predicted @ predicted))
 
     def determined_combinations(
         self, null: Sequence[np.ndarray], covariance: np.ndarray, unknowns: tuple[Unknown, ...]
@@ -330,7 +270,7 @@ class Valley(NamedTuple):
                 for other, power in zip(unknowns, powers.tolist(), strict=True)
                 if other.name != u.name and abs(power) > 1e-6
             }
-            point = self.visit({u.name: u.value * _FACTOR}, guess, same=True)
+            point = self.visit({u.name: u.value * _FACTOR}, guess)
             if point is not None and point.excess <= SAME:
                 points.append(point.values)
         return points
@@ -378,18 +318,11 @@ _DIFFERENCE = 1e-5
 """relative step of a parameter"""
 
 
-def second_solutions(
-    problem: Problem, at: Solution, e: Evaluation, *, optimum: bool = True
-) -> tuple[SecondSolution, ...]:
-    """Return other admissible values of the free parameters that fit as well or better.
-
-    Args:
-        optimum: False at start values, where the residuals have to stay the same.
-    """
+def second_solutions(problem: Problem, at: Solution, e: Evaluation) -> tuple[SecondSolution, ...]:
+    """Return other admissible values of the free parameters that fit as well or better."""
     here = {n: float(v) for n, v in zip(at.layout.of_interest, e.named, strict=True)}
     here = {n: here[n] for n in problem.free if n in here}
-    # At start values any step is an improvement, and rows that are sums over frequencies change.
-    if len(here) < 2 or not (optimum or at.layout.noise_model == "white"):
+    if len(here) < 2:
         return ()
     finite = np.isfinite(e.r).all() and np.isfinite(e.J).all()
     if not (finite and all(map(math.isfinite, here.values()))):
@@ -397,10 +330,10 @@ def second_solutions(
     valley, solutions = Valley(problem, at, e), []
     for held in _exchanged_modes(problem, here):
         # First with the exchanged values held, then all together.
-        point = valley.visit(held, {}, same=not optimum, priors=True)
+        point = valley.visit(held, {}, priors=True)
         if point is not None and point.excess <= _COMPENSATED * point.expected:
             guess = {n: point.values[n] for n in here}
-            point = valley.visit({}, guess, same=not optimum, priors=True)
+            point = valley.visit({}, guess, priors=True)
         # A point within the interval by the slopes is no other solution.
         if point is None or not (point.excess <= SAME and point.expected > _APART):
             continue

@@ -15,11 +15,10 @@ import numpy as np
 import scipy.special
 
 from heli_jax.identification.estimation.evaluation import Evaluation, pseudoinverse
-from heli_jax.identification.identifiability.equivalents import (
-    Rows,
-    descend,
-    rows_at,
-    squares_of,
+from heli_jax.identification.estimation.levenberg_marquardt import (
+    measured_count,
+    optimise,
+    residual_and_jacobian,
 )
 from heli_jax.identification.identifiability.verdict import FACTOR, Z95, Unknown, Verdict
 from heli_jax.identification.problem import Problem
@@ -31,6 +30,8 @@ _REACHES = (3.0, 9.0)
 the whole interval"""
 _POINTS = 13
 """of such a profile; odd, so that the optimum is one of them"""
+_STEPS = 20
+"""evaluations of one search"""
 _OUTWARDS = (0.35, 0.6, 1.0, 1.7, 2.9, 4.9, 8.4, 14.0, 24.0, 41.0)
 """points of a search for an interval's end, over the end by the slopes"""
 _AS_EXPECTED = 1.15
@@ -57,7 +58,8 @@ class Profile(NamedTuple):
 def profile(at: Solution, name: str) -> Profile:
     """Return the profile of a free parameter, for white residuals."""
     i = at.layout.free.index(name)
-    line = _line(at, rows_at(at, at.z), i)
+    made = residual_and_jacobian(*at)
+    line = _line(at, np.asarray(made.r), np.asarray(made.J), i)
     for reach in _REACHES:
         t = np.linspace(-reach, reach, _POINTS) * line.sd
         left = [root for _, root in line.roots(-1, -t[t < 0][::-1])][::-1]
@@ -90,8 +92,8 @@ class _Line(NamedTuple):
     """(q,) change of all unknowns by a unit of this one, to first order"""
     sd: float
     """of the unknown's coordinate"""
-    squares: float
-    """at the optimum"""
+    cost: float
+    """squares at the optimum over the number of measured values"""
 
     def roots(self, side: int, distances: Iterable[float]) -> Iterator[tuple[float, float]]:
         """Yield distances from the optimum to one side, each with the root of the deviance there.
@@ -99,21 +101,22 @@ class _Line(NamedTuple):
         Each search begins on the line through the optimum and the point before.
         """
         z0 = np.asarray(self.at.z, np.float64)
-        moving, guess, tangent = np.arange(z0.size) != self.i, z0, self.tangent
+        held, guess, tangent = np.arange(z0.size) == self.i, z0, self.tangent
         for t in distances:
             guess = guess + tangent * (z0[self.i] + side * t - guess[self.i])
-            guess, squares = descend(lambda z: rows_at(self.at, z), guess, moving)
+            found = optimise(*self.at[:3], guess, _STEPS, held=held)
+            guess = np.asarray(found.z, np.float64)
             if t > 0.0:
                 tangent = (guess - z0) / (guess[self.i] - z0[self.i])
-            yield t, math.sqrt(self._deviance(squares))
+            yield t, math.sqrt(self._deviance(found.cost))
 
-    def _deviance(self, squares: float) -> float:
-        """Return the deviance at a sum of squares; zero where it is below that of the optimum."""
-        if not math.isfinite(squares):
+    def _deviance(self, cost: float) -> float:
+        """Return the deviance at a cost; zero where it is below that of the optimum."""
+        if not math.isfinite(cost):
             return math.inf
-        if squares <= 0.0:
+        if cost <= 0.0:
             return 0.0
-        return max(0.0, squares - self.squares)
+        return max(0.0, measured_count(self.at.data) * (cost - self.cost))
 
     def value(self, distance: float) -> float:
         """Return the parameter, in its unit."""
@@ -121,11 +124,12 @@ class _Line(NamedTuple):
         return float(value_of(self.at.layout, self.at.data, self.i, z))
 
 
-def _line(at: Solution, here: Rows, i: int) -> _Line:
-    """Return the line along unknown i."""
-    inverse = pseudoinverse(here.J)
+def _line(at: Solution, r: np.ndarray, J: np.ndarray, i: int) -> _Line:
+    """Return the line along unknown i, by the residuals and their derivatives at the optimum."""
+    inverse = pseudoinverse(J)
     along = inverse @ inverse[i]
-    return _Line(at, i, along / along[i], math.sqrt(along[i]), squares_of(here.r))
+    cost = float(np.sum(np.square(r))) / measured_count(at.data)
+    return _Line(at, i, along / along[i], math.sqrt(along[i]), cost)
 
 
 def profile_wide_intervals(
@@ -162,7 +166,7 @@ def profile_wide_intervals(
     limits, one_sided = {}, []
     for i, u in wide:
         reach = together * float(reaches[i])
-        line = _line(at, Rows(np.asarray(e.r), J), i)
+        line = _line(at, e.r, J, i)
         ends = [_end(problem, line, e, u, side, reach) for side in (-1, 1)]
         bounded = [t for t in ends if t is not None]
         if len(bounded) < 2:

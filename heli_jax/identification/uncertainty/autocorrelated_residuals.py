@@ -18,7 +18,7 @@ import scipy.special
 from jaxtyping import Float
 
 from heli_jax.identification.estimation.evaluation import NULL, Evaluation, deviations
-from heli_jax.identification.identifiability.equivalents import rows_at
+from heli_jax.identification.estimation.residual import residual_and_jacobian
 from heli_jax.identification.unknowns.layout import Data, Layout, Solution
 
 _LENGTH = 6.0
@@ -146,8 +146,8 @@ def residual_curvature(at: Solution, J: Float[np.ndarray, "n q"]) -> Float[np.nd
         for i, step in enumerate(steps.tolist()):
             ends = []
             for end in (step, -step):
-                near = rows_at(at, jnp.asarray(at.z).at[i].add(end))
-                ends.append(near.J.T @ near.r)
+                near = residual_and_jacobian(*at[:3], jnp.asarray(at.z).at[i].add(end))
+                ends.append(np.asarray(near.J).T @ np.asarray(near.r))
             curvature[:, i] = (ends[0] - ends[1]) / (2.0 * step) - J.T @ J[:, i]
     # The differences are symmetric up to rounding.
     curvature[:k, :k] = 0.5 * (curvature[:k, :k] + curvature[:k, :k].T)

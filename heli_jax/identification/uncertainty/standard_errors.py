@@ -14,14 +14,13 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 import scipy.special
 from jaxtyping import Float
 
-from heli_jax.identification.estimation.evaluation import Evaluation, deviations, evaluate
+from heli_jax.identification.estimation.evaluation import Evaluation, deviations
 from heli_jax.identification.identifiability.analysis import Around, verdict_of
-from heli_jax.identification.identifiability.equivalents import Valley
+from heli_jax.identification.identifiability.equivalents import Valley, own_record
 from heli_jax.identification.identifiability.profile import profile_wide_intervals
 from heli_jax.identification.identifiability.verdict import Z95, SecondSolution, Verdict
 from heli_jax.identification.problem import Problem
@@ -157,17 +156,7 @@ def through_inputs(at: Solution, e: Evaluation) -> Evaluation | None:
         if np.nanstd(np.asarray(y)) > 0
     ):
         return None
-    # The simulated outputs in place of the measured ones, with the same samples missing.
-    flights = tuple(
-        flight._replace(
-            outputs={
-                n: jnp.where(jnp.isfinite(y), jnp.asarray(run[n], jnp.asarray(y).dtype), jnp.nan)
-                for n, y in flight.outputs.items()
-            }
-        )
-        for flight, run in pairs
-    )
-    J = np.array(evaluate(at.layout, at.data._replace(flights=flights), at.noise, at.z).J)
+    J = np.array(own_record(at, e)[1].J)
     # The rows of the innovations' variances, before those of the priors, are zero.
     priors = len(at.layout.free) + at.layout.size - at.layout.first_nuisance
     tags = at.layout.objective.tags(at.layout, at.data, len(J) - priors)
