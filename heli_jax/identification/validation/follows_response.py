@@ -236,7 +236,7 @@ def feedback(
         each = correlations_with_sums(v, innovations, blocks)
         # Several p-values may underflow to zero: then the correlation decides.
         best = np.lexsort((each.correlation.ravel(), each.p_value.ravel()))[0]
-        k, b = np.unravel_index(best, each.p_value.shape)
+        k, b = divmod(int(best), len(blocks))
         made.append(
             Feedback(
                 flight.name or "flight 1",
