@@ -107,7 +107,10 @@ def _best_place(at: Solution, e: Evaluation, kind: str, name: str) -> tuple[floa
     A negative delay shifts the signal to earlier times.
     """
     dt = float(at.data.flights[0].dt)
-    left, gains = {0.0: _beside(e.J, e.r)}, {0.0: 0.0}
+    # The noise keeps its size: otherwise it would follow the residual that a shift takes away.
+    noises = slice(len(at.layout.of_interest), at.layout.first_nuisance)
+    followers = np.delete(np.arange(at.layout.size), noises)
+    left, gains = {0.0: _beside(e.J[:, followers], e.r)}, {0.0: 0.0}
 
     def gained(k: float) -> float:
         """Return the gain if the unknowns follow, for rows as white as the present ones."""
@@ -115,7 +118,7 @@ def _best_place(at: Solution, e: Evaluation, kind: str, name: str) -> tuple[floa
             rows, J = _rows(at, _moved(at.data, kind, name, k * dt))
             gains[k] = -np.inf
             if np.all(np.isfinite(rows)) and np.all(np.isfinite(J)):
-                left[k] = _beside(J, rows)
+                left[k] = _beside(J[:, followers], rows)
                 gains[k] = _gain(_block(dt), left[0], left[k])
         return gains[k]
 
