@@ -10,7 +10,6 @@ import scipy.signal
 from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.signal_facts import facts_of_all
 from heli_jax.identification.diagnostics.quality import stuck_outputs
-from heli_jax.identification.validation.adequacy import Evidence, OutputAdequacy, Record, _of_noise
 
 RNG = np.random.default_rng(0)
 T = 0.005 * np.arange(6000)
@@ -75,11 +74,3 @@ def test_dropouts_that_hold_the_last_value_are_told_by_what_they_take_together()
     # Once or twice, or below 1 % of a record, it is a logger's fault.
     assert of((300, 3000), 60).stretches == ()
     assert of(range(300, 5700, 2000), 22).stretches == ()
-
-
-def test_an_output_of_which_nothing_is_explained_is_found():
-    judged = [OutputAdequacy(n, True, v, v, True, 0.0) for n, v in (("p", 1e-5), ("phi", 0.99))]
-    measured = dict.fromkeys(("p", "phi"), np.zeros(3000))
-    record = Record("one", measured, measured)
-    evidence = Evidence((record,), {}, {}, None, 5)
-    assert [_of_noise(o, evidence) for o in judged] == [True, False]
