@@ -64,7 +64,7 @@ def search(problem: Problem) -> None:
     guess = first_guess(problem)
     over = Search(problem, guess.layout, guess.data, 200)
     # With instruments the first search uses other data, as in `fit`.
-    first = Search(problem, guess.layout, guess.begun, 200)
+    first = Search(problem, guess.layout, guess.search_data, 200)
     [begun] = first.run(guess.noise, guess.z[None])
     found = relax_noise_covariance(over, guess.noise, begun)
     assert bool(found.best.converged)

@@ -339,9 +339,10 @@ class Windowed(NamedTuple):
         at = np.concatenate(
             [[(i, s // self.step) for s in v] for i, v in enumerate(self.starts) if v]
         )
-        return np.nonzero(
+        first, second = np.nonzero(
             (at[:, None, 0] == at[None, :, 0]) & (at[:, None, 1] + steps == at[None, :, 1])
         )
+        return first, second
 
     @property
     def averages(self) -> float:

@@ -238,7 +238,7 @@ def in_degrees(
         yield found(
             "units.in-doubt",
             "doubt",
-            name,
+            str(name),
             value=size,
             denies=certain,
             distrusts=() if certain or flown else estimates,

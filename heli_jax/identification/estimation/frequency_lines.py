@@ -471,10 +471,9 @@ def errors_of_record(
         return lines_of(outputs) - modelled(m, driving, R, ends)
 
     # Signals are delayed before they are cut, because an input may be logged before it acts.
-    whole = (driving, outputs)
-    return jax.vmap(of_flight)(
-        *jax.tree.map(lambda v: v[:, record.first : record.last], whole), ends
-    )
+    cut = slice(record.first, record.last)
+    inside = Driving(*(v[:, cut] for v in driving))
+    return jax.vmap(of_flight)(inside, outputs[:, cut], ends)
 
 
 def whitened(W: Complex[Array, "K p p"], errors: Complex[Array, "f K p"]) -> Float[Array, "f r"]:

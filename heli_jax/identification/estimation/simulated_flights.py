@@ -196,7 +196,7 @@ def by_output(layout: Layout, runs: tuple[Run, ...]) -> tuple[dict[str, np.ndarr
         runs: simulated flights fetched from the device.
     """
     return tuple(
-        dict(zip(names, run.outputs, strict=True))
+        dict(zip(names, np.asarray(run.outputs), strict=True))
         for names, run in zip(layout.outputs, runs, strict=True)
     )
 

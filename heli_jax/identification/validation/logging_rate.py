@@ -293,7 +293,7 @@ def aliased_parameters(
         past &= (decay * flight.dt < 1.0) | (swing > decay * _SWINGS)
         lost = [
             k
-            for k in np.flatnonzero(past)
+            for k in np.flatnonzero(past).tolist()
             if modes.strongest(k, problem, flight, sd)[0] >= RATE.shows
         ]
         if not lost:
