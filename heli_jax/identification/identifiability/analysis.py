@@ -184,6 +184,8 @@ class Nuisances(NamedTuple):
 
     free: np.ndarray
     """(any, q) sensitivity to the unknowns with the nuisances free"""
+    bounded: np.ndarray
+    """(any, q) the same with the nuisances bounded by their weak priors"""
     fixed: np.ndarray
     """(any, q) the same with the nuisances known"""
     compensation: np.ndarray
@@ -240,6 +242,7 @@ def verdict_of(
             "record; use other start values or a shorter window"
         )
     unknowns, sensitivity, others = relative_rows(problem, layout, e)
+    weak = np.asarray(e.J, np.float64)[e.J.shape[0] - (layout.size - layout.first_nuisance) :]
     unknowns = tuple(u._replace(aliased=u.name in around.aliased) for u in unknowns)
     q = len(unknowns)
     R = np.linalg.qr(np.hstack([sensitivity, others]), mode="r")
@@ -250,7 +253,12 @@ def verdict_of(
     named = flight_unknowns(layout, labels(problem.training))
     # The parameters of the disturbance and the noise's factors stand before the named nuisances.
     free = projected(fixed, N[:, seen])
-    nuisances = Nuisances(free, fixed, compensation[N.shape[1] - len(named) :], named)
+    held = np.vstack([N, weak[:, q:]])
+    bounded = projected(
+        np.vstack([fixed, np.zeros((len(weak), q))]),
+        held[:, np.linalg.norm(held, axis=0) > NO_EFFECT],
+    )
+    nuisances = Nuisances(free, bounded, fixed, compensation[N.shape[1] - len(named) :], named)
     to_relative = np.asarray(e.slopes, np.float64) * [u.sign / u.reference for u in unknowns]
     if around.reported is not None:
         around = around._replace(reported=around.reported * np.outer(to_relative, to_relative))
@@ -270,7 +278,7 @@ def analyse(
         sensitivity: (any, q) with the nuisances free, and without rows of priors. Weak priors of
             nuisances would bound a parameter that is exchangeable with a bias.
     """
-    nuisances = nuisances or Nuisances(sensitivity, sensitivity, np.zeros((0, len(unknowns))), ())
+    nuisances = nuisances or Nuisances(*[sensitivity] * 3, np.zeros((0, len(unknowns))), ())
     scale, own = np.array([u.scale for u in unknowns]), np.array([u.prior for u in unknowns])
     names = [u.name for u in unknowns]
     # A prior is a row with one over its sd.
@@ -280,6 +288,10 @@ def analyse(
     )
     covariance = total.covariance
     null = with_wide_intervals(total.null, covariance, unknowns)
+    if not total.null:
+        # The intervals are those of the fit, which has the weak priors.
+        bounded = np.vstack([nuisances.bounded, np.diag(own)])
+        covariance = directions(bounded, scale).covariance
     # Directions whose intervals by the slopes are short: aliased parameters, and the regression on
     # a one-sided parameter of those that are one-sided too.
     aliased = [v for v, u in zip(np.eye(len(unknowns)), unknowns, strict=True) if u.aliased]
