@@ -133,7 +133,7 @@ def _banked(phi: np.ndarray) -> Problem:
 def test_angles_that_turn_faster_than_a_helicopter_are_warned_of() -> None:
     t = 0.02 * np.arange(200)
     # 15 degrees to either side at 0.8 Hz; taken as radians it would be 75 rad/s.
-    with pytest.warns(UserWarning, match="faster than helicopters turn.*np.radians"):
+    with pytest.warns(UserWarning, match="implausible for a helicopter.*np.radians"):
         _banked(15.0 * np.sin(5.0 * t))
     # A full roll in half a second, with a continuous and a wrapped angle; and the drift of a linear
     # model.

@@ -32,7 +32,7 @@ def pair(*names):
 @pytest.mark.parametrize(
     ("place", "how"),
     [
-        ("nothing is free", {"free": {}}),
+        ("no parameter is free", {"free": {}}),
         ("Ixy", {"free": {"Ixy": Free(1.0)}}),
         ("Ixx.start", {"free": {"Ixx": Free(float("nan"))}}),
         ("Ixx", {"free": {"Ixx": Free(-0.1)}}),

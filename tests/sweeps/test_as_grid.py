@@ -22,5 +22,5 @@ def test_a_grid_has_its_axes_as_dimensions(bench30, record):
         assert float(cells["rms"].sel(at)) == float(one["rms"])
         np.testing.assert_array_equal(cells["mode_imag"].sel(at), one["mode_imag"])
         assert int(cells["status"].sel(at)) == 0
-    with pytest.raises(ValueError, match="of a sample there is no grid"):
+    with pytest.raises(ValueError, match="a sample has no grid"):
         as_grid(run.isel(element=[0, 1, 2, 3, 4]))

@@ -75,8 +75,8 @@ def test_no_scheduler_ends_in_words(monkeypatch):
 @pytest.mark.parametrize(
     ("error", "words"),
     [
-        (CancelledError("x"), "the scheduler or its workers are lost"),
-        (CommClosedError("x"), "--resume goes on"),
+        (CancelledError("x"), "lost the scheduler or its workers"),
+        (CommClosedError("x"), "--resume continues"),
         (ModuleNotFoundError("No module named 'mine'"), "No module named 'mine' on the scheduler"),
         (RuntimeError("Error during deserialization of the task graph"), "PYTHONPATH"),
     ],

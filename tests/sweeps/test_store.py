@@ -224,7 +224,7 @@ def test_a_directory_that_exists_is_kept(run, whole, tmp_path):
         run(whole)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter").write_text("dear")
-    with pytest.raises(InputError, match="is no store of a sweep"):
+    with pytest.raises(InputError, match="is not a store of a sweep"):
         run(tmp_path / "mine", resume=True)
     assert (tmp_path / "mine" / "letter").read_text() == "dear"
     with pytest.raises(InputError, match="exists already"):
@@ -267,7 +267,7 @@ def test_a_store_that_lacks_something_is_refused(run, whole, tmp_path):
     gone = tmp_path / "gone"
     shutil.copytree(whole, gone)
     (gone / "sweep.zarr" / "fit" / "c" / "5").unlink()
-    with pytest.raises(InputError, match="gone: fit has 9 chunks of 10 that are finished"):
+    with pytest.raises(InputError, match="gone: fit has 9 of 10 finished chunks"):
         run(gone, resume=True)
 
 
@@ -305,7 +305,7 @@ def test_a_store_that_is_no_store_is_refused(run, whole, tmp_path):
     out = tmp_path / "broken"
     shutil.copytree(whole, out)
     (out / "sweep.zarr" / "zarr.json").write_text("{")
-    with pytest.raises(InputError, match="is no store of a sweep"):
+    with pytest.raises(InputError, match="is not a store of a sweep"):
         run(out, resume=True)
 
 

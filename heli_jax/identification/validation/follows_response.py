@@ -8,8 +8,11 @@ of such a correlation is Bartlett's: the sum over all lags of the product of bot
 (L. D. Haugh, J. Am. Stat. Assoc. 71, 1976).
 
 An output responds to the motion of a stick within the same sample, and the stick then moves on
-from there. That is no feedback. So the innovations are also freed of the inputs up to their sample,
-in parts of a sample. The test misses feedback within a sample.
+from there. That is no feedback. Two tests exclude it:
+
+- The innovations are also freed of the inputs up to their sample, in parts of a sample. This test
+  misses only feedback within a sample.
+- The input is freed of its own past in parts of a sample. This test sees feedback within a sample.
 
 An input that is logged late follows the response too, and no correlation separates the two. With an
 estimated negative delay the input is shifted earlier; otherwise the report names a late log as the
@@ -151,7 +154,7 @@ LEVEL = 0.01
 RATE = 50.0
 """Highest rate of the test [Hz]; feedback to a vehicle is slower than a quarter of it."""
 _SLOW_RATE = 10.0
-"""Lowest rate of the test [Hz]."""
+"""Rate at which slow feedback, such as a pilot's, shows through a sensor's noise [Hz]."""
 _PARTS = 5
 """Largest number of parts into which an input is split within a sample of a lower rate."""
 _LONGEST = 2.0
@@ -201,75 +204,105 @@ def feedback(
 ) -> tuple[Feedback, ...]:
     """Return for each freely moving input the past innovations that it follows most significantly.
 
-    The result is empty if no output moves and is measured, no input moves freely, or the record is
-    too short.
+    The result is empty if the record is too short.
 
     Args:
         together: number of flights that are tested together, for the p-values.
         earlier: shift of each input to earlier times [s]; zero by default.
     """
     # A record cannot show a delay beyond half of its length.
-    most = flight.n_samples // 2
-    steps = {n: min(math.ceil(s / flight.dt - 1e-9), most) for n, s in (earlier or {}).items()}
-    inputs, outputs, parts, dt = _decimated(flight, steps, _rate_of(flight))
-    if not outputs or next(iter(outputs.values())).size < _LEAST:
-        return ()
-    # A lower rate turns steps into slopes: the highest rate shows whether an input moves freely.
-    quick, *_ = _decimated(flight, steps, RATE)
-    moving = [n for n in inputs if _moves_freely(quick.get(n, inputs[n]))]
-    free = {n: v for n in moving if (v := _unforeseen(inputs[n])) is not None}
-    if not free:
-        return ()
-    # All signals together predict the outputs: otherwise the response to an input would look like
-    # feedback. A sample's own inputs join the outputs before it.
-    y = np.stack(list(outputs.values()), axis=1)
-    now = np.concatenate(list(parts.values()), axis=1)
-    now = np.concatenate([now[1:], now[-1:]])
-    innovations = arx_residuals(y, np.concatenate([y, now], axis=1))
-    if innovations is None:
-        return ()
-    blocks = lag_blocks(max(1, min(round(_LONGEST / dt), len(innovations) // 10)))
-    # Bonferroni: one test in a hundred records fails by chance, not one in a hundred lags.
-    count = together * len(inputs) * len(outputs) * len(blocks)
-    made = []
-    for name, v in free.items():
-        each = correlations_with_sums(v, innovations, blocks)
-        # Several p-values may underflow to zero: then the correlation decides.
-        best = np.lexsort((each.correlation.ravel(), each.p_value.ravel()))[0]
-        k, b = divmod(int(best), len(blocks))
-        made.append(
-            Feedback(
-                flight.name or "flight 1",
-                name,
-                list(outputs)[k],
-                float(each.correlation[k, b]),
-                (blocks[b][0] * dt, blocks[b][1] * dt),
-                min(1.0, count * float(each.p_value[k, b])),
-                steps.get(name, 0) * flight.dt,
-            )
-        )
-    return tuple(made)
+    most, dt = flight.n_samples // 2, flight.dt
+    steps = {n: min(math.ceil(s / dt - 1e-9), most) for n, s in (earlier or {}).items()}
+    by_rate = [views for rate in _rates_of(flight) if (views := _views(flight, steps, rate))]
+    found: dict[str, Feedback] = {}
+    for views in by_rate:
+        N = len(views[0].innovations)
+        blocks = lag_blocks(max(1, min(round(_LONGEST / views[0].dt), N // 10)))
+        seconds = [(first * views[0].dt, last * views[0].dt) for first, last in blocks]
+        for view in views:
+            # Bonferroni: one test in a hundred records fails by chance, not one in a hundred lags.
+            count = len(views) * view.inputs * len(view.outputs) * len(blocks)
+            for name, free in view.free.items():
+                each = correlations_with_sums(free, view.innovations, blocks)
+                for k, b in np.ndindex(each.p_value.shape):
+                    one = Feedback(
+                        flight.name or "flight 1",
+                        name,
+                        view.outputs[k],
+                        float(each.correlation[k, b]),
+                        seconds[b],
+                        min(1.0, together * len(by_rate) * count * float(each.p_value[k, b])),
+                        steps.get(name, 0) * dt,
+                    )
+                    # Several p-values may underflow to zero: then the correlation decides.
+                    found[name] = min(
+                        found.get(name, one), one, key=lambda f: (f.p_value, f.correlation)
+                    )
+    return tuple(found.values())
 
 
-def _rate_of(flight: Flight) -> float:
-    """Return the sampling rate at which a flight is tested [Hz]."""
+def _rates_of(flight: Flight) -> tuple[float, ...]:
+    """Return the sampling rates at which a flight is tested [Hz]."""
     # Use no more than the inputs' rate and half of the log's. The log does not show how a stick
     # moved within a sample, so the response to this motion would count as an innovation.
     frames = [0.5]
     for u in flight.inputs.values():
         at = np.flatnonzero(np.diff(u) != 0.0)
         frames += [1.0 / float(np.median(np.diff(at)))] if at.size > 1 else []
-    return float(np.clip(min(frames) / flight.dt, _SLOW_RATE, RATE))
+    fast = float(np.clip(min(frames) / flight.dt, _SLOW_RATE, RATE))
+    return (fast, _SLOW_RATE) if fast > _SLOW_RATE else (fast,)
 
 
-def _unforeseen(u: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"] | None:
-    """Return the residual of an input after its own past, without jumps.
+class _View(NamedTuple):
+    """Unpredicted parts of a flight's inputs and outputs at one rate."""
+
+    free: dict[str, np.ndarray]
+    """Part (N,) of each input that its own past does not predict."""
+    innovations: Float[np.ndarray, "N p"]
+    outputs: tuple[str, ...]
+    inputs: int
+    """Number of inputs that move."""
+    dt: float
+
+
+def _views(flight: Flight, steps: Mapping[str, int], rate: float) -> list[_View]:
+    """Return the signals of both tests; arguments as in `_decimated`.
+
+    The list is empty if no output moves and is measured, the record is too short, or no input moves
+    freely.
+    """
+    inputs, outputs, parts, dt = _decimated(flight, steps, rate)
+    if not outputs or next(iter(outputs.values())).size < _LEAST:
+        return []
+    # A lower rate turns steps into slopes: the highest rate shows whether an input moves freely.
+    quick, *_ = _decimated(flight, steps, RATE)
+    moving = [n for n in inputs if _moves_freely(quick.get(n, inputs[n]))]
+    free = {n: v for n in moving if (v := _unforeseen(inputs[n], inputs[n][:, None])) is not None}
+    if not free:
+        return []
+    finer = {n: v for n in free if (v := _unforeseen(inputs[n], parts[n])) is not None}
+    y = np.stack(list(outputs.values()), axis=1)
+    u = np.stack(list(inputs.values()), axis=1)
+    # All signals together predict the outputs: otherwise the response to an input would look like
+    # feedback. A sample's own inputs join the outputs before it.
+    now = np.concatenate(list(parts.values()), axis=1)
+    now = np.concatenate([now[1:], now[-1:]])
+    given = arx_residuals(y, np.concatenate([y, now], axis=1))
+    past = arx_residuals(y, np.concatenate([y, u], axis=1))
+    names = tuple(outputs)
+    pairs = ((free, given), (finer, past))
+    return [_View(v, e, names, len(inputs), dt) for v, e in pairs if e is not None and v]
+
+
+def _unforeseen(
+    u: Float[np.ndarray, " N"], own: Float[np.ndarray, "N m"]
+) -> Float[np.ndarray, " N"] | None:
+    """Return the residual (N,) of an input after its own past (N, m), without jumps.
 
     None if nothing is left. A pilot's test steps are larger than the corrections of a gust and
     would hide them. The input alone selects the jumps, so that the test stays valid.
     """
-    own = u[:, None]
-    left = arx_residuals(own, own)
+    left = arx_residuals(u[:, None], own)
     for _ in range(_ROUNDS):
         if left is None:
             return None
