@@ -18,7 +18,7 @@ from heli_jax.config.experiment import Experiment
 from heli_jax.config.kinematics import NOISES, SIZES
 from heli_jax.dynamics.kinematics import FORCES, RATES, is_kinematic
 from heli_jax.errors import InputError
-from heli_jax.finding import Finding, once
+from heli_jax.finding import Finding, without_repeats
 from heli_jax.identification.diagnostics.search import FAR
 from heli_jax.identification.result import Estimate
 from heli_jax.numbers import with_sd
@@ -289,7 +289,7 @@ def _doubts(run: FitRun, errors: Sequence[SensorError]) -> tuple[Finding, ...]:
     # The verdict covers channels that the simulation misses. The remedies of these findings are for
     # vehicles.
     of_model = ("adequacy.", "dynamics.", "excitation.")
-    notes = once(
+    notes = without_repeats(
         f for f in run.fit.findings if f.severity != "ok" and not f.code.startswith(of_model)
     )
     scales = [

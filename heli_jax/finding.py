@@ -120,7 +120,7 @@ def as_data(finding: Finding) -> dict[str, Any]:
     return {**finding._asdict(), "shifts": dict(finding.shifts)}
 
 
-def once(findings: Iterable[Finding]) -> list[Finding]:
+def without_repeats(findings: Iterable[Finding]) -> list[Finding]:
     """Return the findings without repeated sentences."""
     by_sentence: dict[str, Finding] = {}
     for finding in findings:
@@ -130,7 +130,7 @@ def once(findings: Iterable[Finding]) -> list[Finding]:
 
 def sentences(findings: Iterable[Finding]) -> list[str]:
     """Return the sentences of findings without repetition."""
-    return [f.sentence for f in once(findings)]
+    return [f.sentence for f in without_repeats(findings)]
 
 
 def distrusted(findings: Sequence[Finding], estimates: Mapping[str, Any]) -> dict[str, Distrust]:
@@ -169,7 +169,7 @@ def distrusted(findings: Sequence[Finding], estimates: Mapping[str, Any]) -> dic
     return out
 
 
-def weighed(findings: Iterable[Finding], estimates: Mapping[str, Any]) -> list[Finding]:
+def rated(findings: Iterable[Finding], estimates: Mapping[str, Any]) -> list[Finding]:
     """Return the findings, with severity doubt if a misfit makes an interval unusable, else note.
 
     Args:

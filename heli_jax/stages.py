@@ -126,7 +126,7 @@ def stage(
             work.seconds[name or words] = work.seconds.get(name or words, 0.0) + spent
 
 
-def watched() -> bool:
+def is_watched() -> bool:
     """True if there is an observer; otherwise progress need not be computed."""
     work = _work.get()
     return work is not None and work.observer is not None

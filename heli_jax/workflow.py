@@ -18,7 +18,7 @@ from heli_jax.config import Experiment
 from heli_jax.config.frequency import asked_handling, missing_handling
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.errors import InputError, located, require_kind
-from heli_jax.finding import Finding, note, once
+from heli_jax.finding import Finding, note, without_repeats
 from heli_jax.identification.equation_error.rls import Baseline, baseline
 from heli_jax.identification.fit import check, fit, rates
 from heli_jax.identification.problem import Problem
@@ -243,7 +243,7 @@ def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Ch
 def reading_notes(problem: Problem) -> list[Finding]:
     """Return the notes of the logs' readers, and notes on the origin of estimated start values."""
     guess = problem.first_guess
-    return once((*log_notes(problem), *(guess.findings if guess else ())))
+    return without_repeats((*log_notes(problem), *(guess.findings if guess else ())))
 
 
 def log_notes(problem: Problem) -> list[Finding]:
@@ -264,7 +264,7 @@ def log_notes(problem: Problem) -> list[Finding]:
             if flight.hold[name] != "zero-order"
         ]
     # Flights may be windows of one log, so repeated notes are removed.
-    return once(notes)
+    return without_repeats(notes)
 
 
 def _baseline(config: Experiment, problem: Problem, fitted: Fit, progress: Say) -> Baseline | None:

@@ -38,16 +38,16 @@ def test_outermost_stages_make_up_the_time():
 def test_an_observer_hears_of_stages_of_its_own_thread_alone():
     heard = Heard()
     with stages.observed_by(heard):
-        assert stages.watched()
+        assert stages.is_watched()
         with stages.stage("outer", total=3), stages.recorded(), stages.stage("inner"):
             stages.advance(2, "cost 1")
         with stages.stage("reading", shown=False):
             pass
-        other = threading.Thread(target=lambda: heard.said.append(stages.watched()))
+        other = threading.Thread(target=lambda: heard.said.append(stages.is_watched()))
         other.start()
         other.join()
     assert heard.said == ["+outer", "+inner", "-inner 2", "-outer 0", False]
-    assert not stages.watched()
+    assert not stages.is_watched()
     with stages.stage("nobody listens"):
         stages.advance()
 

@@ -8,9 +8,9 @@ import scipy.signal
 
 from heli_jax import cli, yaml_file
 from heli_jax.numerics.white_noise import (
+    has_coloured_noise,
     noise_guess,
     rises_when_slower,
-    wanders,
     without_noise,
 )
 
@@ -32,23 +32,25 @@ def angles(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("seed", range(5))
 def test_an_integrated_rate_wanders_and_white_noise_does_not(seed: int) -> None:
     gyro, sensor, integrated = angles(seed)
-    assert wanders(integrated)
-    assert not wanders(gyro)
-    assert not wanders(sensor)
+    assert has_coloured_noise(integrated)
+    assert not has_coloured_noise(gyro)
+    assert not has_coloured_noise(sensor)
     # Lost samples and a rounding to 0.001 degrees change nothing.
     lost = np.random.default_rng(seed).random(T.size) < 0.02
-    assert wanders(np.where(lost, np.nan, np.radians(np.round(np.degrees(integrated), 3))))
+    assert has_coloured_noise(
+        np.where(lost, np.nan, np.radians(np.round(np.degrees(integrated), 3)))
+    )
     # A sensor half as fast repeats its values.
-    assert not wanders(np.repeat(sensor[::2], 2))
+    assert not has_coloured_noise(np.repeat(sensor[::2], 2))
     # A few samples give no result.
-    assert not wanders(integrated[:300])
+    assert not has_coloured_noise(integrated[:300])
 
 
 def test_a_smoothed_signal_has_no_noise_of_a_sensor() -> None:
     gyro, _, _ = angles(0)
     smooth = np.sin(T) + 0.3 * np.sin(3.1 * T)
     assert without_noise(smooth)
-    assert wanders(smooth)
+    assert has_coloured_noise(smooth)
     assert not without_noise(gyro)
     assert noise_guess(gyro) == pytest.approx(0.03, rel=0.1)
     assert not without_noise(np.zeros(10))
@@ -92,7 +94,7 @@ def test_noise_that_went_through_a_low_pass_shows_below_white_noise(seed: int) -
     a = np.exp(-2 * np.pi * 10.0 * 0.01)
     filtered = np.asarray(scipy.signal.lfilter([np.sqrt(1 - a * a)], [1, -a], before))
     assert rises_when_slower(filtered + white, 3)
-    assert not wanders(filtered + white)
+    assert not has_coloured_noise(filtered + white)
     lost = rng.random(3000) < 0.2
     assert rises_when_slower(np.where(lost, np.nan, filtered), 3)
     assert not rises_when_slower(np.where(lost, np.nan, white), 3)

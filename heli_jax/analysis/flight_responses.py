@@ -34,7 +34,7 @@ from heli_jax.analysis.spectra import (
 )
 from heli_jax.analysis.transfer_fit import Hold, Measured, TransferFit, fit_transfer
 from heli_jax.finding import Finding, note, sentences
-from heli_jax.flights.flight import Flight, own_instruments, own_said
+from heli_jax.flights.flight import Flight, own_instrument_note, own_instruments
 from heli_jax.flights.holds import without_jumps
 from heli_jax.flights.parts import spans
 
@@ -166,7 +166,9 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
         words = f"{n} was logged at {rate:.3g} Hz: no response to it above {half:.3g} Hz"
         notes.append(note("responses.logged-slowly", words, n, value=rate))
     if own:
-        notes.append(note("loop.instrument-unused", f"{own_said(own)}; it is not used", *own))
+        notes.append(
+            note("loop.instrument-unused", f"{own_instrument_note(own)}; it is not used", *own)
+        )
     outputs: dict[str, Output] = {}
     windows: dict[str, Windows] = {}
     names = (inputs, instruments)

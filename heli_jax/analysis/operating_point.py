@@ -96,7 +96,7 @@ def _trimmed(model: Model, params: Any, condition: Condition) -> OperatingPoint 
             steady = trim(model, params, flight)
         except ValueError:  # the vehicle cannot fly this condition
             continue
-        return OperatingPoint(steady.state, steady.inputs, f"the trim {flown(flight)}")
+        return OperatingPoint(steady.state, steady.inputs, f"the trim {condition_in_words(flight)}")
     return None
 
 
@@ -209,7 +209,7 @@ def _mean_rate(outputs: Mapping[str, np.ndarray], axis: str, dt: float) -> float
     return 0.0
 
 
-def flown(condition: Condition) -> str:
+def condition_in_words(condition: Condition) -> str:
     """Return a condition in words: `in hover`, `at 12 m/s ahead`."""
     named = (
         ("ahead", condition.forward_speed),

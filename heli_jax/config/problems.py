@@ -228,7 +228,7 @@ def candidate_models(experiment: Experiment, fitted: Problem) -> "Alternatives":
         InputError: no axis of the model can be disturbed.
     """
     # Not before it is needed: it imports the optimiser, which takes a second.
-    from heli_jax.identification.select import alternatives, undisturbed_too
+    from heli_jax.identification.select import alternatives, other_axes
 
     model, disturbance = experiment.model, experiment.config.disturbance
     axes = disturbable(model)
@@ -241,7 +241,7 @@ def candidate_models(experiment: Experiment, fitted: Problem) -> "Alternatives":
     # With a list, the other axes are candidates as well. With `axis: roll` the axis is fixed and
     # only its poles are compared.
     requested = (
-        stated if disturbance is not None and disturbance.axis else undisturbed_too(model, stated)
+        stated if disturbance is not None and disturbance.axis else other_axes(model, stated)
     )
     with located(f"{experiment.path}: disturbance"):
         return alternatives(fitted, model, requested, stated=stated)

@@ -359,7 +359,7 @@ def own_instruments(flights: Sequence[Flight], names: Sequence[str]) -> tuple[st
     return tuple(own)
 
 
-def own_said(names: Sequence[str]) -> str:
+def own_instrument_note(names: Sequence[str]) -> str:
     """Return the note about instruments that are the input itself."""
     return (
         f"instrument of {', '.join(names)}: it is the input itself, which feedback correlates "

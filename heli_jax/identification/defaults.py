@@ -13,7 +13,7 @@ from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import LowPass, Model
 from heli_jax.flights.flight import Flight
-from heli_jax.numerics.white_noise import rises_when_slower, wanders
+from heli_jax.numerics.white_noise import has_coloured_noise, rises_when_slower
 from heli_jax.vehicle import of_helicopter
 
 _WHITE_TO = 3.0
@@ -34,7 +34,7 @@ def _shows(low_pass: LowPass, flight: Flight) -> bool:
     signal = flight.outputs[low_pass.output]
     # Noise added behind the filter, or coarse resolution, hides the fall near the Nyquist
     # frequency.
-    return wanders(signal) or rises_when_slower(signal, max(2, int(above)))
+    return has_coloured_noise(signal) or rises_when_slower(signal, max(2, int(above)))
 
 
 # Params, states and inputs are Any, because each model has its own records.

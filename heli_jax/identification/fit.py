@@ -143,10 +143,10 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
     c = Context(problem, at, guess.e, verdict_of(problem, guess.layout, guess.e))
     notes = tuple(gusts_guessed(c))
     # A record that is mostly at rest may still have a good window.
-    asked = (rates_enough, nothing_follows)
+    chosen = (rates_enough, nothing_follows)
     record = tuple(
         f._replace(severity="doubt") if f.code == NOTHING_FOLLOWS else f
-        for diagnostic in asked
+        for diagnostic in chosen
         for f in diagnostic(c)
         if f.bad
     )
@@ -194,11 +194,11 @@ def fit(
         ended = search(problem, guess, starts, seed, max_steps, report)
     timing = {"fit": time.perf_counter() - began}
     with stage("intervals and verdicts"), np.errstate(over="ignore", invalid="ignore"):
-        c = _where_ended(problem, guess, before, ended)
+        c = _context_at_optimum(problem, guess, before, ended)
         return _result(c, ended.runs, seed, timing)
 
 
-def _where_ended(
+def _context_at_optimum(
     problem: Problem, guess: FirstGuess, before: Verdict, ended: SearchResult
 ) -> Context:
     """Return the Context at the end of the search."""

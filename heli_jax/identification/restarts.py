@@ -80,7 +80,7 @@ def _diverges(at: SearchState) -> bool:
     # Squares of a diverged run may overflow. Infinity exceeds the limit too.
     with np.errstate(all="ignore"):
         misfit = float(np.sum(np.square(np.asarray(guess.e.r, np.float64))))
-    return misfit > _FAR_WORSE * at.search.misfit_of_nothing(guess.noise)
+    return misfit > _FAR_WORSE * at.search.misfit_without_response(guess.noise)
 
 
 def _by_windows(at: SearchState) -> list[StartPoint]:
@@ -132,10 +132,10 @@ def _needs_further_starts(at: SearchState) -> bool:
         moved = [{n: y - np.nanmean(y) for n, y in of.items()} for of in outputs]
         explained = 1.0 - left / sum_of_squares(moved, noise)
         return not (best.best.converged and explained > _LITTLE)
-    return layout.noise_model == "spectrum" and left_stability(at.search, best)
+    return layout.noise_model == "spectrum" and lost_stability(at.search, best)
 
 
-def left_stability(search: Search, optimum: RelaxedOptimum) -> bool:
+def lost_stability(search: Search, optimum: RelaxedOptimum) -> bool:
     """True if the start values are stable and the optimum is not."""
     problem = search.problem
     values = named_values(search.layout, search.data, optimum.best.z)

@@ -215,10 +215,10 @@ class Fit:
         """`yes`, `not judged` (no optimum), or `no (VAF of p is 20.0 %)`."""
         if self.status == "not-converged":
             return "not judged"
-        return f"no ({'; '.join(self.denials)})" if self.denials else "yes"
+        return f"no ({'; '.join(self.reasons_against)})" if self.reasons_against else "yes"
 
     @property
-    def denials(self) -> tuple[str, ...]:
+    def reasons_against(self) -> tuple[str, ...]:
         """Reasons why the model is not adequate, each in a few words."""
         return tuple(dict.fromkeys(f.brief for f in self.findings if f.denies))
 

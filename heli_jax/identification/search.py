@@ -27,7 +27,7 @@ from heli_jax.identification.estimation.noise_covariance import (
 from heli_jax.identification.estimation.output_error import in_time
 from heli_jax.identification.estimation.starts import delay_start, draw, noise_guess_at
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.restarts import RESTARTS, SearchState, left_stability
+from heli_jax.identification.restarts import RESTARTS, SearchState, lost_stability
 from heli_jax.identification.unknowns.layout import layout_of
 from heli_jax.messages import messages
 
@@ -126,7 +126,7 @@ def is_better(over: Search, optimum: RelaxedOptimum, other: RelaxedOptimum) -> b
     """
 
     def passes(o: RelaxedOptimum) -> tuple[bool, bool]:
-        unstable = over.layout.model.linear and left_stability(over, o)
+        unstable = over.layout.model.linear and lost_stability(over, o)
         return o.best.converged, not unstable
 
     if passes(optimum) != passes(other):

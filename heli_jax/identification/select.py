@@ -249,7 +249,7 @@ def _sentences(ranked: tuple[Candidate, ...], compared: list[Nested]) -> list[st
     ]
 
 
-def undisturbed_too(model: Model, names: Sequence[str]) -> tuple[str, ...]:
+def other_axes(model: Model, names: Sequence[str]) -> tuple[str, ...]:
     """Return the named axes and states, then the model's other axes."""
     rest = [axis.name for axis in axes_of(model) if not {axis.name, axis.rate} & set(names)]
     return (*names, *rest)
@@ -302,8 +302,8 @@ class MethodComparison(NamedTuple):
         main = self.results[0].fit
         if main is None:
             return ()
-        beside = (n for n in main.nuisance if n == "time_shift" or n.startswith("gain "))
-        return (*main.estimates, *beside)
+        nuisances = (n for n in main.nuisance if n == "time_shift" or n.startswith("gain "))
+        return (*main.estimates, *nuisances)
 
     def estimate(self, result: MethodResult, name: str) -> Estimate | None:
         """Return a method's estimate of a parameter, delay or gain; None without one."""
@@ -327,24 +327,24 @@ class MethodComparison(NamedTuple):
     def sentences(self) -> tuple[str, ...]:
         """Sentences on agreement and differences."""
         main, *others = self.results
-        said = [f"{r.label} has no numbers: {r.reason}" for r in self.results if r.reason]
+        remarks = [f"{r.label} has no numbers: {r.reason}" for r in self.results if r.reason]
         if main.fit is None:
-            return tuple(said)
+            return tuple(remarks)
         for other in others:
             differences = {n: self.difference(other, n) for n in self.names}
             known = {n: d for n, d in differences.items() if d is not None}
             apart = [f"{n} by {abs(d):.1f}" for n, d in known.items() if abs(d) > APART]
             if apart:
-                said.append(
+                remarks.append(
                     f"{other.label} and {main.label} differ in {', '.join(apart)} joint standard "
                     "deviations: an assumption of one of them is violated in this record."
                 )
             elif known:
-                said.append(
+                remarks.append(
                     f"{other.label} and {main.label} agree within {APART:g} joint standard "
                     f"deviations in {', '.join(known)}."
                 )
-        return tuple(said)
+        return tuple(remarks)
 
 
 def compare_methods(

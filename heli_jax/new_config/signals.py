@@ -12,7 +12,7 @@ from heli_jax.flights.preset import model_inputs, model_outputs
 from heli_jax.new_config import guess, scales, tables, text
 from heli_jax.new_config.guess import Guess, Series
 from heli_jax.new_config.logs import Log
-from heli_jax.numerics.white_noise import wanders, without_noise
+from heli_jax.numerics.white_noise import has_coloured_noise, without_noise
 
 _STICKS_TOO = {"roll", "pitch", "yaw"}
 """Names of motions that sticks have as well."""
@@ -80,7 +80,8 @@ def _wandering(model: Any, log: Log, outputs: Mapping[str, Guess]) -> dict[str, 
     return {
         angle: outputs[angle]
         for angle, rate in rate_by_angle(model).items()
-        if {angle, rate} <= set(outputs) and wanders(log.series[outputs[angle].channel].values)
+        if {angle, rate} <= set(outputs)
+        and has_coloured_noise(log.series[outputs[angle].channel].values)
     }
 
 

@@ -69,7 +69,7 @@ def _divided_differences(at: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.sum(weights * y, axis=1) / np.linalg.norm(weights, axis=1)
 
 
-def wanders(signal: np.ndarray) -> bool:
+def has_coloured_noise(signal: np.ndarray) -> bool:
     """True if a signal's high frequencies are not white noise, as for an angle integrated from a
     rate.
 

@@ -137,7 +137,9 @@ def _of_verdicts(fit: Fit) -> list[Gate]:
     if fit.verdict.identifiable and shares:
         named = ", ".join(f"{n} {percent(s, 0)}" for n, s in shares.items())
         determined = f"determined, by priors: {named}"
-    adequate = f"no: {'; '.join(fit.denials)}" if fit.denials else fit.adequate_in_words
+    adequate = (
+        f"no: {'; '.join(fit.reasons_against)}" if fit.reasons_against else fit.adequate_in_words
+    )
     untrusted = fit.untrusted
     trusted = f"not trusted: {', '.join(untrusted)}" if untrusted else "trusted"
     rows = (

@@ -274,7 +274,7 @@ def lines(fit: Fit) -> tuple[Line, Line, Line]:
         determined = Line("bad", "Not identifiable", text)
     elif fit.untrusted:
         determined = Line("warning", "Identifiable, not trusted", text)
-    adequate = Line("bad", "Not adequate", f"{'; '.join(fit.denials)}.")
+    adequate = Line("bad", "Not adequate", f"{'; '.join(fit.reasons_against)}.")
     if fit.adequate:
         against = [
             f.brief

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from heli_jax.finding import Distrust, Finding, distrusted, exit_code, weighed
+from heli_jax.finding import Distrust, Finding, distrusted, exit_code, rated
 from heli_jax.identification.diagnostics import adequacy
 from heli_jax.identification.diagnostics.context import HeldOut
 from heli_jax.identification.validation.adequacy import assess
@@ -133,7 +133,7 @@ def test_a_misfit_takes_away_the_intervals_that_it_moves_by_more_than_half():
     assert distrusted([absurd], estimates)["a"] == Distrust("x.large", None, "why")
     # A finding without effect is a note; one that contradicts the model stays.
     denies = small._replace(denies=True)
-    assert [f.severity for f in weighed([small, large, unsized, denies], estimates)] == [
+    assert [f.severity for f in rated([small, large, unsized, denies], estimates)] == [
         "note", "doubt", "doubt", "doubt",
     ]  # fmt: skip
 

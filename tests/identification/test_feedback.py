@@ -224,7 +224,7 @@ def told(problem, found, *, white=False, fitted=True):
                 feedback=found,
                 estimates={"Lp": None} if fitted else {},
                 fitted=fitted,
-                arrived=fitted,
+                at_optimum=fitted,
                 white=white,
                 independent=white,
                 params=problem.start_params(),

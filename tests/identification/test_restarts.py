@@ -44,7 +44,7 @@ def test_where_little_is_explained_equation_error_gives_a_start():
 
 
 def test_convergence_then_stability_then_the_posterior_decide(monkeypatch):
-    monkeypatch.setattr(search, "left_stability", lambda over, optimum: optimum.unstable)
+    monkeypatch.setattr(search, "lost_stability", lambda over, optimum: optimum.unstable)
     monkeypatch.setattr(search, "log_posterior", lambda over, optimum: optimum.posterior)
     over = SimpleNamespace(layout=SimpleNamespace(model=SimpleNamespace(linear=True)))
 

@@ -6,7 +6,7 @@ here, and its words in `messages.yaml`.
 
 from collections.abc import Callable, Iterable
 
-from heli_jax.finding import Finding, distrusted, once, weighed
+from heli_jax.finding import Finding, distrusted, rated, without_repeats
 from heli_jax.identification.diagnostics import (
     adequacy,
     dynamics,
@@ -34,7 +34,7 @@ DIAGNOSTICS: tuple[Diagnostic, ...] = (
     loop.moved_by_feedback,
     loop.weak_instruments,
     dynamics.unmodelled_dynamics,
-    dynamics.inputs_ask_otherwise,
+    dynamics.inputs_prefer_other_values,
     adequacy.outputs_explained,
     adequacy.responses_explained,
     adequacy.residual_follows_excitation,
@@ -51,7 +51,7 @@ DIAGNOSTICS: tuple[Diagnostic, ...] = (
 
 def diagnose(c: Context) -> tuple[Finding, ...]:
     """Return all findings at a point, the most severe first."""
-    findings = once(weighed((f for d in DIAGNOSTICS for f in d(c)), c.estimates))
+    findings = without_repeats(rated((f for d in DIAGNOSTICS for f in d(c)), c.estimates))
     return tuple(sorted(findings, key=lambda f: _rank(f, c)))
 
 

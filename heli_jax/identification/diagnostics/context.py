@@ -98,7 +98,7 @@ class Context:
         return self.optimum is not None
 
     @property
-    def arrived(self) -> bool:
+    def at_optimum(self) -> bool:
         """True if the point is an optimum."""
         return self.optimum is not None and bool(self.optimum.best.converged)
 
@@ -157,7 +157,7 @@ class Context:
     def feedback(self) -> tuple[Feedback, ...]:
         """Test results for feedback, by flight and input."""
         # A late log looks like feedback: shift each input to the time at which it acted.
-        delays = {n: (e.value, e.sd) for n, e in self.estimates.items()} if self.arrived else {}
+        delays = {n: (e.value, e.sd) for n, e in self.estimates.items()} if self.at_optimum else {}
         return feedback_of(self.problem, delays)
 
     @property
@@ -177,7 +177,7 @@ class Context:
     @cached_property
     def moved(self) -> dict[str, float]:
         """Share of information that may be feedback, by unknown of interest, in frequency."""
-        if not self.arrived or self.unrelated:
+        if not self.at_optimum or self.unrelated:
             return {}
         poles = self._held_poles
         return moved_by_feedback(self.at, [0.0] * len(poles) if self.instruments else poles)
@@ -239,8 +239,8 @@ class Context:
 
         Empty unless the fit converged, explains the record, and no input follows the response.
         """
-        asked = self.arrived and self.explains and not (self.instruments or self.ahead)
-        if not asked or self.follows:
+        tested = self.at_optimum and self.explains and not (self.instruments or self.ahead)
+        if not tested or self.follows:
             return [], (1.0, {})
         coloured = self.errors.coloured and self.at.layout.noise_model != "spectrum"
         names = [label for label, _ in self.flights]
@@ -307,10 +307,10 @@ class Context:
             self.before,
             white=self.white if self.e.innovations else self.independent,
             aliased=aliased_parameters(self.problem, self.named, noise),
-            second=second_solutions(self.problem, self.at, self.e) if self.arrived else (),
-            optimum=self.arrived,
+            second=second_solutions(self.problem, self.at, self.e) if self.at_optimum else (),
+            optimum=self.at_optimum,
         )
-        if not self.arrived or self.explains:
+        if not self.at_optimum or self.explains:
             return errors
         verdict = errors.verdict
         outputs = [o.output for o in self.adequacy.judged]
@@ -330,7 +330,7 @@ class Context:
     @property
     def status(self) -> Status:
         """Status of the fit: convergence, then identifiability."""
-        if not (self.arrived and np.isfinite(self.e.J).all()):
+        if not (self.at_optimum and np.isfinite(self.e.J).all()):
             return "not-converged"
         return "converged" if self.verdict.identifiable else "not-identifiable"
 
@@ -374,7 +374,7 @@ class Context:
         signals = signals_of(flights, checked.e.simulated, checked.e.innovations)
         in_one_piece, in_frequency = checked.free_run, None
         free_run = signals_of(flights, in_one_piece) if in_one_piece is not None else ()
-        if self.arrived:
+        if self.at_optimum:
             feedback = (self.held or self.follows) and not self.instruments
             in_frequency = validate_in_frequency(problem, at, self.e, flights, feedback=feedback)
         return HeldOut(signals, free_run, in_frequency)

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 from heli_jax.finding import Finding, found
 from heli_jax.identification.diagnostics.context import Context
-from heli_jax.identification.validation.unmodelled import IN_COLOUR, LEVEL
+from heli_jax.identification.validation.unmodelled import LEVEL, LEVEL_COLOURED
 
 RESIDUAL_FOLLOWS_INPUT = "dynamics.residual-follows-input"
 _CODES = {
@@ -35,7 +35,7 @@ def unmodelled_dynamics(c: Context) -> Iterator[Finding]:
         )
 
 
-def inputs_ask_otherwise(c: Context) -> Iterator[Finding]:
+def inputs_prefer_other_values(c: Context) -> Iterator[Finding]:
     """Find parameters whose values by the response to the inputs alone differ from the fit's."""
     p, shifts = c.unmodelled[1]
     if shifts:
@@ -45,5 +45,5 @@ def inputs_ask_otherwise(c: Context) -> Iterator[Finding]:
             *c.at.layout.of_interest,
             value=p,
             shifts=shifts,
-            level=IN_COLOUR,
+            level=LEVEL_COLOURED,
         )

@@ -24,7 +24,7 @@ def inputs_follow_response(c: Context) -> Iterator[Finding]:
     """Find a closed loop, and its effect on estimates by this method."""
     present = [one for one in c.feedback if one.present]
     objective, names = objective_of(c.problem.method), tuple(c.estimates)
-    harmed = c.arrived and not c.independent and objective.noise_model == "white"
+    harmed = c.at_optimum and not c.independent and objective.noise_model == "white"
     if not present:
         if harmed and is_unstable(c.problem, c.params, _HELD):
             yield found("loop.held", "doubt", distrusts=names)
@@ -67,8 +67,8 @@ def inputs_follow_response(c: Context) -> Iterator[Finding]:
 def _frees_a_delay(problem: Problem, late: Sequence[str]) -> str:
     """Return the parameters to free, to distinguish late inputs from a closed loop."""
     own = dict(problem.model.delays)
-    asked = problem.nuisance.time_shift or all(own.get(name) in problem.free for name in late)
-    return "" if asked or not late else "fit.nuisance.time_shift, or delays of the model"
+    estimated = problem.nuisance.time_shift or all(own.get(name) in problem.free for name in late)
+    return "" if estimated or not late else "fit.nuisance.time_shift, or delays of the model"
 
 
 def moved_by_feedback(c: Context) -> Iterator[Finding]:
@@ -100,6 +100,6 @@ def moved_by_feedback(c: Context) -> Iterator[Finding]:
 
 def weak_instruments(c: Context) -> Iterator[Finding]:
     """Find parameters on which the logged excitation has too little information."""
-    names = weak_by_instrument(c.problem, c.at) if c.arrived else ()
+    names = weak_by_instrument(c.problem, c.at) if c.at_optimum else ()
     if names:
         yield found("loop.weak-instrument", "doubt", *names, distrusts=names, limit=STRONG)

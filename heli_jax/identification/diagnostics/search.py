@@ -22,7 +22,7 @@ def at_bound(c: Context) -> Iterator[Finding]:
 def search_stopped(c: Context) -> Iterator[Finding]:
     """Find a search that did not converge."""
     # Rounding has its own finding and remedy.
-    if c.optimum is not None and not (c.arrived or c.rounding):
+    if c.optimum is not None and not (c.at_optimum or c.rounding):
         yield found(STOPPED, "doubt", value=float(sum(s for s, _ in c.optimum.trace)))
 
 

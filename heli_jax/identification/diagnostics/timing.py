@@ -28,7 +28,7 @@ _CODES = {
 
 def signals_shifted(c: Context) -> Iterator[Finding]:
     """Find signals at another time, or inputs with the other hold, if this explains more."""
-    if not (c.arrived and c.explains) or c.instruments:
+    if not (c.at_optimum and c.explains) or c.instruments:
         return
     one = shift_in_time(c.problem, c.at, c.e, _outputs_in_doubt(c))
     if one is None:

@@ -276,7 +276,7 @@ def turned_from_start(c: Context) -> Iterator[Finding]:
     An inverted signal fits equally well, so only the start value shows it.
     """
     turned = {}
-    for name, free in c.problem.free.items() if c.arrived else ():
+    for name, free in c.problem.free.items() if c.at_optimum else ():
         e = c.estimates[name]
         if name in c.problem.model.delay_parameters or e.lower95 is None or e.upper95 is None:
             continue

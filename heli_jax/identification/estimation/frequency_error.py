@@ -29,7 +29,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from heli_jax import naming
-from heli_jax.analysis.operating_point import flown
+from heli_jax.analysis.operating_point import condition_in_words
 from heli_jax.analysis.spectra import windowed
 from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import Flight
@@ -263,7 +263,7 @@ def linearisation_notes(at: Solution, e: Evaluation) -> list[Finding]:
     sds = dict(zip(layout.of_interest, deviations(J)[:q] * np.abs(e.slopes), strict=True))
     in_sds = {n: v / sds[n] for n, v in shifts.items()}
     facts = layout.flight_facts
-    conditions = [None if f.condition is None else flown(f.condition) for f in facts]
+    conditions = [None if f.condition is None else condition_in_words(f.condition) for f in facts]
     where = [f"the trim {c}" if c else "the equilibrium at its mean inputs" for c in conditions]
     moved = [f"{n} by {v:+.2g}" for n, v in in_sds.items() if abs(v) >= _NOTABLE]
     if not known:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from heli_jax import naming
 from heli_jax.errors import nearest
 from heli_jax.finding import Finding, note
-from heli_jax.flights.flight import Flight, own_instruments, own_said
+from heli_jax.flights.flight import Flight, own_instrument_note, own_instruments
 from heli_jax.identification.estimation.frequency_lines import in_time_of, lines_of
 from heli_jax.identification.estimation.frequency_noise import once_a_length, smoothed
 from heli_jax.identification.problem import Problem
@@ -63,7 +63,7 @@ def absent_instrument(problem: Problem) -> str | None:
         if why is not None:
             return f"instrument of {name}: {why}; expected one in every flight, or instrument: none"
     own = own_instruments(problem.training, problem.instrument or ())
-    return own_said(own) if own else None
+    return own_instrument_note(own) if own else None
 
 
 def instrumented_inputs(

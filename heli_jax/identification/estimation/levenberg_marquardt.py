@@ -146,7 +146,7 @@ def optimise(
             if accepted:
                 short = _is_short(at, trial, sizes, start)
                 at = trial
-            if stages.watched():
+            if stages.is_watched():
                 stages.advance(detail=f"cost {at.squares / count:.4g}")
         converged = gain < CONVERGED or (short and gain < _STUCK * at.squares)
         moved = float(np.sum(np.square(at.J @ (at.z - start))))

@@ -74,7 +74,7 @@ class Search:
             # An optimiser may converge where the model explains nothing, because its gradient is
             # zero there. Both costs are means over the measured values.
             if not run.cost <= _GOOD:
-                nothing = self.misfit_of_nothing(noise) / measured_count(self.data)
+                nothing = self.misfit_without_response(noise) / measured_count(self.data)
                 run = run._replace(converged=run.converged and run.cost <= 1.5 * nothing + _GOOD)
             runs.append(run)
             if progress is not None and len(points) > 1:
@@ -91,7 +91,7 @@ class Search:
             return None
         return np.arange(layout.size) >= layout.first_nuisance
 
-    def misfit_of_nothing(self, noise: Noise) -> float:
+    def misfit_without_response(self, noise: Noise) -> float:
         """Return the sum of squares of a model without any response."""
         return sum_of_squares([f.outputs for f in self.data.flights], noise)
 

@@ -278,7 +278,9 @@ def analyse(
         sensitivity: (any, q) with the nuisances free, and without rows of priors. Weak priors of
             nuisances would bound a parameter that is exchangeable with a bias.
     """
-    nuisances = nuisances or Nuisances(*[sensitivity] * 3, np.zeros((0, len(unknowns))), ())
+    if nuisances is None:
+        none = np.zeros((0, len(unknowns)))
+        nuisances = Nuisances(sensitivity, sensitivity, sensitivity, none, ())
     scale, own = np.array([u.scale for u in unknowns]), np.array([u.prior for u in unknowns])
     names = [u.name for u in unknowns]
     # A prior is a row with one over its sd.

@@ -78,7 +78,7 @@ class Drive(NamedTuple):
     """Damping of the filters, and step of the logarithm of their frequency.
 
     Drives other than inputs are also tested without a filter."""
-    beside: tuple[int, ...] = ()
+    removed_first: tuple[int, ...] = ()
     """Columns whose response through the same filter is removed first."""
     unknown: int | None = None
     """The unknown that changes."""
@@ -203,8 +203,8 @@ def strongest(records: Sequence[Lines], drives: Sequence[Drive]) -> Strongest:
     anew = _without(known.astype(np.float32), anew)
     anew *= np.sqrt(freedom / np.sum(anew**2, axis=0))
     of_chance = [each.gains(known_lines, _complex(anew).T).max(axis=(0, 1)) for each in trials]
-    own = one.beside + 2 * at
-    through = one.columns[[*range(one.beside), own, own + 1]]
+    own = one.removed_first + 2 * at
+    through = one.columns[[*range(one.removed_first), own, own + 1]]
     response = _responses(one.filters[[of_filter]], angles)
     steps = _steps(rows, _real((response * through).T), residual)
     p_value = _by_chance(gain, np.max(of_chance, axis=0))
@@ -242,7 +242,7 @@ class _Trial(NamedTuple):
     bands: _Bands
 
     @property
-    def beside(self) -> int:
+    def removed_first(self) -> int:
         """Number of columns before those of the drives."""
         return len(self.columns) - 2 * len(self.drives)
 
@@ -258,7 +258,7 @@ class _Trial(NamedTuple):
         """
         response = _responses(self.filters, self.bands.angles)
         power = np.real(response) ** 2 + np.imag(response) ** 2
-        d, b, columns = len(self.drives), self.beside, self.columns
+        d, b, columns = len(self.drives), self.removed_first, self.columns
         pairs = columns[:, None] * np.conj(columns[:b])
         whole = np.tensordot(power, self.bands.sums(np.real(pairs)), (1, 2))
         own = columns[b:].reshape(d, 2, -1)
@@ -301,11 +301,11 @@ def _trials(
     """
     low, high = 2.0 * float(angles[0]), 0.9 * float(angles[-1])
     back, bands = np.exp(-1j * angles), _bands(angles)
-    for (bank, plain, beside), group in itertools.groupby(
-        drives, lambda d: (d.bank, d.kind != "input", d.beside)
+    for (bank, plain, removed_first), group in itertools.groupby(
+        drives, lambda d: (d.bank, d.kind != "input", d.removed_first)
     ):
         those = tuple(group)
-        columns = np.concatenate([ends, X[[*beside]], X[[d.column for d in those]]])
+        columns = np.concatenate([ends, X[[*removed_first]], X[[d.column for d in those]]])
         columns = np.stack([columns, columns * back], axis=1).reshape(-1, len(back))
         filters = [(np.inf, 0.0)] if plain else []
         for damping, step in bank:
@@ -417,10 +417,10 @@ def _steps(
     q = J.shape[1]
     # e falls by J times the step.
     alone = -np.linalg.lstsq(columns[:, :q], e[:, 0], rcond=1e-6)[0]
-    beside = -np.linalg.lstsq(columns, e[:, 0], rcond=1e-6)[0]
+    removed_first = -np.linalg.lstsq(columns, e[:, 0], rcond=1e-6)[0]
     over = np.where(sizes > 0, sizes, np.inf)
-    amount = float(np.sum(beside[-2:] / over[-2:]))
-    return (beside[:q] - alone) / over[:q], alone / over[:q], amount
+    amount = float(np.sum(removed_first[-2:] / over[-2:]))
+    return (removed_first[:q] - alone) / over[:q], alone / over[:q], amount
 
 
 def _real(v: Complex[np.ndarray, "K c"]) -> Float[np.ndarray, "K2 c"]:

@@ -115,7 +115,7 @@ def of_one_clock(at: Solution, e: Evaluation, name: str) -> list[tuple[int, OwnS
     The output moves and the simulation follows it. Of these flights the longest are taken. All
     share one sample time and one clock of the output, since filters count samples.
     """
-    flights, asked = at.data.flights, list[tuple[int, OwnSamples]]()
+    flights, tested = at.data.flights, list[tuple[int, OwnSamples]]()
     sizes = [next(iter(f.outputs.values())).shape[0] for f in flights]
     order = np.argsort(sizes, kind="stable")[::-1].tolist()
     dt = float(flights[order[0]].dt)
@@ -127,8 +127,8 @@ def of_one_clock(at: Solution, e: Evaluation, name: str) -> list[tuple[int, OwnS
         with np.errstate(over="ignore", invalid="ignore"):
             size = np.std(np.asarray(e.raw[i][name])[own.rows]) / np.std(y[own.rows])
         if _ROUNDING < size < np.sqrt(1.0 - _DIVERGED):
-            asked.append((i, own))
-    return [(i, own) for i, own in asked if own.every == asked[0][1].every]
+            tested.append((i, own))
+    return [(i, own) for i, own in tested if own.every == tested[0][1].every]
 
 
 def sensitivities(at: Solution, e: Evaluation) -> dict[tuple[int, str], np.ndarray]:
@@ -218,7 +218,7 @@ def _normal(v: np.ndarray) -> np.ndarray:
     return v / size if size > 0 else v
 
 
-LEVEL, IN_COLOUR = 0.01, 1e-3
+LEVEL, LEVEL_COLOURED = 0.01, 1e-3
 """Significance level of all tests together, and the level if residuals in time are autocorrelated.
 
 In strong gusts the whitening filter is too short to remove all autocorrelation."""
@@ -268,7 +268,7 @@ def unmodelled(
     names = sorted({n for outputs in layout.outputs for n in outputs if of_one_clock(at, e, n)})
     if not names:
         return nothing
-    level = (IN_COLOUR if coloured else LEVEL) / len(names)
+    level = (LEVEL_COLOURED if coloured else LEVEL) / len(names)
     lacking, J = [], sensitivities(at, e)
     each = {name: _lines(at, e, name, J, flights) for name in names}
     for name, (drives, records) in each.items():
@@ -280,12 +280,12 @@ def unmodelled(
             strongest(_lines(at, e, name, J, flights, _WILD)[1], drives).p_value < level
         ):
             lacking.append(_told(at, e, name, strong, J))
-    asked, k = [records for _, records in each.values() if records], len(layout.of_interest)
-    chances = [pulled_away(records, k) for records in asked]
+    tested, k = [records for _, records in each.values() if records], len(layout.of_interest)
+    chances = [pulled_away(records, k) for records in tested]
     p = min(1.0, min(chances) * len(chances)) if chances else 1.0
-    if p > IN_COLOUR:
+    if p > LEVEL_COLOURED:
         return lacking, (p, {})
-    step = step_to_least([one for records in asked for one in records])[:k] * np.asarray(e.slopes)
+    step = step_to_least([one for records in tested for one in records])[:k] * np.asarray(e.slopes)
     return lacking, (p, dict(zip(layout.of_interest, step.tolist(), strict=True)))
 
 
@@ -308,12 +308,12 @@ def _where_least(
             break
         there = at._replace(z=at.z + part * jnp.asarray(strong.step, at.z.dtype))
         e = evaluate(*there)
-        asked, again = _lines(there, e, name, sensitivities(there, e), called)
-        if not asked or not _deviance(again) < _deviance(records):
+        tested, again = _lines(there, e, name, sensitivities(there, e), called)
+        if not tested or not _deviance(again) < _deviance(records):
             part *= 0.25
             continue
         gained, at, records, part = _deviance(records) - _deviance(again), there, again, 1.0
-        strong = strongest(records, asked)
+        strong = strongest(records, tested)
         if gained < _ENOUGH:
             break
     return strong
