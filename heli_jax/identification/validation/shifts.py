@@ -26,6 +26,7 @@ from heli_jax.identification.estimation.evaluation import (
     pseudoinverse,
 )
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
+from heli_jax.identification.estimation.simulated_flights import signal_numbers
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Solution
 
@@ -107,10 +108,7 @@ def _best_place(at: Solution, e: Evaluation, kind: str, name: str) -> tuple[floa
     A negative delay shifts the signal to earlier times.
     """
     dt = float(at.data.flights[0].dt)
-    # The noise keeps its size: otherwise it would follow the residual that a shift takes away.
-    noises = slice(len(at.layout.of_interest), at.layout.first_nuisance)
-    followers = np.delete(np.arange(at.layout.size), noises)
-    left, gains = {0.0: _beside(e.J[:, followers], e.r)}, {0.0: 0.0}
+    left, gains = {0.0: _beside(_without_level(at, e.r, e.J), e.r)}, {0.0: 0.0}
 
     def gained(k: float) -> float:
         """Return the gain if the unknowns follow, for rows as white as the present ones."""
@@ -118,7 +116,7 @@ def _best_place(at: Solution, e: Evaluation, kind: str, name: str) -> tuple[floa
             rows, J = _rows(at, _moved(at.data, kind, name, k * dt))
             gains[k] = -np.inf
             if np.all(np.isfinite(rows)) and np.all(np.isfinite(J)):
-                left[k] = _beside(J[:, followers], rows)
+                left[k] = _beside(_without_level(at, rows, J), rows)
                 gains[k] = _gain(_block(dt), left[0], left[k])
         return gains[k]
 
@@ -149,6 +147,20 @@ def _rows(at: Solution, data: Data) -> tuple[np.ndarray, np.ndarray]:
     """Return the whitened rows (n,) and their slopes (n, q) with other data."""
     there = residual_and_jacobian(at.layout, data, at.noise, at.z)
     return jax.device_get((there.r, there.J))
+
+
+def _without_level(at: Solution, r: np.ndarray, J: np.ndarray) -> np.ndarray:
+    """Return the slopes J (n, q) of innovations over a noise whose mean log variance is fixed.
+
+    The level of the noise would follow the residual that a shift removes. Ratios of noises remain.
+    """
+    if at.layout.noise_model != "disturbance":
+        return J
+    # The row below the innovations is sqrt(N (1 + mean log variance - level)).
+    n, J = signal_numbers(at.layout, at.data).size, J.copy()
+    J[:n] += np.outer(r[:n], J[n]) * (r[n] / np.count_nonzero(r[:n]))
+    J[n] = 0.0
+    return J
 
 
 def _beside(J: np.ndarray, v: np.ndarray) -> Float[np.ndarray, " n"]:
