@@ -1,5 +1,7 @@
 """The response of linear models at the lines of a record, against NumPy."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,11 +13,13 @@ from heli_jax.identification.estimation.frequency_lines import (
     Driving,
     Matrices,
     Record,
+    at_each_line,
     at_lines,
     ends_of,
     errors_of_record,
     modelled,
     projection,
+    sources,
 )
 
 
@@ -32,19 +36,22 @@ def test_every_run_of_a_model_is_its_response_at_the_lines_and_the_effects_of_th
     for k in range(samples):
         y[k] = C @ x + D @ U[k]
         x = A @ x + B @ U[k]
-    z, R = at_lines(machine, Record(0, 0, samples))
+    record = Record(0, 0, samples)
+    z, R = at_lines(machine, record)
     expected = np.linalg.inv(np.asarray(z)[:, None, None] * np.eye(3) - A)
     np.testing.assert_allclose(R, expected, rtol=1e-10)
+    here = sources(record, jax.tree.map(lambda v: v[None], signals))
     ends = z[:, None] * jnp.asarray(first - x + 0j)[None] / samples**0.5
     lines = np.fft.rfft(y, axis=0)[1 : (samples + 1) // 2] / samples**0.5
-    made = modelled(machine, signals, R, ends)
-    np.testing.assert_allclose(made, lines, atol=1e-8 * np.max(np.abs(lines)))
+    made = at_each_line(partial(modelled, machine), R, here._replace(ends=ends[:, :, None]))
+    np.testing.assert_allclose(made[:, :, 0], lines, atol=1e-8 * np.max(np.abs(lines)))
     # Least squares finds the effects of the ends.
     W = jnp.broadcast_to(jnp.eye(2, dtype=complex), (len(z), 2, 2))
-    record, one = Record(0, 0, samples), jax.tree.map(lambda v: v[None], signals)
-    at = ends_of(machine, record, W, one, jnp.asarray(y)[None])
-    left = errors_of_record(machine, record, one, jnp.asarray(y)[None], at.R, at.inputs)
-    np.testing.assert_allclose(left, 0.0, atol=1e-8 * np.max(np.abs(lines)))
+    transforms = jnp.asarray(lines)[:, :, None]
+    at = ends_of(machine, record, W, here, transforms)
+    left = errors_of_record(machine, W, at.R, here._replace(ends=at.inputs), transforms)
+    for errors in (left, at.errors):
+        np.testing.assert_allclose(errors, 0.0, atol=1e-8 * np.max(np.abs(lines)))
 
 
 def test_a_state_that_no_output_shows_adds_nothing():
@@ -68,7 +75,9 @@ def test_slopes_of_the_response_are_those_of_the_whole_expression():
 
     def outputs(*v):
         m, signals = Matrices(*v[:4]), Driving(*v[4:])
-        return modelled(m, signals, at_lines(m, record)[1], jnp.asarray(z)[:, None] * ends[None])
+        here = sources(record, jax.tree.map(lambda v: v[None], signals))
+        here = here._replace(ends=(jnp.asarray(z)[:, None] * ends[None])[:, :, None])
+        return at_each_line(partial(modelled, m), at_lines(m, record)[1], here)[:, :, 0]
 
     def plain(A, B, C, D, U, acting):
         lines, passing = (jnp.fft.rfft(v, axis=0)[1:30] / 60**0.5 for v in (U, acting))

@@ -18,7 +18,6 @@ effect of feedback.
 Sources: Pintelon and Schoukens (2012), chapters 6, 9 and 10; Klein and Morelli (2006), chapter 7.
 """
 
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -54,6 +53,7 @@ from heli_jax.identification.estimation.frequency_lines import (
     errors_of_lines,
     errors_of_record,
     lines_of,
+    lines_of_flights,
     measured,
     orthonormal,
     other_outputs,
@@ -61,7 +61,7 @@ from heli_jax.identification.estimation.frequency_lines import (
     records_of,
     records_of_group,
     shared_of,
-    whitened,
+    sources,
     without_parts,
 )
 from heli_jax.identification.estimation.frequency_noise import (
@@ -312,8 +312,7 @@ def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Floa
 
         y = measured(layout, data, members)
         for record, W in records_of_group(layout, noise, members):
-            e, J, Z = _errors_of_record(model, at, record, W, y, instruments)
-            products.append((e @ e, Z.T @ e, Z.T @ Z, Z.T @ J))
+            products.append(_products_of_record(model, at, record, W, y, instruments))
     ee, Ze, ZZ, ZJ = jax.tree.map(lambda *v: sum(v), *products)
     S = orthonormal(ZZ)
     r, M = S.T @ Ze, S.T @ ZJ
@@ -323,33 +322,37 @@ def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Floa
     return jnp.append(r + M @ (v - at), left)
 
 
-def _errors_of_record(
+def _products_of_record(
     model: Callable[[Array, bool], tuple[Matrices, Driving]],
     v: Float[Array, " q"],
     record: Record,
     W: Complex[Array, "K p p"],
     outputs: Float[Array, "f N p"],
     instruments: bool,
-) -> tuple[Float[Array, " r"], Float[Array, "r q"], Float[Array, "r q"]]:
-    """Return e, J and Z of one record of each flight of a group, with its ends projected out.
+) -> tuple[Float[Array, ""], Float[Array, " q"], Float[Array, "q q"], Float[Array, "q q"]]:
+    """Return e'e, Z'e, Z'Z and Z'J over one record of each flight of a group, without its ends.
 
     Args:
         model: model and inputs of the group by the shared unknowns v, directly or by instrument.
         instruments: take the derivatives Z by instrument; else they are J.
     """
-    m, driving = model(v, False)
-    at = ends_of(m, record, W, driving, outputs)
+    y, (m, driving) = lines_of_flights(record, outputs), model(v, False)
+    ends = ends_of(m, record, W, sources(record, driving), y)
 
-    def errors(v: Array, by_instrument: bool) -> Float[Array, "f r"]:
+    def errors(v: Array, by_instrument: bool) -> Float[Array, "r f"]:
         m, driving = model(v, by_instrument)
+        at = sources(record, driving)
         # Inputs by instrument have no effects of ends.
-        ends = None if by_instrument else at.inputs
-        return whitened(W, errors_of_record(m, record, driving, outputs, at.R, ends))
+        at = at if by_instrument else at._replace(ends=ends.inputs)
+        return errors_of_record(m, W, ends.R, at, y)
 
-    def slopes(by_instrument: bool) -> Float[Array, "r q"]:
-        # Variable projection (Kaufman): derivatives keep the ends fixed.
-        J = jax.jacfwd(functools.partial(errors, by_instrument=by_instrument))(v)
-        return (J - jnp.einsum("rm,sm,fsq->frq", at.Q, at.Q, J)).reshape(-1, v.size)
+    # Variable projection (Kaufman): derivatives keep the ends fixed.
+    e, J = ends.errors[:, :, None], jax.jacfwd(lambda v: errors(v, False))(v)
+    Z = jax.jacfwd(lambda v: errors(v, True))(v) if instruments else J
 
-    J = slopes(False)
-    return errors(v, False).reshape(-1), J, slopes(True) if instruments else J
+    def product(a: Float[Array, "r f c"], b: Float[Array, "r f d"]) -> Float[Array, "c d"]:
+        # The ends' effects are projected out of the products, not out of the long columns.
+        along = [(ends.Q.T @ v.reshape(len(v), -1)).reshape(-1, v.shape[2]) for v in (a, b)]
+        return a.reshape(-1, a.shape[2]).T @ b.reshape(-1, b.shape[2]) - along[0].T @ along[1]
+
+    return product(e, e)[0, 0], product(Z, e)[:, 0], product(Z, Z), product(Z, J)

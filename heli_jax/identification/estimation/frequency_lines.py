@@ -9,6 +9,7 @@ Sources: Pintelon and Schoukens (2012), chapters 6 and 10; Golub and Pereyra (19
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -344,36 +345,58 @@ def at_lines(m: Matrices, record: Record) -> tuple[Complex[Array, " K"], Complex
     return z, jnp.linalg.inv(z[:, None, None] * unit - Ad[None].astype(z.dtype))
 
 
-def modelled(
-    m: Matrices,
-    driving: Driving,
-    R: Complex[Array, "K n n"],
-    ends: Complex[Array, "K n"] | None = None,
-) -> Complex[Array, "K p"]:
-    """Return the outputs at the lines of a record.
+_LINES = 32
+"""Lines that are evaluated together, so that their sensitivities stay in the processor's cache."""
+
+
+class Sources(NamedTuple):
+    """Transforms of what drives one record of each flight of a group."""
+
+    U: Complex[Array, "K r f"]
+    """Inputs of the states, multiplied by B."""
+    held: Complex[Array, "K m f"]
+    """Inputs at the samples, multiplied by D."""
+    ends: Complex[Array, "K n f"] | None = None
+    """Inputs of the states by the ends of the record; default zero."""
+
+
+def lines_of_flights(record: Record, v: Float[Array, "f N c"]) -> Complex[Array, "K c f"]:
+    """Return the transforms of one record of each flight of a group."""
+    # Signals are delayed before they are cut, because an input may be logged before it acts.
+    return lines_of(jnp.moveaxis(v[:, record.first : record.last], 0, -1))
+
+
+def sources(record: Record, driving: Driving) -> Sources:
+    """Return the transforms of inputs over whole flights, without the effects of the ends."""
+    return Sources(*(lines_of_flights(record, v) for v in driving))
+
+
+def at_each_line(of_line: Callable[..., Array], *lines: Any) -> Array:
+    """Evaluate a function at each line; the leading axes of `lines` are the lines."""
+    return jax.lax.map(lambda line: of_line(*line), lines, batch_size=_LINES)
+
+
+def modelled(m: Matrices, R: Complex[Array, "n n"], at: Sources) -> Complex[Array, "p f"]:
+    """Return the outputs at one line.
 
     Args:
-        driving: inputs (N, r) over the record.
-        R: (zI - Ad)^-1 at the lines.
-        ends: inputs of the states by the ends of the record; default zero.
+        R: (zI - Ad)^-1.
+        at: sources at this line.
     """
-    B, C, D, Ad = (v.astype(R.dtype) for v in (m.B, m.C, m.D, m.Ad))
-    inputs = lines_of(driving.U) @ B.T
-    inputs = inputs if ends is None else inputs + ends
+    Ad, B, C, D = (v.astype(R.dtype) for v in m)
+    inputs = B @ at.U if at.ends is None else B @ at.U + at.ends
     # Products replace the derivative of an inverse: dY = C R (dAd X + dU) + dC X. The differences
     # are zero, but their derivatives are not.
-    X = jax.lax.stop_gradient(jnp.einsum("kij,kj->ki", R, inputs))
+    X = jax.lax.stop_gradient(R @ inputs)
     dA, dC = (v - jax.lax.stop_gradient(v) for v in (Ad, C))
-    H = jax.lax.stop_gradient(C)[None] @ R
-    passing = lines_of(driving.held) @ D.T
-    return jnp.einsum("kpn,kn->kp", H, inputs + X @ dA.T) + X @ dC.T + passing
+    return (jax.lax.stop_gradient(C) @ R) @ (inputs + dA @ X) + dC @ X + D @ at.held
 
 
 def real_rows(v: Complex[Array, "K p *c"]) -> Float[Array, "r *c"]:
-    """Return real and imaginary parts of whitened errors as rows of variance 1."""
+    """Return real and imaginary parts of whitened errors as rows of variance 1, line by line."""
     # The real part of a complex normal error has half of its variance.
-    v = 2.0**0.5 * v.reshape(-1, *v.shape[2:])
-    return jnp.concatenate([jnp.real(v), jnp.imag(v)])
+    rows = 2.0**0.5 * jnp.concatenate([jnp.real(v), jnp.imag(v)], axis=1)
+    return rows.reshape(-1, *v.shape[2:])
 
 
 _NO_END = 1e-10
@@ -421,21 +444,23 @@ class Ends(NamedTuple):
     """(zI - Ad)^-1 at the lines."""
     Q: Float[Array, "r m"]
     """Orthonormal effects on the whitened errors."""
-    inputs: Complex[Array, "f K n"]
-    """Inputs of the states by the ends, by flight."""
+    inputs: Complex[Array, "K n f"]
+    """Inputs of the states by the ends."""
+    errors: Float[Array, "r f"]
+    """Whitened errors without these effects."""
 
 
 def ends_of(
     m: Matrices,
     record: Record,
     whitening: Complex[Array, "K p p"],
-    driving: Driving,
-    outputs: Float[Array, "f N p"],
+    at: Sources,
+    outputs: Complex[Array, "K p f"],
 ) -> Ends:
     """Fit the ends of one record of each flight by linear least squares.
 
     Args:
-        driving: inputs over whole flights (f, N, r), like the outputs.
+        outputs: transforms of the measured outputs.
     """
     z, R = at_lines(m, record)
     # A gust that does not end where it began has a jump, which affects all lines. Treated as
@@ -449,36 +474,26 @@ def ends_of(
     H = whitening.astype(z.dtype) @ m.C[None].astype(z.dtype) @ R
     made = H[:, :, None, :] * effects[:, None, :, None]
     Q, S = projection(real_rows(made.reshape(K, p, -1)))
-    e = whitened(whitening, errors_of_record(m, record, driving, outputs, R))
-    factors = (e @ Q @ S.T).reshape(len(outputs), -1, n).astype(z.dtype)
-    return Ends(R, Q, jnp.einsum("ke,fen->fkn", effects, factors))
+    errors = errors_of_record(m, whitening, R, at, outputs)
+    along = Q.T @ errors
+    factors = (S @ along).reshape(effects.shape[1], n, -1).astype(z.dtype)
+    return Ends(R, Q, jnp.einsum("ke,enf->knf", effects, factors), errors - Q @ along)
 
 
 def errors_of_record(
     m: Matrices,
-    record: Record,
-    driving: Driving,
-    outputs: Float[Array, "f N p"],
+    whitening: Complex[Array, "K p p"],
     R: Complex[Array, "K n n"],
-    ends: Complex[Array, "f K n"] | None = None,
-) -> Complex[Array, "f K p"]:
-    """Return measured less modelled outputs at the lines of one record of each flight.
+    at: Sources,
+    outputs: Complex[Array, "K p f"],
+) -> Float[Array, "r f"]:
+    """Return measured less modelled outputs of one record of each flight in rows of variance 1."""
 
-    The arguments are those of `ends_of` and `modelled`.
-    """
+    def errors(W: Array, R: Array, at: Sources, outputs: Array) -> Float[Array, "1 2p f"]:
+        return real_rows((W.astype(R.dtype) @ (outputs - modelled(m, R, at)))[None])
 
-    def of_flight(driving: Driving, outputs: Array, ends: Array | None) -> Complex[Array, "K p"]:
-        return lines_of(outputs) - modelled(m, driving, R, ends)
-
-    # Signals are delayed before they are cut, because an input may be logged before it acts.
-    cut = slice(record.first, record.last)
-    inside = Driving(*(v[:, cut] for v in driving))
-    return jax.vmap(of_flight)(inside, outputs[:, cut], ends)
-
-
-def whitened(W: Complex[Array, "K p p"], errors: Complex[Array, "f K p"]) -> Float[Array, "f r"]:
-    """Return the errors of each flight in rows of variance 1."""
-    return jax.vmap(real_rows)(jnp.einsum("kij,fkj->fki", W.astype(errors.dtype), errors))
+    rows = at_each_line(errors, whitening, R, at, outputs)
+    return rows.reshape(-1, rows.shape[-1])
 
 
 def records_of_group(
@@ -515,8 +530,10 @@ def errors_of_lines(layout: Layout, data: Data, noise: Noise, z: Float[Array, " 
         first = m if first is None else first
         y = measured(layout, data, members)
         for k, (record, W) in enumerate(records_of_group(layout, noise, members)):
-            at = ends_of(m, record, W, driving, y)
-            made = errors_of_record(m, record, driving, y, at.R, at.inputs)
-            errors |= {(i, k): e for i, e in zip(members, made, strict=True)}
+            here, of_outputs = sources(record, driving), lines_of_flights(record, y)
+            ends = ends_of(m, record, W, here, of_outputs)
+            here = here._replace(ends=ends.inputs)
+            made = of_outputs - at_each_line(partial(modelled, m), ends.R, here)
+            errors |= {(i, k): made[:, :, j] for j, i in enumerate(members)}
     assert first is not None
     return LineErrors([errors[at] for at in sorted(errors)], first)

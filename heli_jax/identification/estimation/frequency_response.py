@@ -19,6 +19,7 @@ coherence weights are not used, because they lose a factor of 2 to 10 in precisi
 
 import dataclasses
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -38,9 +39,9 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.evaluation import Evaluation
 from heli_jax.identification.estimation.frequency_instrument import absent_instrument
 from heli_jax.identification.estimation.frequency_lines import (
-    Driving,
     Record,
     alike,
+    at_each_line,
     at_lines,
     discretised,
     in_time_of,
@@ -48,6 +49,7 @@ from heli_jax.identification.estimation.frequency_lines import (
     projection,
     real_rows,
     shared_of,
+    sources,
 )
 from heli_jax.identification.estimation.objective import Objective, RowTags, untagged
 from heli_jax.identification.estimation.output_error import OBJECTIVE as OUTPUT_ERROR
@@ -91,7 +93,7 @@ def _groups(layout: Layout, data: Data, weights: ResponseWeights) -> list[list[i
 class _InWindows(NamedTuple):
     """A group of flights in windows."""
 
-    E: Complex[Array, "f W k p"]
+    E: Complex[Array, "W k p f"]
     """Transforms of measured less modelled outputs."""
     effects: Complex[Array, "W k p n"]
     """Those of the effects of a record's ends, by state."""
@@ -118,21 +120,21 @@ def _in_windows(
     N = y.shape[1]
     of_windows = dataclasses.replace(layout, outputs=(w.outputs,) * len(data.flights))
     m, driving = discretised(of_windows, data, u, group)
-    z, R = at_lines(m, Record(group[0], 0, N))
+    record = Record(group[0], 0, N)
+    (z, R), at = at_lines(m, record), sources(record, driving)
+    if ends is not None:
+        at = at._replace(ends=z[:, None, None] * ends.T[None].astype(z.dtype))
 
     def windows(y: Float[Array, "N p *c"]) -> Complex[Array, "W k p *c"]:
         signals, starts = y.reshape(N, -1).T, w.starts[group[0]]
         X = jnp.asarray(window_transforms(signals, starts, w.length, w.numbers, w.dt))
         return jnp.moveaxis(X, 0, -1).reshape(*X.shape[1:], *y.shape[1:])
 
-    def errors(driving: Driving, y: Array, ends: Array | None) -> Complex[Array, "W k p"]:
-        inputs = None if ends is None else z[:, None] * ends[None].astype(z.dtype)
-        return windows(y - in_time_of(modelled(m, driving, R, inputs), N))
-
+    made = in_time_of(at_each_line(partial(modelled, m), R, at), N)
     H = jax.lax.stop_gradient(m.C)[None].astype(z.dtype) @ R
     first = np.cumsum([0, *(len(s) for s in w.starts)])
     return _InWindows(
-        jax.vmap(errors)(driving, y, ends),
+        windows(jnp.moveaxis(y, 0, -1) - made),
         windows(in_time_of(H * z[:, None, None], N)),
         jnp.stack([w.Z[first[i] : first[i + 1]] for i in group]),
     )
@@ -156,7 +158,7 @@ def rows_of_responses(
         sums = []
         for group, factors in zip(groups, ends, strict=True):
             E, _, Z = _in_windows(layout, data, weights.windows, unknowns(v), group, factors)
-            sums.append(jnp.einsum("fwkz,fwkp->kpz", jnp.conj(Z), E))
+            sums.append(jnp.einsum("fwkz,wkpf->kpz", jnp.conj(Z), E))
         return _whitened(weights, jnp.sum(jnp.stack(sums), axis=0)[..., None])[:, 0]
 
     # Each state of each flight gives one column of end effects.
@@ -194,9 +196,9 @@ def errors_in_windows(
     for group in _groups(layout, data, weights):
         E, effects, _ = _in_windows(layout, data, weights.windows, u, group)
         Q, S = projection(rows(effects))
-        factors = (S @ (Q.T @ rows(jnp.moveaxis(E, 0, -1)))).astype(E.dtype)
-        left = E - jnp.einsum("nf,wkpn->fwkp", factors, effects)
-        of_flight |= dict(zip(group, left, strict=True))
+        factors = (S @ (Q.T @ rows(E))).astype(E.dtype)
+        left = E - jnp.einsum("nf,wkpn->wkpf", factors, effects)
+        of_flight |= dict(zip(group, jnp.moveaxis(left, -1, 0), strict=True))
     return jnp.concatenate([of_flight[i] for i in sorted(of_flight)])
 
 
