@@ -107,9 +107,6 @@ def fisher(params: Any, records: int = 5) -> dict[str, float]:
         z = start_vector(layout, data, problem)
         dtype = z.dtype
         noise = Noise(({"roll": np.asarray(NOISE, dtype)},), np.zeros((), dtype))
-        noise = layout.objective.noise_at_start(
-            layout, data, evaluate(layout, data, noise, z), noise
-        )
         sds.append(deviations(evaluate(layout, data, noise, z).J)[: len(FREE)])
     mean = np.sqrt(np.mean(np.square(sds), axis=0))
     return dict(zip(FREE, (float(v) for v in mean), strict=True))

@@ -52,9 +52,7 @@ def prepared(flights: list[Flight], **more: Any) -> Prepared:
     # The factor of each noise is an unknown that starts here.
     sd = tuple({n: np.float64(NOISE[n]) for n in sorted(f.outputs)} for f in flights)
     z = jnp.asarray(start_vector(layout, data, of))
-    noise = Noise(sd, np.zeros(()))
-    level = layout.objective.noise_at_start(layout, data, evaluate(layout, data, noise, z), noise)
-    return Prepared(of, layout, data, level, z)
+    return Prepared(of, layout, data, Noise(sd, np.zeros(())), z)
 
 
 def at(of: Prepared, z: jax.Array) -> tuple[np.ndarray, np.ndarray, float]:

@@ -203,8 +203,7 @@ def _same_responses(at: SearchState) -> list[StartPoint]:
         # The initial states differ for the alternative values, so their estimation begins at zero.
         z[layout.first_nuisance :] = 0.0
         z = with_noise_guess(search, best.noise, jnp.asarray(z, best.best.z.dtype))
-        e = evaluate(layout, search.data, best.noise, z)
-        points.append((layout.objective.noise_at_start(layout, search.data, e, best.noise), z))
+        points.append((best.noise, z))
     return points
 
 

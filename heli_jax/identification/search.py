@@ -44,11 +44,6 @@ def first_guess(problem: Problem) -> FirstGuess:
     if not any(np.ptp(u) > 0 for f in problem.training for u in f.inputs.values()):
         z = in_time(layout, data, noise, z)
     e = evaluate(layout, data, noise, z)
-    level = layout.objective.noise_at_start(layout, data, e, noise)
-    # If the method keeps the noise, it returns the same object and nothing is evaluated twice.
-    if level is not noise:
-        noise = level
-        e = evaluate(layout, data, noise, z)
     return FirstGuess(layout, data, noise, z, e, search_data)
 
 

@@ -89,9 +89,6 @@ def test_the_rows_hold_fishers_information(bench30):
         )
         layout, data = layout_of(problem, problem.training), data_of(problem, problem.training)
         noise, z = first_noise(problem, problem.training), start_vector(layout, data, problem)
-        noise = layout.objective.noise_at_start(
-            layout, data, evaluate(layout, data, noise, z), noise
-        )
         J = evaluate(layout, data, noise, z).J
         found.append(J.T @ J)
     wanted = information(u, truth)

@@ -101,15 +101,12 @@ def _without(
     search: Search, optimum: RelaxedOptimum, d: Disturbance
 ) -> tuple[RelaxedOptimum, float]:
     """Return the optimum without one disturbance, and twice the log-likelihood lost."""
-    layout, data = search.layout, search.data
+    layout = search.layout
     # A value far below the smallest noise replaces zero, whose logarithm is infinite.
     smallest = min(float(s) for by_name in optimum.noise.sd for s in by_name.values())
     at = layout.disturbance_at(d.sigma)
     # All other parameters are fitted again, because a likelihood ratio compares two optima.
     z = optimum.best.z.at[at].set(np.log(smallest) - _NONE)
-    # The rows depend on the level of their own innovations.
-    alone = evaluate(layout, data, optimum.noise, z)
-    noise = layout.objective.noise_at_start(layout, data, alone, optimum.noise)
-    without = relaxed_from(search, noise, z)
+    without = relaxed_from(search, optimum.noise, z)
     ratio = 2.0 * (log_likelihood_of(search, optimum) - log_likelihood_of(search, without))
     return without, ratio

@@ -38,6 +38,8 @@ class Evaluation(NamedTuple):
     """Derivatives of the named values by their coordinates."""
     z: np.ndarray
     """Unknowns (q,)."""
+    cost: float
+    """See `ResidualAndJacobian`."""
 
 
 def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Evaluation:
@@ -46,15 +48,15 @@ def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) ->
     # Output-error residuals already contain a simulation; filter innovations do not.
     runs = simulated_at(layout, data, z) if at.simulated is None else at.simulated
     # Everything is fetched at once, with one wait for the device.
-    runs, innovations, r, J, values, slopes = jax.device_get(
-        (runs, at.innovations, at.r, at.J, *named(layout, data, z))
+    runs, innovations, r, J, cost, values, slopes = jax.device_get(
+        (runs, at.innovations, at.r, at.J, at.cost, *named(layout, data, z))
     )
     simulated = by_output(layout, runs)
     raw = tuple(
         {n: np.asarray(flight.outputs[n]) - v for n, v in run.items()}
         for flight, run in zip(data.flights, simulated, strict=True)
     )
-    return Evaluation(simulated, raw, innovations, r, J, values, slopes, np.asarray(z))
+    return Evaluation(simulated, raw, innovations, r, J, values, slopes, np.asarray(z), float(cost))
 
 
 def simulated_outputs(

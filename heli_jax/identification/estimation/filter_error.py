@@ -93,14 +93,9 @@ def disturbed_records(reached: Solution, u: Unknowns, i: int, keys: Array) -> di
     return naming.asdict(jax.lax.map(run, keys, batch_size=_BATCH))
 
 
-_FLOOR = 1e-3
-"""Least square of the likelihood's row over the count, which keeps the row real if the noise
-decreases."""
 _DIGITS = 1e13
 """Ratio of the variances of innovation and measurement beyond which float64 has no digits left."""
 _TOLERANCE = 1e-6
-_FELL = 0.9
-"""Decrease of the log noise variance beyond which the likelihood's row is at its floor."""
 _CORRECTED = 0.02
 """Relative change of a correction's slope above which the parameters change too."""
 
@@ -113,7 +108,8 @@ class FilterError(Objective):
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
         """Return the innovations over their sd, and rows that make J'J the Fisher information."""
         by_flight = filtered_flights(layout, data, noise, u)
-        return Residuals(_likelihood_rows(layout, data, noise, u, by_flight), None, by_flight)
+        rows, added = _likelihood_rows(layout, data, noise, u, by_flight)
+        return Residuals(rows, None, by_flight, added)
 
     def tags(self, layout: Layout, data: Data, count: int) -> RowTags:
         """Return the row tags: innovations, one row of the mean log variance, and the variances of
@@ -134,33 +130,19 @@ class FilterError(Objective):
         """Add the corrections, which are zero before the first relaxation."""
         return noise._replace(corrections=first_corrections(problem))
 
-    def noise_at_start(self, layout: Layout, data: Data, e: Evaluation, noise: Noise) -> Noise:
-        """Return the noise with the level of the innovations."""
-        level = innovation_sums(e, noise)[1] / measured_count(data)
-        # The start may be unstable.
-        level = level if np.isfinite(level) else 0.0
-        return noise._replace(log_variance_ratio=np.asarray(level, noise.log_variance_ratio.dtype))
-
     def relax(
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
     ) -> tuple[Float[Array, " q"], Noise]:
-        """Return z, and the noise with the level and the corrections at z.
-
-        The noise itself is part of z.
-        """
-        n, e = measured_count(data), evaluate(layout, data, noise, z)
-        level = np.asarray(innovation_sums(e, noise)[1] / n, noise.log_variance_ratio.dtype)
-        measured = signal_numbers(layout, data).size
+        """Return z, and the noise with the corrections at z; its sds are part of z."""
+        if not noise.corrections:
+            return z, noise
+        e, measured = evaluate(layout, data, noise, z), signal_numbers(layout, data).size
         corrections = corrections_at(layout, data, noise, e, z, measured)
-        return z, noise._replace(log_variance_ratio=level, corrections=corrections)
+        return z, noise._replace(corrections=corrections)
 
     def noise_matters(self, problem: Problem, layout: Layout, before: Noise, after: Noise) -> bool:
-        """True if the change of the noise affects the optimum.
-
-        The noise fell below the floor of the likelihood's row, or a correction changed.
-        """
-        fell = before.log_variance_ratio - after.log_variance_ratio
-        return bool(fell > _FELL) or corrections_changed(before, after) > _CORRECTED
+        """True if a correction changed enough to move the optimum."""
+        return corrections_changed(before, after) > _CORRECTED
 
     def log_likelihood(self, layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
         """Return the log-likelihood of the innovations (Schweppe, 1965)."""
@@ -246,11 +228,11 @@ def _filter_arguments(
 
 def _likelihood_rows(
     layout: Layout, data: Data, noise: Noise, u: Unknowns, by_flight: tuple[Innovations, ...]
-) -> Array:
-    r"""Return rows whose sum of squares is minus twice the log-likelihood, up to a constant.
+) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+    r"""Return rows, and what their sum of squares lacks of minus twice the log-likelihood.
 
-    Rows are zero without a measurement. The rows are $e_k/\sqrt{s_k}$, and one row whose square is
-    $N(1 + \overline{\log s} - level)$.
+    Rows are zero without a measurement. The rows are $e_k/\sqrt{s_k}$, and one row $\sqrt N$ with
+    half of the derivative of $\sqrt N\,\overline{\log s}$, which is no square.
 
     These rows contain half of the variances' information ($\tfrac14 s'^2/s^2$ of $\tfrac12$), so
     the optimiser would take twice the step along the noise. Further rows of value zero have the
@@ -267,13 +249,13 @@ def _likelihood_rows(
     log_s = jnp.where(seen, jnp.log(s / sd**2), 0.0)
     count = jnp.sum(seen.astype(rows.dtype))
     mean = jnp.sum(log_s) / count
-    # N mean(log s) is written as a square. The level of the last relaxation keeps it near 1, where
-    # the root is differentiable.
-    above = mean - noise.log_variance_ratio + correction(layout, noise, u) / count
-    last = jnp.sqrt(count * jnp.maximum(1.0 + above, _FLOOR))
+    whole = mean + correction(layout, noise, u) / count
+    level = jax.lax.stop_gradient(whole)
+    last = jnp.sqrt(count) * (1.0 + 0.5 * (whole - level))
     log_s = jnp.where(seen, log_s - mean, 0.0)
     # The last rows are zero; only the first term contributes a derivative.
-    return jnp.concatenate([rows, last[None], 0.5 * (log_s - jax.lax.stop_gradient(log_s))])
+    rows = jnp.concatenate([rows, last[None], 0.5 * (log_s - jax.lax.stop_gradient(log_s))])
+    return rows, count * level
 
 
 def innovation_sums(e: Evaluation, noise: Noise) -> tuple[float, float]:

@@ -130,7 +130,7 @@ def table(layout: Layout, data: Data, runs: list[Run], chosen: Run) -> tuple[Sta
             optimum, last = 0, None
         # Costs are compared, because equal optima may lie apart in directions that the data leave
         # open.
-        if converged and (last is None or cost > last * (1.0 + 1e-6) + 1e-300):
+        if converged and (last is None or cost > last + 1e-6 * abs(last)):
             optimum, last = optimum + 1, cost
         rows.append(
             StartRow(

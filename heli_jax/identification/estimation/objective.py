@@ -107,10 +107,6 @@ class Objective(abc.ABC):
         """
         return noise
 
-    def noise_at_start(self, layout: Layout, data: Data, e: Evaluation, noise: Noise) -> Noise:
-        """Return the noise after an evaluation at a start; the same object if unchanged."""
-        return noise
-
     def data_at_start(self, data: Data) -> Data:
         """Return the data of the first search, if they differ from the measured data."""
         return data
@@ -162,18 +158,18 @@ class Objective(abc.ABC):
             total -= v.size * float(np.log(2.0 * np.pi * sd**2)) + float(np.sum((v / sd) ** 2))
         return 0.5 * total
 
-    def log_density(self, layout: Layout, data: Data, rows: Float[Array, " n"]) -> Array:
+    def log_density(self, layout: Layout, data: Data, residuals: Residuals) -> Array:
         """Return the log density of the rows up to a constant; traced.
 
         The scales of white noise are integrated out under Jeffreys' prior.
         """
         if self.noise_model != "white":
-            return -0.5 * jnp.sum(rows**2)
+            return -0.5 * (jnp.sum(residuals.rows**2) + residuals.added)
         # The integral over sd of sd^-(n+1) exp(-S / (2 sd^2)) is proportional to S^(-n/2). Rows of
         # missing samples are zero, and n excludes them.
         counts = [jnp.sum(jnp.isfinite(y)) for f in data.flights for y in f.outputs.values()]
-        n = jnp.stack(counts).astype(rows.dtype)
-        numbers = signal_numbers(layout, data)
+        n = jnp.stack(counts).astype(residuals.rows.dtype)
+        rows, numbers = residuals.rows, signal_numbers(layout, data)
         S = jnp.zeros(n.size, rows.dtype).at[numbers].add(rows[: numbers.size] ** 2)
         return -0.5 * jnp.sum(n * jnp.log(S))
 

@@ -26,6 +26,9 @@ class Residuals(NamedTuple):
     """Simulations by flight; None without simulation."""
     innovations: tuple[Innovations, ...] = ()
     """Innovations by flight, for methods that predict one step ahead."""
+    added: Array | float = 0.0
+    """Added to the sum of squares it gives minus twice the log-likelihood. It has no derivative of
+    its own: the rows contain that."""
 
 
 # Derivatives of many windows at once. An initial state affects only its window, an input's offset
@@ -133,6 +136,12 @@ def rows_of(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> 
     return _all_rows(layout, data, noise, z)[0]
 
 
+def cost_of(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Float[Array, ""]:
+    """Return what the optimiser minimises."""
+    rows, residuals = _all_rows(layout, data, noise, z)
+    return jnp.sum(rows**2) + residuals.added
+
+
 class ResidualAndJacobian(NamedTuple):
     """Residuals and their derivative at one point."""
 
@@ -144,6 +153,8 @@ class ResidualAndJacobian(NamedTuple):
     """Innovations by flight; empty with output error."""
     simulated: tuple[Run, ...] | None
     """Simulated flights with bias; None without simulation."""
+    cost: Float[Array, ""]
+    """What the optimiser minimises: the sum of squares of r, and what the method adds to it."""
 
 
 @jitted
@@ -156,7 +167,8 @@ def residual_and_jacobian(
     def rows(z: Array) -> tuple[Array, Any]:
         # Auxiliary values avoid a second simulation.
         r, residuals = _all_rows(layout, data, noise, z)
-        return r, (r, residuals.runs, residuals.innovations)
+        cost = jnp.sum(r**2) + residuals.added
+        return r, (r, residuals.runs, residuals.innovations, cost)
 
     def along(v: Array) -> Any:
         return jax.jvp(rows, (z,), (v,), has_aux=True)
@@ -166,8 +178,8 @@ def residual_and_jacobian(
         directions = jnp.zeros_like(directions).at[colours[0], np.arange(layout.size)].set(1.0)
         directions = directions[: colours[0].max() + 1]
     # The None axis makes vmap compute once what all directions share.
-    r, J, (_, runs, innovations) = jax.vmap(along, out_axes=(None, -1, None))(directions)
+    r, J, (_, runs, innovations, cost) = jax.vmap(along, out_axes=(None, -1, None))(directions)
     if colours is not None:
         J = _spread_out(layout, data, J, *colours)
     simulated = None if runs is None else with_bias(unpack(layout, data, z), runs)
-    return ResidualAndJacobian(r, J, innovations, simulated)
+    return ResidualAndJacobian(r, J, innovations, simulated, cost)

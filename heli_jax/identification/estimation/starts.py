@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.identification.estimation.levenberg_marquardt import optimise
-from heli_jax.identification.estimation.residual import rows_of
+from heli_jax.identification.estimation.residual import cost_of
 from heli_jax.identification.estimation.simulated_flights import signal_numbers
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Free, Problem
 from heli_jax.identification.unknowns import transforms
@@ -72,9 +72,9 @@ def _best_on_grid(
 def _costs_at(
     layout: Layout, data: Data, noise: Noise, points: Float[Array, "s q"]
 ) -> Float[Array, " s"]:
-    """Return the mean of the squared rows at each point."""
+    """Return the cost at each point."""
     # Points are evaluated in sequence, because a batch would need one filter's memory for each.
-    return jax.lax.map(lambda z: jnp.mean(jnp.square(rows_of(layout, data, noise, z))), points)
+    return jax.lax.map(lambda z: cost_of(layout, data, noise, z), points)
 
 
 # Starts drawn around the stated one, within the bounds.

@@ -224,14 +224,14 @@ class Valley(NamedTuple):
                 return None
             z[names.index(name)] = at
         fixed = np.array([i < len(names) and names[i] in held for i in range(layout.size)])
-        here = np.asarray(self.e.r, np.float64)
+        cost = self.e.cost
         if not priors:
             data = data._replace(prior_sd=jnp.full_like(data.prior_sd, jnp.inf))
             # The rows of the parameters' priors stand before those of the nuisances.
-            last = here.size - (layout.size - layout.first_nuisance)
-            here = np.delete(here, slice(last - len(layout.free), last))
+            last = self.e.r.size - (layout.size - layout.first_nuisance)
+            cost -= float(np.sum(np.square(self.e.r[last - len(layout.free) : last])))
         optimum = optimise(layout, data, self.at.noise, z, _STEPS, held=fixed)
-        excess = optimum.cost * measured_count(data) - float(here @ here)
+        excess = optimum.cost * measured_count(data) - cost
         if not math.isfinite(excess):
             return None
         values, _ = named(layout, data, jnp.asarray(optimum.z, self.at.z.dtype))

@@ -59,7 +59,7 @@ def profile(at: Solution, name: str) -> Profile:
     """Return the profile of a free parameter, for white residuals."""
     i = at.layout.free.index(name)
     made = residual_and_jacobian(*at)
-    line = _line(at, np.asarray(made.r), np.asarray(made.J), i)
+    line = _line(at, float(made.cost), np.asarray(made.J), i)
     for reach in _REACHES:
         t = np.linspace(-reach, reach, _POINTS) * line.sd
         left = [root for _, root in line.roots(-1, -t[t < 0][::-1])][::-1]
@@ -93,7 +93,7 @@ class _Line(NamedTuple):
     sd: float
     """of the unknown's coordinate"""
     cost: float
-    """squares at the optimum over the number of measured values"""
+    """of the optimum, see `Optimum`"""
 
     def roots(self, side: int, distances: Iterable[float]) -> Iterator[tuple[float, float]]:
         """Yield distances from the optimum to one side, each with the root of the deviance there.
@@ -114,8 +114,6 @@ class _Line(NamedTuple):
         """Return the deviance at a cost; zero where it is below that of the optimum."""
         if not math.isfinite(cost):
             return math.inf
-        if cost <= 0.0:
-            return 0.0
         return max(0.0, measured_count(self.at.data) * (cost - self.cost))
 
     def value(self, distance: float) -> float:
@@ -124,11 +122,11 @@ class _Line(NamedTuple):
         return float(value_of(self.at.layout, self.at.data, self.i, z))
 
 
-def _line(at: Solution, r: np.ndarray, J: np.ndarray, i: int) -> _Line:
-    """Return the line along unknown i, by the residuals and their derivatives at the optimum."""
+def _line(at: Solution, cost: float, J: np.ndarray, i: int) -> _Line:
+    """Return the line along unknown i, by the cost and the Jacobian at the optimum."""
     inverse = pseudoinverse(J)
     along = inverse @ inverse[i]
-    cost = float(np.sum(np.square(r))) / measured_count(at.data)
+    cost = cost / measured_count(at.data)
     return _Line(at, i, along / along[i], math.sqrt(along[i]), cost)
 
 
@@ -166,7 +164,7 @@ def profile_wide_intervals(
     limits, one_sided = {}, []
     for i, u in wide:
         reach = together * float(reaches[i])
-        line = _line(at, e.r, J, i)
+        line = _line(at, e.cost, J, i)
         ends = [_end(problem, line, e, u, side, reach) for side in (-1, 1)]
         bounded = [t for t in ends if t is not None]
         if len(bounded) < 2:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from heli_jax import stages
 from heli_jax.identification.estimation.evaluation import evaluate
-from heli_jax.identification.estimation.residual import prior_rows, rows_of, weak_rows
+from heli_jax.identification.estimation.residual import prior_rows, weak_rows
 from heli_jax.identification.result import Fit
 from heli_jax.identification.unknowns.layout import (
     Data,
@@ -230,8 +230,9 @@ def log_posterior(
     # Draws integrate over the parameters of the mean, which the restricted likelihood allows for.
     scales = layout.model.input_scales
     corrections = {n: c for n, c in dict(noise.corrections).items() if n in scales}
-    rows = rows_of(layout, data, noise._replace(corrections=corrections), z)
+    noise = noise._replace(corrections=corrections)
+    residuals = layout.objective.residuals(layout, data, noise, unpack(layout, data, z))
     rest = jnp.concatenate([prior_rows(layout, data, z), weak_rows(layout, z)])
-    # The rows of the priors come last; their scale is known.
-    measured = layout.objective.log_density(layout, data, rows[: rows.shape[0] - rest.shape[0]])
+    # The scale of the priors' rows is known.
+    measured = layout.objective.log_density(layout, data, residuals)
     return measured - 0.5 * jnp.sum(rest**2)
