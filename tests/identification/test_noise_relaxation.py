@@ -22,7 +22,7 @@ class Slowly:
         self.moves = iter(moves)
 
     def relax(self, layout: Any, data: Any, noise: Noise, z: Any) -> Any:
-        return z, noise._replace(log_variance_ratio=noise.log_variance_ratio + 0.01)
+        return z, noise._replace(log_determinant=noise.log_determinant + 0.01)
 
     def noise_matters(self, *_: Any) -> bool:
         return True

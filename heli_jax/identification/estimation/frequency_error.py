@@ -179,7 +179,7 @@ class FrequencyError(Objective):
             except np.linalg.LinAlgError:
                 sound = False
         if not sound:
-            return z, noise._replace(log_variance_ratio=np.asarray(np.nan))
+            return z, noise._replace(log_determinant=np.asarray(np.nan))
         # The nuisances define the point of linearisation.
         if not layout.model.linear:
             z = in_time(layout, data, noise, z)

@@ -153,10 +153,6 @@ def optimise(
     return Optimum(jnp.asarray(at.z, jnp.asarray(z0).dtype), cost, steps, converged, moved)
 
 
-_LEAST_NOISE = 1e-3
-"""Smallest sd of a measurement noise, relative to its first guess."""
-
-
 def _bounds(layout: Layout, data: Data) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and highest coordinates (q,); infinite without a bound."""
     bounds = np.tile([-np.inf, np.inf], (layout.size, 1))
@@ -164,9 +160,6 @@ def _bounds(layout: Layout, data: Data) -> tuple[np.ndarray, np.ndarray]:
     limits = zip(layout.kinds, *map(np.asarray, (data.sign, data.low, data.high)), strict=True)
     for i, of_one in enumerate(limits):
         bounds[i] = transforms.coordinate_limits(*of_one)
-    # Without a limit a noise that the record does not show would end in rounding.
-    last = layout.first_nuisance
-    bounds[last - len(layout.scaled) : last, 0] = np.log(_LEAST_NOISE)
     return bounds[:, 0], bounds[:, 1]
 
 

@@ -107,7 +107,7 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
 
 def _changed(noise: Noise, new: Noise) -> float:
     """Return the largest change of a logarithm of the noise."""
-    change = abs(float(noise.log_variance_ratio - new.log_variance_ratio)) + max(
+    change = abs(float(noise.log_determinant - new.log_determinant)) + max(
         abs(float(np.log(sd[n] / before[n])))
         for sd, before in zip(new.sd, noise.sd, strict=True)
         for n in before

@@ -131,7 +131,7 @@ class Objective(abc.ABC):
             y = np.asarray(data.flights[i].outputs[name])
             size = max(self.scale(errors) * np.sqrt(freedom), least_noise(y))
             sd[i][name] = np.asarray(size, y.dtype)
-        return z, Noise(tuple(sd), noise.log_variance_ratio)
+        return z, Noise(tuple(sd), noise.log_determinant)
 
     def scale(self, errors: Float[np.ndarray, " n"]) -> float:
         """Return the most likely scale of the noise of one signal."""

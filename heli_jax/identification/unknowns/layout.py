@@ -243,10 +243,8 @@ class Noise(NamedTuple):
     sd: tuple[dict[str, Any], ...]
     """sd of the measurement noise by flight and output; those in `Layout.scaled` are multiplied by
     their factors."""
-    log_variance_ratio: Any
-    """Filter error: mean over all measurements of log(innovation variance / sd^2) at the last
-    relaxation, which gives the rows variance 1. Frequency error: mean over all lines of log
-    det(spectrum)."""
+    log_determinant: Any
+    """Methods in frequency: mean over all lines of log det(spectrum); else zero."""
     whitening: Any = ()
     """Frequency error: whitening matrices of each record's lines (K, p, p); otherwise ()."""
     corrections: Any = ()

@@ -222,7 +222,7 @@ def _judged(
         z = in_time(layout, data, noise, z)
     for _ in range(_ROUNDS):
         z, noise = layout.objective.relax(layout, data, noise, z)
-    if not np.isfinite(float(noise.log_variance_ratio)):
+    if not np.isfinite(float(noise.log_determinant)):
         return None
     there = Solution(layout, data, noise, z)
     made = residual_and_jacobian(*there)
