@@ -6,7 +6,6 @@ import numpy as np
 
 from heli_jax.finding import found
 from heli_jax.identification.estimation.data import data_of, start_vector
-from heli_jax.identification.estimation.disturbance_search import significant_disturbances
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.multistart import (
     FirstGuess,
@@ -23,6 +22,7 @@ from heli_jax.identification.estimation.noise_covariance import (
     first_noise,
     log_likelihood_of,
     relax_noise_covariance,
+    significant_disturbances,
 )
 from heli_jax.identification.estimation.output_error import in_time
 from heli_jax.identification.estimation.starts import delay_start, draw, noise_guess_at
@@ -37,9 +37,8 @@ def first_guess(problem: Problem) -> FirstGuess:
     layout = layout_of(problem, problem.training)
     data = data_of(problem, problem.training, layout)
     noise = first_noise(problem, problem.training)
-    search_data = layout.objective.data_at_start(data)
     z = start_vector(layout, data, problem)
-    z = noise_guess_at(layout, search_data, noise, z) if layout.disturbance else z
+    z = noise_guess_at(layout, data, noise, z) if layout.disturbance else z
     # Started at rest at zero, a record without input is insensitive to every parameter.
     if not any(np.ptp(u) > 0 for f in problem.training for u in f.inputs.values()):
         z = in_time(layout, data, noise, z)
@@ -49,7 +48,7 @@ def first_guess(problem: Problem) -> FirstGuess:
     if level is not noise:
         noise = level
         e = evaluate(layout, data, noise, z)
-    return FirstGuess(layout, data, noise, z, e, search_data)
+    return FirstGuess(layout, data, noise, z, e)
 
 
 class SearchResult(NamedTuple):
@@ -77,15 +76,14 @@ def search(
         starts: number of start points, as in `fit`.
         report: called with a line of text before each longer computation.
     """
-    layout, data, noise, z, e, search_data = guess
+    layout, data, noise, z, e = guess
     if starts is None:
-        points = delay_start(problem, layout, search_data, noise, z, e.J)[None]
+        points = delay_start(problem, layout, data, noise, z, e.J)[None]
     else:
         points = draw(layout, problem, z, starts, seed)
 
     over = Search(problem, layout, data, max_steps)
-    first = Search(problem, layout, search_data, max_steps)
-    optima = first.run(noise, points, report)
+    optima = over.run(noise, points, report)
     best = relax_noise_covariance(over, noise, min(optima, key=rank))
     if layout.sigmas:
         best = significant_disturbances(over, best)

@@ -45,8 +45,6 @@ from heli_jax.identification.unknowns.layout import (
 ENOUGH = 0.9
 """D-efficiency of the windows that are taken: the q-th root of the determinant of their information
 over that of all windows"""
-DETERMINES = 1.0
-"""relative sd below which a parameter is determined"""
 _RAILS = 0.05
 """share of a window's samples at an end of a signal's range from which on it is left out"""
 _GAP = 0.25

@@ -31,7 +31,7 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Solution
 
 LEVEL = 0.01
-"""Significance level of the test of all outputs together."""
+"""Significance level of all tests of one question together: outputs, inputs, lags and flights."""
 _FIRST, _GROWTH = 12, 1.15
 """Lines of the lowest band, and ratio of the widths of one band and the next."""
 _SEEN = 0.8

@@ -32,6 +32,7 @@ from jaxtyping import Float
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.flights.flight import Flight, labels
 from heli_jax.identification.problem import Problem
+from heli_jax.identification.validation.excitation import LEVEL
 
 _NOTHING = 1e-7
 """Size of a sum over that for unrelated terms, below which it is rounding."""
@@ -149,8 +150,6 @@ def arx_residuals(
     return left
 
 
-LEVEL = 0.01
-"""Significance level of a record: all inputs, outputs and lags together."""
 RATE = 50.0
 """Highest rate of the test [Hz]; feedback to a vehicle is slower than a quarter of it."""
 _SLOW_RATE = 10.0
