@@ -63,7 +63,9 @@ def search(problem: Problem) -> None:
     """Compute estimates with covariance, as `fit` does from one start, and nothing else."""
     guess = first_guess(problem)
     over = Search(problem, guess.layout, guess.data, 200)
-    [begun] = over.run(guess.noise, guess.z[None])
+    # With instruments the first search uses other data, as in `fit`.
+    first = Search(problem, guess.layout, guess.search_data, 200)
+    [begun] = first.run(guess.noise, guess.z[None])
     found = relax_noise_covariance(over, guess.noise, begun)
     assert bool(found.best.converged)
     deviations(evaluate(guess.layout, guess.data, found.noise, found.best.z).J)

@@ -37,8 +37,9 @@ def first_guess(problem: Problem) -> FirstGuess:
     layout = layout_of(problem, problem.training)
     data = data_of(problem, problem.training, layout)
     noise = first_noise(problem, problem.training)
+    search_data = layout.objective.data_at_start(data)
     z = start_vector(layout, data, problem)
-    z = noise_guess_at(layout, data, noise, z) if layout.disturbance else z
+    z = noise_guess_at(layout, search_data, noise, z) if layout.disturbance else z
     # Started at rest at zero, a record without input is insensitive to every parameter.
     if not any(np.ptp(u) > 0 for f in problem.training for u in f.inputs.values()):
         z = in_time(layout, data, noise, z)
@@ -48,7 +49,7 @@ def first_guess(problem: Problem) -> FirstGuess:
     if level is not noise:
         noise = level
         e = evaluate(layout, data, noise, z)
-    return FirstGuess(layout, data, noise, z, e)
+    return FirstGuess(layout, data, noise, z, e, search_data)
 
 
 class SearchResult(NamedTuple):
@@ -76,14 +77,15 @@ def search(
         starts: number of start points, as in `fit`.
         report: called with a line of text before each longer computation.
     """
-    layout, data, noise, z, e = guess
+    layout, data, noise, z, e, search_data = guess
     if starts is None:
-        points = delay_start(problem, layout, data, noise, z, e.J)[None]
+        points = delay_start(problem, layout, search_data, noise, z, e.J)[None]
     else:
         points = draw(layout, problem, z, starts, seed)
 
     over = Search(problem, layout, data, max_steps)
-    optima = over.run(noise, points, report)
+    first = Search(problem, layout, search_data, max_steps)
+    optima = first.run(noise, points, report)
     best = relax_noise_covariance(over, noise, min(optima, key=rank))
     if layout.sigmas:
         best = significant_disturbances(over, best)

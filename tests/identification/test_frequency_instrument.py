@@ -9,7 +9,9 @@ from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model
 from heli_jax.analysis.spectra import ResponseOptions
 from heli_jax.identification.diagnostics.loop import inputs_follow_response
 from heli_jax.identification.diagnostics.search import band_unused
+from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.frequency_instrument import (
+    as_instruments_have_it,
     following,
 )
 from heli_jax.identification.estimation.frequency_lines import orthonormal, projection
@@ -188,3 +190,22 @@ def test_a_response_far_larger_than_the_measured_one_explains_nothing():
         [(statistic, freedom, left, answer, _)] = _sums_over_bands(signals, X, np.ones((300, 1)))
         assert left / answer == pytest.approx((1.0 - k) ** 2, rel=0.02, abs=0.02)
         assert statistic > 3.0 * freedom
+
+
+def test_outputs_follow_the_instruments_and_nothing_that_is_fed_back(leaning):
+    rng = np.random.default_rng(6)
+    r = np.convolve(rng.standard_normal(1500), np.ones(5) / 5, "same")
+    answer = np.convolve(r, [0.0, 0.5, 0.3, 0.2])[:1500]
+    calm = np.convolve(answer, [0.0, 0.4, 0.4, 0.2])[:1500]
+    gusts = rng.standard_normal(1500) * 0.5
+    outputs = {"p": calm - gusts, "phi": 2.0 * calm + gusts}
+    # A straight line replaces missing samples.
+    outputs["phi"][1000:1003] = np.nan
+    drive = {"inputs": {"lat": answer + gusts}, "instruments": {"lat": r}}
+    given = problem(leaning, [Flight(dt=DT, outputs=outputs, **drive)])
+    data = data_of(given, given.training)
+    before, after = data.flights[0], as_instruments_have_it(data).flights[0]
+    assert np.array_equal(after.inputs.lat, before.by_instrument.lat)
+    for name, y in (("p", calm), ("phi", 2.0 * calm)):
+        left = after.outputs[name] - np.mean(after.outputs[name]) - (y - y.mean())
+        assert np.std(left) < 0.25 * np.std(y)

@@ -36,6 +36,7 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.evaluation import Evaluation, deviations
 from heli_jax.identification.estimation.frequency_instrument import (
     absent_instrument,
+    as_instruments_have_it,
     instrument_notes,
     instrumented_inputs,
 )
@@ -129,6 +130,13 @@ class FrequencyError(Objective):
             return inverse_roots(S * np.eye(S.shape[1]))
 
         return noise._replace(whitening=tuple(once_a_length(whitening, smoothed(measured))))
+
+    def data_at_start(self, data: Data) -> Data:
+        """Return by instrument the parts of inputs and outputs that follow the instruments."""
+        # The equations by instrument have several solutions. Least squares of these parts ends near
+        # the right one; with measured signals, which contain feedback, it may not.
+        by = data.flights[0].by_instrument is not None
+        return as_instruments_have_it(data) if by else data
 
     def noise_of_check(self, layout: Layout, data: Data, noise: Noise) -> Noise:
         """Return the spectrum of the outputs' part that the inputs do not explain.

@@ -8,6 +8,7 @@ Sources: Söderström and Stoica (1983); Pintelon and Schoukens (2012), chapter 
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -81,6 +82,37 @@ def instrumented_inputs(
         {**f.inputs, **dict(zip(names, columns.T, strict=True))}
         for f, columns in zip(flights, following(inputs, r), strict=True)
     )
+
+
+def as_instruments_have_it(data: Data) -> Data:
+    """Return the flights as if only the instruments moved them, for a direct estimate.
+
+    Inputs are those by instrument; outputs are reduced to the part that follows them. Gusts and
+    noise are contained only by chance, without their effect through feedback.
+    """
+    inputs = [naming.asdict(f.by_instrument) for f in data.flights]
+    moving = [n for n in inputs[0] if any(np.ptp(np.asarray(u[n])) > 0 for u in inputs)]
+    names = list(data.flights[0].outputs)
+    direct = tuple(f._replace(by_instrument=None) for f in data.flights)
+    if not moving or any(list(f.outputs) != names for f in data.flights):
+        return data._replace(flights=direct)
+    outputs = [np.stack([_filled(f.outputs[n]) for n in names], axis=1) for f in data.flights]
+    made = following(
+        outputs, [np.stack([np.asarray(u[n]) for n in moving], axis=1) for u in inputs]
+    )
+    flights = []
+    for f, columns in zip(data.flights, made, strict=True):
+        columns = columns.astype(f.outputs[names[0]].dtype)
+        by_name = dict(zip(names, columns.T, strict=True))
+        flights.append(f._replace(inputs=f.by_instrument, outputs=by_name, by_instrument=None))
+    return data._replace(flights=tuple(flights))
+
+
+def _filled(y: Any) -> Float[np.ndarray, " N"]:
+    """Return a signal with missing samples interpolated linearly."""
+    y = np.asarray(y)
+    at, seen = np.arange(y.size), np.isfinite(y)
+    return np.interp(at, at[seen], y[seen])
 
 
 def following(

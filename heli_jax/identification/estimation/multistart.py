@@ -167,3 +167,5 @@ class FirstGuess(NamedTuple):
     noise: Noise
     z: Float[Array, " q"]
     e: Evaluation
+    search_data: Data
+    """Data of the first search."""

@@ -111,6 +111,10 @@ class Objective(abc.ABC):
         """Return the noise after an evaluation at a start; the same object if unchanged."""
         return noise
 
+    def data_at_start(self, data: Data) -> Data:
+        """Return the data of the first search, if they differ from the measured data."""
+        return data
+
     def noise_of_check(self, layout: Layout, data: Data, noise: Noise) -> Noise:
         """Return the noise of a check at the start values.
 
