@@ -374,10 +374,7 @@ class Context:
         flights = tuple(f for f in problem.flights if f.hold_out)
         if not flights or not self.fitted:
             return HeldOut()
-        checked = validate(problem, at.layout, at.z, at.noise, flights)
-        signals = signals_of(flights, checked.e.simulated, checked.e.innovations)
-        in_one_piece, in_frequency = checked.free_run, None
-        free_run = signals_of(flights, in_one_piece) if in_one_piece is not None else ()
+        (signals, free_run), in_frequency = validate(problem, at, flights), None
         if self.at_optimum:
             feedback = (self.held or self.follows) and not self.instruments
             in_frequency = validate_in_frequency(problem, at, self.e, flights, feedback=feedback)

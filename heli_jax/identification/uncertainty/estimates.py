@@ -42,10 +42,9 @@ from heli_jax.identification.unknowns.layout import (
     flight_unknowns,
     unpack,
 )
+from heli_jax.identification.validation.metrics import diverges, metrics
 from heli_jax.messages import sentence
 
-_DIVERGES = 10.0
-"""variance of a simulation's error over that of the signal from which on it diverges"""
 _MORE = 1.5
 """sd by the inputs alone over that by all rows from which on the disturbance has information"""
 _NOISE_ONLY = 1e-6
@@ -161,14 +160,10 @@ def through_inputs(at: Solution, e: Evaluation) -> Evaluation | None:
     """
     if not e.innovations or not (np.isfinite(e.J).all() and np.isfinite(e.r).all()):
         return None
-    pairs = list(zip(at.data.flights, e.simulated, strict=True))
-    if any(
-        _diverges(np.asarray(y), np.asarray(simulated[n]))
-        for flight, simulated in pairs
-        for n, y in flight.outputs.items()
-        if np.nanstd(np.asarray(y)) > 0
-    ):
-        return None
+    for flight, simulated in zip(at.data.flights, e.simulated, strict=True):
+        measured = {n: np.asarray(y) for n, y in flight.outputs.items() if np.nanstd(y) > 0}
+        if any(diverges(metrics(y, np.asarray(simulated[n]))) for n, y in measured.items()):
+            return None
     J = np.array(own_record(at, e)[1].J)
     # The rows of the innovations' variances, before those of the priors, are zero.
     priors = len(at.layout.free) + at.layout.size - at.layout.first_nuisance
@@ -196,14 +191,6 @@ def resting_on_disturbance(by_all: Verdict, by_inputs: Verdict) -> tuple[list[st
     resting = [n for n in by_all.names if n in alone - known]
     more = [n for n, far in zip(by_all.names, wider > _MORE * sds, strict=True) if far]
     return resting, [n for n in more if n not in known | alone]
-
-
-@np.errstate(over="ignore", invalid="ignore")
-def _diverges(measured: np.ndarray, simulated: np.ndarray) -> bool:
-    """True if a simulation (N,) diverges from the measurement (N,), NaN where missing."""
-    seen = ~np.isnan(measured)
-    error = (measured - simulated)[seen]
-    return not float(np.var(error)) <= _DIVERGES * float(np.var(measured[seen]))
 
 
 # Estimates by name and in their units.

@@ -228,7 +228,7 @@ def unmodelled(
         if strong.p_value < level and (
             strongest(_lines(at, e, name, J, flights, _WILD)[1], drives).p_value < level
         ):
-            lacking.append(_told(at, e, name, strong, J))
+            lacking.append(_described(at, e, name, strong, J))
     tested, k = [records for _, records in each.values() if records], len(layout.of_interest)
     chances = [pulled_away(records, k) for records in tested]
     p = min(1.0, min(chances) * len(chances)) if chances else 1.0
@@ -244,7 +244,7 @@ def _where_least(
     drives: Sequence[Drive],
     records: Sequence[Lines],
     level: float,
-    called: Sequence[str],
+    labels: Sequence[str],
 ) -> Strongest:
     """Return the strongest drive; if it is significant, where the whitened residual is least.
 
@@ -257,7 +257,7 @@ def _where_least(
             break
         there = at._replace(z=at.z + part * jnp.asarray(strong.step, at.z.dtype))
         e = evaluate(*there)
-        tested, again = _lines(there, e, name, sensitivities(there, e), called)
+        tested, again = _lines(there, e, name, sensitivities(there, e), labels)
         if not tested or not _deviance(again) < _deviance(records):
             part *= 0.25
             continue
@@ -281,7 +281,7 @@ def _lines(
     e: Evaluation,
     name: str,
     J: Mapping[tuple[int, str], np.ndarray],
-    called: Sequence[str],
+    labels: Sequence[str],
     most: float = np.inf,
 ) -> tuple[list[Drive], list[Lines]]:
     """Return the candidate drives of an output's residual, and its lines by flight.
@@ -289,7 +289,7 @@ def _lines(
     No drive is returned if nothing can be tested.
 
     Args:
-        called: the flights' names.
+        labels: the flights' names.
         most: bound of the whitened residual [robust sds].
     """
     moving, samples = moving_inputs(at), tested_flights(at, e, name)
@@ -320,7 +320,7 @@ def _lines(
     drives = [Drive(c, "input", (n,), NARROW) for c, n in enumerate(moving)]
     drives += [Drive(c, "amplitude", (), BROAD, tuple(range(m))) for c in range(m, first)]
     if len(records) > 1:
-        names = [called[i] if i < len(called) else f"flight {i + 1}" for i, _ in samples]
+        names = [labels[i] if i < len(labels) else f"flight {i + 1}" for i, _ in samples]
         of = [names[place] for place, _ in lines]
         drives += [
             # With only two flights either may be the odd one.
@@ -337,7 +337,7 @@ def _lines(
     return drives, records
 
 
-def _told(
+def _described(
     at: Solution,
     e: Evaluation,
     name: str,
