@@ -22,7 +22,7 @@ import scipy.special
 from jaxtyping import Complex, Float
 
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.frequency_instrument import instruments_of
+from heli_jax.identification.estimation.frequency_instrument import filled, instruments_of
 from heli_jax.identification.estimation.frequency_lines import (
     lines_of,
     records_of,
@@ -59,12 +59,8 @@ def excitation_of(problem: Problem) -> dict[str, float]:
     sums: dict[str, np.ndarray] = {}
     for flight in problem.training:
         X = _drives(flight, by)
-        seen = {n: np.flatnonzero(np.isfinite(y)) for n, y in flight.outputs.items()}
-        measured = {
-            n: np.interp(np.arange(y.size), seen[n], y[seen[n]])
-            for n, y in flight.outputs.items()
-            if seen[n].size >= _SEEN * y.size
-        }
+        seen = {n: y for n, y in flight.outputs.items() if np.mean(np.isfinite(y)) >= _SEEN}
+        measured = {n: filled(y) for n, y in seen.items()}
         measured = {n: y for n, y in measured.items() if np.ptp(y) > 0}
         if X is None or not measured:
             continue
