@@ -205,17 +205,12 @@ def _context_at_optimum(
     """Return the Context at the end of the search."""
     layout, data, optimum = ended.search.layout, ended.search.data, ended.optimum
     e = evaluate(layout, data, optimum.noise, optimum.best.z)
-
-    def context() -> Context:
-        at = Solution(layout, data, optimum.noise, optimum.best.z)
-        return Context(problem, at, e, before, optimum)
-
-    c = context()
-    if c.rounding:
-        # Diagnostics must not use a likelihood that consists of rounding errors.
-        optimum = optimum._replace(best=optimum.best._replace(converged=False))
-        c = context()
-    return c
+    c = Context(problem, Solution(layout, data, optimum.noise, optimum.best.z), e, before, optimum)
+    if not c.rounding:
+        return c
+    # Diagnostics must not use a likelihood that consists of rounding errors.
+    failed = optimum.best._replace(converged=False)
+    return dataclasses.replace(c, optimum=optimum._replace(best=failed))
 
 
 def _result(c: Context, starts: tuple[StartRow, ...], seed: int, timing: dict[str, float]) -> Fit:

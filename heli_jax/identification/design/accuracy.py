@@ -20,44 +20,20 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.evaluation import Evaluation, deviations, evaluate
 from heli_jax.identification.identifiability.analysis import (
     NO_EFFECT,
+    Sensitivity,
     projected,
-    relative_rows,
+    sensitivity_at,
     verdict_of,
 )
 from heli_jax.identification.identifiability.verdict import Unknown
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
-    Layout,
     Solution,
     flight_places,
     layout_of,
 )
 from heli_jax.identification.unknowns.transforms import scale
 from heli_jax.simulation.inputs import chirp, multistep_3211
-
-
-class Sensitivity(NamedTuple):
-    """The rows of the data at one point, columns in relative coordinates."""
-
-    unknowns: tuple[Unknown, ...]
-    """the parameters of interest"""
-    shared: Float[np.ndarray, "n s"]
-    """by the parameters of interest, then by the noise's parameters of filter error"""
-    own: Float[np.ndarray, "n k"]
-    """by initial states, biases and input offsets, in sds of their weak priors"""
-
-    def part(self, rows: np.ndarray) -> "Sensitivity":
-        """Return some of the rows."""
-        return self._replace(shared=self.shared[rows], own=self.own[rows])
-
-
-def sensitivity_at(problem: Problem, layout: Layout, e: Evaluation) -> Sensitivity:
-    """Return the rows of the data of an evaluation."""
-    unknowns, sensitivity, others = relative_rows(problem, layout, e)
-    # The first of the other unknowns are shared by all flights.
-    count = layout.first_nuisance - len(unknowns)
-    shared = np.hstack([sensitivity, others[:, :count]])
-    return Sensitivity(unknowns, shared, others[:, count:])
 
 
 def triangle(s: Sensitivity) -> Float[np.ndarray, "s s"]:

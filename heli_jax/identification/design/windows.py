@@ -25,14 +25,13 @@ from heli_jax.flights.parts import part
 from heli_jax.flights.signal_facts import DROP_SHARE
 from heli_jax.identification.design.accuracy import (
     expected_sd,
-    sensitivity_at,
     together,
     triangle,
 )
 from heli_jax.identification.estimation.data import runs_away
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.simulated_flights import predict
-from heli_jax.identification.identifiability.analysis import verdict_of
+from heli_jax.identification.identifiability.analysis import sensitivity_at, verdict_of
 from heli_jax.identification.identifiability.verdict import Unknown
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (

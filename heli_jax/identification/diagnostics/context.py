@@ -58,8 +58,8 @@ from heli_jax.identification.validation.logging_rate import (
 from heli_jax.identification.validation.metrics import (
     Metrics,
     Whiteness,
-    correlated_residuals,
     metrics,
+    outputs_correlated,
     pooled_metrics,
     signals_of,
     whiteness_of,
@@ -150,7 +150,7 @@ class Context:
     @cached_property
     def independent(self) -> bool:
         """True if the residuals, or innovations, are white and not correlated between outputs."""
-        return self.white and not correlated_residuals(self.signals)
+        return self.white and not outputs_correlated(self.signals)
 
     # Feedback to the inputs.
 

@@ -319,28 +319,26 @@ _FEWEST = 8
 """Fewest pairs of samples for a correlation."""
 
 
-def correlated_residuals(signals: tuple[Signals, ...]) -> dict[str, float]:
-    """Return the correlation of dependent residuals by 'output and output, flight'.
+def outputs_correlated(signals: tuple[Signals, ...]) -> bool:
+    """True if residuals of two outputs of a flight are correlated.
 
     The intervals are too narrow then, because two correlated residuals count as independent.
     """
-    correlated = {}
     for s in signals:
         # Two diverging simulations have correlated errors, whatever the noise.
         names = [n for n, y in s.measured.items() if not diverges(metrics(y, s.simulated[n]))]
-        for b, a in itertools.combinations(names, 2):
-            # Flights are kept apart, because biases of joined flights would look like correlation.
-            x, y = s.residual(a), s.residual(b)
+        # Flights are kept apart, because biases of joined flights would look like correlation.
+        for x, y in itertools.combinations([s.residual(n) for n in names], 2):
             # Sensors of different rates share few samples; only those count.
             seen = np.isfinite(x) & np.isfinite(y)
             n = int(seen.sum())
             if n < _FEWEST or not (np.std(x[seen]) > 0 and np.std(y[seen]) > 0):
                 continue
-            rho = float(np.corrcoef(x[seen], y[seen])[0, 1])
-            # For independent white residuals the standard deviation of rho is 1 / sqrt(n).
-            if abs(rho) > max(_SURELY_CORRELATED / n**0.5, _WORTH_IT):
-                correlated[f"{b} and {a}, {s.flight}"] = rho
-    return correlated
+            # For independent white residuals the standard deviation is 1 / sqrt(n).
+            rho = abs(float(np.corrcoef(x[seen], y[seen])[0, 1]))
+            if rho > max(_SURELY_CORRELATED / n**0.5, _WORTH_IT):
+                return True
+    return False
 
 
 def whiteness_of(
