@@ -257,20 +257,16 @@ def is_decimated(flight: Flight, output: str) -> bool:
     return facts is not None and facts.usual < _FEWER * flight.dt
 
 
-def whiteness_in_band(innovations: np.ndarray, together: int) -> Whiteness:
-    """Test for whiteness as `whiteness` does; if that fails, in the band that decimation passes.
+def in_passed_band(signal: np.ndarray) -> np.ndarray:
+    """Return a decimated signal (N,) at the lower rate that its low-pass passes entirely.
 
-    Args:
-        innovations: (N,) over their standard deviations, NaN where nothing is measured.
-        together: number of signals that are tested together, for the p-value.
+    It is unchanged if many samples are missing (NaN).
     """
-    found, seen = whiteness(innovations, together), np.isfinite(innovations)
-    if found.white or np.mean(seen) < _SEEN:
-        return found
-    spectrum = np.fft.rfft(np.where(seen, innovations, 0.0))
-    kept = int(PASSED * innovations.size)
-    other = whiteness(np.fft.irfft(spectrum[: kept + 1], 2 * kept), together)
-    return other if other.white else found
+    seen = np.isfinite(signal)
+    if np.mean(seen) < _SEEN:
+        return signal
+    kept = int(PASSED * signal.size)
+    return np.fft.irfft(np.fft.rfft(np.where(seen, signal, 0.0))[: kept + 1], 2 * kept)
 
 
 # Signals of a fit.
@@ -376,7 +372,7 @@ def whiteness_of(
     }
     # Among many signals one looks autocorrelated by chance, so all share the significance level.
     return {
-        name: whiteness_in_band(error, len(errors))
+        name: whiteness(in_passed_band(error), len(errors))
         if name in low_passed
         else whiteness(error, len(errors), fitted.get(name))
         for name, error in errors.items()
