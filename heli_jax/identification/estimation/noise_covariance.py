@@ -18,7 +18,7 @@ from heli_jax.identification.estimation.noise_scales import corrections_changed
 from heli_jax.identification.estimation.starts import noise_guess_at
 from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.layout import Noise, Solution
+from heli_jax.identification.unknowns.layout import Noise, Solution, disturbance_limits
 from heli_jax.numerics.white_noise import noise_guess
 
 _ROUNDS = 30
@@ -189,11 +189,22 @@ def with_noise_guess(search: Search, noise: Noise, z: Float[Array, " q"]) -> Flo
 
 
 def _is_known(search: Search, optimum: RelaxedOptimum, d: Disturbance) -> bool:
-    """True if the size of a disturbance is well determined."""
-    e = evaluate(search.layout, search.data, optimum.noise, optimum.best.z)
+    """True if all parameters of a disturbance are determined, and within what a record can show."""
+    layout, z = search.layout, optimum.best.z
+    e = evaluate(layout, search.data, optimum.noise, z)
     if not (optimum.best.converged and np.all(np.isfinite(e.J))):
         return False
-    return bool(deviations(e.J)[search.layout.disturbance_at(d.sigma)] < _SURE)
+    sds = deviations(e.J)
+    its = [layout.disturbance_at(n) for n in (d.sigma, d.tau) if n in layout.disturbance]
+    if not (np.isfinite(sds[its]).all() and sds[layout.disturbance_at(d.sigma)] < _SURE):
+        return False
+    if d.tau not in layout.disturbance:
+        return True
+    # `unpack` clips at the limits, so the likelihood is flat there. It is nearly flat below one
+    # sample.
+    _, high = (float(v) for v in disturbance_limits(layout, search.data)[d.tau])
+    low = np.log(min(float(f.dt) for f in search.data.flights))
+    return bool(low < float(z[layout.disturbance_at(d.tau)]) < high)
 
 
 def _without(
