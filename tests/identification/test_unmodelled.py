@@ -247,10 +247,9 @@ def test_wild_samples_that_happen_to_follow_the_stick_are_no_answer():
     e = rng.standard_normal(N)
     wild = rng.choice(N, 8, replace=False)
     e[wild] += 60.0 * np.sign(u[wild])
-    lines = lines_of(e, np.ones((N, 1)), u[:, None])
-    assert strongest([lines], STICK).p_value > 0.01
-    # The samples of 60 sds count as 5.
-    assert lines.size < 1.2
+    full, part = (lines_of(e, np.ones((N, 1)), u[:, None], (), most) for most in (np.inf, 5.0))
+    assert strongest([full], STICK).p_value < 0.01 < strongest([part], STICK).p_value
+    assert part.size < 0.5 * full.size
 
 
 def test_the_answer_through_a_filter_is_found_where_it_is():

@@ -232,7 +232,9 @@ class Context:
         tested = self.at_optimum and self.explains and not (self.instruments or self.ahead)
         if not tested or self.follows:
             return [], (1.0, {})
-        return unmodelled(self.at, self.e, [label for label, _ in self.flights])
+        coloured = self.errors.coloured and self.at.layout.noise_model != "spectrum"
+        names = [label for label, _ in self.flights]
+        return unmodelled(self.at, self.e, names, coloured=coloured)
 
     @cached_property
     def adequacy(self) -> Adequacy:

@@ -11,7 +11,7 @@ from heli_jax.identification.estimation.noise_covariance import NO_DISTURBANCE
 from heli_jax.identification.validation.adequacy import EXPLAINED, WORSE
 from heli_jax.identification.validation.excitation import LEVEL
 from heli_jax.identification.validation.metrics import pooled_metrics
-from heli_jax.identification.validation.unmodelled import LEVEL_IN_TIME
+from heli_jax.identification.validation.unmodelled import LEVEL_COLOURED
 
 # Adequacy of the model.
 
@@ -110,7 +110,7 @@ def unmodelled_dynamics(c: Context) -> Iterator[Finding]:
             gain=one.gain,
             near=f"{one.frequency:.2g} rad/s" if one.frequency else "",
             lacks="a mode or a lag" if one.frequency else "dynamics",
-            level=LEVEL_IN_TIME,
+            level=LEVEL,
         )
 
 
@@ -124,7 +124,7 @@ def inputs_prefer_other_values(c: Context) -> Iterator[Finding]:
             *c.at.layout.of_interest,
             value=p,
             shifts=shifts,
-            level=LEVEL_IN_TIME,
+            level=LEVEL_COLOURED,
         )
 
 

@@ -272,7 +272,8 @@ def _residual(
     # With f linear between samples: h(k+1) = phi h(k) + first f(k) + second f(k+1).
     one = np.eye(len(hidden))
     system = (matrix[np.ix_(hidden, hidden)], one, one, 0.0 * one)
-    phi, B, _, second, _ = cont2discrete(system, record.step, "foh")
+    discrete: Any = cont2discrete(system, record.step, "foh")  # SciPy's type is a union
+    phi, B, _, second, _ = discrete
     first = B - phi @ second
     free = []
     for r, segment in zip(residual, record.segments, strict=True):

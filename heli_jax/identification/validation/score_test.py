@@ -42,8 +42,6 @@ _AT_LEAST = 14.0
 """Least gain for which a p-value is computed; one filter exceeds it by chance in 1 of 1000."""
 _ROUNDING = 1e-9
 """Share of a column below which the rest is rounding."""
-_WILD = 5.0
-"""Bound of the whitened residual [robust sds]."""
 _MEDIAN = 0.6745
 """Median size of a standard normal number."""
 _EULER = 0.5772156649015329
@@ -100,6 +98,8 @@ class Strongest(NamedTuple):
     """Frequency of the filter [rad/sample]."""
     shift: Float[np.ndarray, " q"]
     """Change of the unknowns if the model includes the filter."""
+    step: Float[np.ndarray, " q"]
+    """Step of the unknowns to the smallest whitened residual without the filter."""
     amount: float
     """Estimated coefficient of the drive, in the units of a step of an unknown."""
 
@@ -109,14 +109,15 @@ def lines_of(
     J: Float[np.ndarray, "N q"],
     drives: Float[np.ndarray, "N d"],
     holes: Sequence[int] = (),
+    most: float = np.inf,
 ) -> Lines | None:
     """Return the spectra of a record's signals, whitened by the residual's autoregression.
 
-    The whitened residual is bounded, since a few outliers may have most of the power (Huber, 1981).
     None if the record is too short or has no residual.
 
     Args:
         holes: the samples before which others are missing.
+        most: bound of the whitened residual [robust sds] (Huber, 1981).
     """
     n = e.size - ORDER
     if (n - 1) // 2 < max(_LEAST, 2 * J.shape[1]) or not np.std(e) > 0:
@@ -130,8 +131,9 @@ def lines_of(
     white = np.stack([np.convolve(c, h, "valid") for c in rows])
     # A jump across missing samples is no response: drop all samples that the filter mixes.
     white[:, across(holes, e.size)[ORDER:]] = 0.0
-    most = _WILD * float(np.median(np.abs(white[0][white[0] != 0.0]))) / _MEDIAN
-    white[0] = np.clip(white[0], -most, most)
+    if np.isfinite(most):
+        most *= float(np.median(np.abs(white[0][white[0] != 0.0]))) / _MEDIAN
+        white[0] = np.clip(white[0], -most, most)
     v = np.asarray(scipy.fft.rfft(white))[:, 1 : 1 + (n - 1) // 2] / np.sqrt(n)
     # A bias leaves only rounding here. Set it to zero, so that nothing is regressed on it.
     mean_squares = np.mean(np.real(v) ** 2 + np.imag(v) ** 2, axis=1, keepdims=True)
@@ -190,7 +192,8 @@ def strongest(records: Sequence[Lines], drives: Sequence[Drive]) -> Strongest:
     drive, gain = one.drives[at], float(of[of_filter, at] * freedom / squares)
     damping, frequency = one.filters[of_filter].tolist()
     if not gain > _AT_LEAST:
-        return Strongest(drive, gain, 1.0, damping, frequency, np.zeros(J.shape[1]), 0.0)
+        nothing = np.zeros(J.shape[1])
+        return Strongest(drive, gain, 1.0, damping, frequency, nothing, nothing, 0.0)
     # A fixed seed gives the same phases each time. Single precision halves the work; the surrogate
     # distribution is known to about 10 % anyway.
     turns = np.random.default_rng(0).random((e.size, _SURROGATES))
@@ -203,12 +206,9 @@ def strongest(records: Sequence[Lines], drives: Sequence[Drive]) -> Strongest:
     own = one.removed_first + 2 * at
     through = one.columns[[*range(one.removed_first), own, own + 1]]
     response = _responses(one.filters[[of_filter]], angles)
-    step = _step(np.concatenate([rows, _real((response * through).T)], axis=1), residual)
-    shift = step[: J.shape[1]] - _step(rows, residual)
+    steps = _steps(rows, _real((response * through).T), residual)
     p_value = _by_chance(gain, np.max(of_chance, axis=0))
-    # The coefficients of the drive, and of the drive one sample later.
-    amount = float(np.sum(step[-2:]))
-    return Strongest(drive, gain, p_value, damping, frequency, shift, amount)
+    return Strongest(drive, gain, p_value, damping, frequency, *steps)
 
 
 class _Bands(NamedTuple):
@@ -373,7 +373,8 @@ def pulled_away(records: Sequence[Lines], k: int) -> float:
 def step_to_least(records: Sequence[Lines]) -> Float[np.ndarray, " q"]:
     """Return the step of the unknowns to the smallest whitened residual."""
     e = _real(np.concatenate([record.e for record in records])[:, None])
-    return _step(_real(np.concatenate([record.J for record in records])), e)
+    J = _real(np.concatenate([record.J for record in records]))
+    return _steps(J, np.zeros((len(J), 2)), e)[1]
 
 
 def _inverse(left: np.ndarray, whole: np.ndarray) -> np.ndarray:
@@ -402,11 +403,24 @@ def _by_chance(gain: float, others: Float[np.ndarray, " r"]) -> float:
     return float(-np.expm1(-np.exp(-(gain - middle) / scale)))
 
 
-def _step(J: Float[np.ndarray, "K2 q"], e: Float[np.ndarray, "K2 1"]) -> Float[np.ndarray, " q"]:
-    """Return the step of the unknowns to the smallest residual, which falls by J times the step."""
-    sizes = np.linalg.norm(J, axis=0)
-    sizes = np.where(sizes > 0, sizes, np.inf)
-    return -np.linalg.lstsq(J / sizes, e[:, 0], rcond=1e-6)[0] / sizes
+def _steps(
+    J: Float[np.ndarray, "K2 q"], more: Float[np.ndarray, "K2 c"], e: Float[np.ndarray, "K2 1"]
+) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"], float]:
+    """Return the effect of further columns on the unknowns' step, the step, and a drive's amount.
+
+    The first is the step with the columns less that without; the second is the step without. The
+    amount is the sum of the last two coefficients: a drive, and the drive one sample later.
+    """
+    columns = np.concatenate([J, more], axis=1)
+    sizes = np.linalg.norm(columns, axis=0)
+    columns = columns / np.where(sizes > 0, sizes, 1.0)
+    q = J.shape[1]
+    # e falls by J times the step.
+    alone = -np.linalg.lstsq(columns[:, :q], e[:, 0], rcond=1e-6)[0]
+    removed_first = -np.linalg.lstsq(columns, e[:, 0], rcond=1e-6)[0]
+    over = np.where(sizes > 0, sizes, np.inf)
+    amount = float(np.sum(removed_first[-2:] / over[-2:]))
+    return (removed_first[:q] - alone) / over[:q], alone / over[:q], amount
 
 
 def _real(v: Complex[np.ndarray, "K c"]) -> Float[np.ndarray, "K2 c"]:
