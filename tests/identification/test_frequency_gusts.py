@@ -99,12 +99,14 @@ def test_a_closed_loop_is_said_only_of_inputs_without_an_instrument():
     # However coherent residual and response are, there was no loop.
     open_loop = [one._replace(p_value=0.5) for one in loops]
     assert trust(moved, open_loop) == []
+    [found] = trust(moved, open_loop, held=True)
+    assert found.distrusts == ("Mm", "Ll")
 
 
-def trust(moved, feedback, instruments=()):
+def trust(moved, feedback, instruments=(), *, held=False):
     """Return the findings of a fit with such a loop."""
     follows = any(one.present for one in feedback)
     context = SimpleNamespace(
-        moved=moved, feedback=feedback, instruments=instruments, follows=follows
+        moved=moved, feedback=feedback, instruments=instruments, held=held, follows=follows
     )
     return list(moved_by_feedback(context))

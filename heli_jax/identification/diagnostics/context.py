@@ -36,6 +36,7 @@ from heli_jax.identification.validation.adequacy import (
     Adequacy,
     assess,
     is_unstable,
+    unstable_poles,
 )
 from heli_jax.identification.validation.closed_loop_trust import moved_by_feedback
 from heli_jax.identification.validation.excitation import (
@@ -166,11 +167,24 @@ class Context:
         return any(one.present for one in self.feedback)
 
     @cached_property
+    def _poles(self) -> list[float]:
+        """Poles in a fit of lines that only a loop can keep from growing, see `unstable_poles`."""
+        objective, none = self.at.layout.objective, [0.0] * len(self.flights)
+        lines = objective.noise_model == "spectrum" and not objective.fits_responses
+        return unstable_poles(self.problem, self.params) if lines else none
+
+    @property
+    def held(self) -> bool:
+        """True for a fit in frequency of an unstable model, which only a loop can hold."""
+        return bool(self.moved) and any(self._poles)
+
+    @cached_property
     def moved(self) -> dict[str, float]:
         """Share of information that may be feedback, by unknown of interest, in frequency."""
         if not self.at_optimum or self.unrelated:
             return {}
-        return moved_by_feedback(self.at)
+        poles = [0.0] * len(self._poles) if self.instruments else self._poles
+        return moved_by_feedback(self.at, poles)
 
     @cached_property
     def instruments(self) -> tuple[str, ...]:
@@ -362,7 +376,7 @@ class Context:
             return HeldOut()
         (signals, free_run), in_frequency = validate(problem, at, flights), None
         if self.at_optimum:
-            feedback = self.follows and not self.instruments
+            feedback = (self.held or self.follows) and not self.instruments
             in_frequency = validate_in_frequency(problem, at, self.e, flights, feedback=feedback)
         return HeldOut(signals, free_run, in_frequency)
 

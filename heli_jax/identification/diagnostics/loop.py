@@ -74,12 +74,13 @@ def _frees_a_delay(problem: Problem, late: Sequence[str]) -> str:
 def moved_by_feedback(c: Context) -> Iterator[Finding]:
     """Find parameters that feedback may have biased in frequency, if no excitation was logged."""
     by = c.instruments
+    closed = any(one.present for one in c.feedback) or (c.held and not by)
     direct = [one for one in c.feedback if one.input not in by]
     # Feedback to an input with an instrument may go to the other inputs as well.
     inputs = list(dict.fromkeys(one.input for one in [f for f in direct if f.present] or direct))
     limit = BESIDE if by else MAY_BE
     parts = {n: part for n, part in c.moved.items() if part > limit}
-    if not (parts and c.follows) or (by and not inputs):
+    if not (parts and closed) or (by and not inputs):
         return
     yield found(
         "loop.no-instrument",
@@ -88,6 +89,7 @@ def moved_by_feedback(c: Context) -> Iterator[Finding]:
         value=max(parts.values()),
         distrusts=parts,
         inputs=inputs if by else ["the inputs"],
+        held="" if c.follows else "the vehicle is held",
         names=list(parts),
         shares=list(parts.values()),
         limit=limit,

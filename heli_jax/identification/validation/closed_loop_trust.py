@@ -2,16 +2,20 @@ r"""Bias of estimates by feedback, if no excitation was logged.
 
 Feedback brings the disturbances of the vehicle into its inputs. The direct response is then biased
 by the share $\gamma^2$ of the input that comes from feedback. The record does not show that share,
-but bounds it: feedback of one output at a constant gain adds $|k|^2 S_{ee}$ to $S_{uu}$, at no
-frequency more than the input. The bound uses the largest such gain, averaged over the outputs,
-since the feedback path is unknown. A loop acts at low frequencies, where gusts dominate the
-residual.
+but bounds it in two ways:
+
+- Feedback of one output at a constant gain adds $|k|^2 S_{ee}$ to $S_{uu}$, at no frequency more
+  than the input. The bound uses the largest such gain, averaged over the outputs, since the
+  feedback path is unknown. A loop acts at low frequencies, where gusts dominate the residual.
+- The loop that stabilises an unstable vehicle has a bandwidth of at least twice its unstable pole.
+  Below that frequency the whole input may be feedback.
 
 A parameter's share is the mean over frequency, weighted by the information on the parameter. It
-does not prove a loop: parameters are reported only if inputs follow the response. Inputs taken by
-instrument add nothing.
+does not prove a loop. Parameters are reported only if inputs follow the response, or if the model
+is unstable. Inputs taken by instrument add nothing.
 
-Source: L. Ljung, System Identification (1999), 13.4, for the direct estimate's bias.
+Sources: L. Ljung, System Identification (1999), 13.4, for the direct estimate's bias; Astrom and
+Murray, Feedback Systems (2008), 11.4, for the bandwidth that an unstable pole requires.
 """
 
 import functools
@@ -47,16 +51,23 @@ BESIDE = 0.05
 """The same if other inputs are taken by instrument.
 
 The effect of an input has at least this bias, in a fit that feedback should not affect."""
+_REACHES = 2.0
+"""Least bandwidth of the stabilising loop over the unstable pole.
+
+With less bandwidth no feedback has margins (Astrom and Murray, 2008, section 11.4)."""
 _SEEN = 2.0
 """Output power over the residual's, above which a frequency bounds the feedback gain."""
 _PART = 0.05
 """Standard deviation of the Gaussian that smooths the spectra, as a share of the frequency."""
 
 
-def moved_by_feedback(at: Solution) -> dict[str, float]:
+def moved_by_feedback(at: Solution, poles: Sequence[float]) -> dict[str, float]:
     """Return the share of information that may be feedback, 0 to 1, by unknown of interest.
 
     Empty in the time domain, and if every moving input is taken by instrument.
+
+    Args:
+        poles: the result of `unstable_poles`; zero for an estimate by instrument.
     """
     layout = at.layout
     if layout.noise_model != "spectrum":
@@ -65,6 +76,11 @@ def moved_by_feedback(at: Solution) -> dict[str, float]:
     parts = _room_of_responses(at) if responses else _room_of_records(at)
     if not parts:
         return {}
+    if not responses:
+        for i, record in enumerate(records_of(layout)):
+            dt = float(at.data.flights[record.flight].dt)
+            omega = 2.0 * np.pi * np.arange(1, record.lines + 1) / (record.samples * dt)
+            parts[i] = np.where(omega <= _REACHES * poles[record.flight], 1.0, parts[i])
     whole = information(at, [np.ones_like(v) for v in parts])
     of_each = shares(information(at, parts), whole)
     return {n: float(v) for n, v in zip(layout.of_interest, of_each, strict=True)}
