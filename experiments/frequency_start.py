@@ -16,7 +16,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from heli_jax import Free, Problem, fit, models
-from heli_jax.identification.frequency_start import frequency_error_start, started
+from heli_jax.identification.fit import frequency_error_start, started
 from tests.identification.bench import BENCH, record, vehicle
 
 jax.config.update("jax_enable_x64", True)

@@ -125,8 +125,7 @@ ROOMS = (
     "methods", "defaults", "problem", "unknowns",
     "estimation", "identifiability", "design", "validation", "equation_error", "result",
     "uncertainty",
-    "agreement", "diagnostics", "restarts", "search", "fit",
-    "frequency_start", "select",
+    "diagnostics", "restarts", "search", "fit", "select",
 )  # fmt: skip
 
 

@@ -12,8 +12,7 @@ from heli_jax.finding import Finding
 from heli_jax.identification.design.accuracy import GUESSED
 from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.equation_error.start import EquationErrorStart
-from heli_jax.identification.fit import Check, Estimate
-from heli_jax.identification.frequency_start import FrequencyErrorStart
+from heli_jax.identification.fit import Check, Estimate, FrequencyErrorStart
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.numbers import (
     percent,

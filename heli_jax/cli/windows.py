@@ -9,9 +9,8 @@ from heli_jax.cli.terminal import print_table, print_text
 from heli_jax.config import Experiment
 from heli_jax.config.logs import require_flights, with_log
 from heli_jax.errors import located
-from heli_jax.identification.design.accuracy import GUESSED
+from heli_jax.identification.design.accuracy import DETERMINES, GUESSED
 from heli_jax.identification.design.windows import (
-    DETERMINES,
     ENOUGH,
     Ranking,
     Window,

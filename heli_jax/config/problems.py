@@ -356,7 +356,7 @@ def _started_in_frequency(experiment: Experiment, problem: Problem) -> Problem:
     if config is None or config.start != "frequency-error":
         return problem
     # Imported on demand: the optimiser takes a second to import.
-    from heli_jax.identification.frequency_start import frequency_error_start, started
+    from heli_jax.identification.fit import frequency_error_start, started
 
     known = naming.names(experiment.model.Params)
     bare = {

@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 from heli_jax import naming
 from heli_jax.identification.equation_error.start import equation_error_start
 from heli_jax.identification.estimation.data import data_of, start_vector
-from heli_jax.identification.estimation.disturbance_search import with_noise_guess
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.multistart import (
     FirstGuess,
@@ -19,7 +18,7 @@ from heli_jax.identification.estimation.multistart import (
     named_values,
     sum_of_squares,
 )
-from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
+from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum, with_noise_guess
 from heli_jax.identification.estimation.starts import draw
 from heli_jax.identification.identifiability.equivalents import second_solutions
 from heli_jax.identification.unknowns import transforms

@@ -14,7 +14,7 @@ from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.adequacy import Adequacy
 from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.held_out import HeldOutFrequency
-from heli_jax.identification.validation.metrics import Metrics, Whiteness
+from heli_jax.identification.validation.metrics import Metrics, Signals, Whiteness
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -43,41 +43,6 @@ class Estimate(NamedTuple):
     def without_interval(self) -> "Estimate":
         """Return the estimate without sd and interval."""
         return self._replace(sd=None, lower95=None, upper95=None, sd_white=None, sd_alone=None)
-
-
-class Signals(NamedTuple):
-    """Measured and simulated signals of one flight; arrays (N,), SI."""
-
-    flight: str
-    hold_out: bool
-    times: np.ndarray
-    """Time [s]."""
-    inputs: dict[str, np.ndarray]
-    measured: dict[str, np.ndarray]
-    simulated: dict[str, np.ndarray]
-    """Simulation including the estimated bias."""
-    innovations: dict[str, np.ndarray] | None = None
-    """Filter error: measurement less its prediction from all earlier samples, SI."""
-    log_start: float | None = None
-    """Time of the first sample from the log's beginning [s]; None without a log."""
-
-    @property
-    def log_times(self) -> np.ndarray:
-        """Time from the log's beginning (N,) [s]; from zero without a log."""
-        return self.times + (self.log_start or 0.0)
-
-    def predicted(self, output: str) -> np.ndarray:
-        """Return the one-step prediction of filter error (N,)."""
-        assert self.innovations is not None
-        return self.measured[output] - self.innovations[output]
-
-    def residual(self, output: str) -> np.ndarray:
-        """Return measured minus simulated (N,)."""
-        return self.measured[output] - self.simulated[output]
-
-    def error(self, output: str) -> np.ndarray:
-        """Return innovations with filter error, else residuals (N,)."""
-        return self.residual(output) if self.innovations is None else self.innovations[output]
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,6 @@ import numpy as np
 
 from heli_jax.finding import found
 from heli_jax.identification.estimation.data import data_of, start_vector
-from heli_jax.identification.estimation.disturbance_search import significant_disturbances
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.multistart import (
     FirstGuess,
@@ -23,6 +22,7 @@ from heli_jax.identification.estimation.noise_covariance import (
     first_noise,
     log_likelihood_of,
     relax_noise_covariance,
+    significant_disturbances,
 )
 from heli_jax.identification.estimation.output_error import in_time
 from heli_jax.identification.estimation.starts import delay_start, draw, noise_guess_at

@@ -32,15 +32,14 @@ from heli_jax.analysis.response_agreement import USUAL_J, ResponseAgreement
 from heli_jax.finding import Distrust, Finding, sentences
 from heli_jax.flights import Flight
 from heli_jax.flights.flight import as_content
-from heli_jax.identification.diagnostics.noise import COLOURED, TOO_NARROW
+from heli_jax.identification.diagnostics.residuals import COLOURED, TOO_NARROW
 from heli_jax.identification.equation_error.start import (
     Equation,
     EquationErrorStart,
     StartValue,
 )
 from heli_jax.identification.estimation.multistart import StartRow
-from heli_jax.identification.fit import Fit
-from heli_jax.identification.frequency_start import FrequencyErrorStart
+from heli_jax.identification.fit import Fit, FrequencyErrorStart
 from heli_jax.identification.identifiability.profile import Profile
 from heli_jax.identification.identifiability.verdict import Combination, Pair
 from heli_jax.identification.problem import Problem

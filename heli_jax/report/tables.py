@@ -14,7 +14,7 @@ from heli_jax.finding import sentences
 from heli_jax.flights.flight import in_words
 from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.equation_error.start import EquationErrorStart
-from heli_jax.identification.frequency_start import FrequencyErrorStart
+from heli_jax.identification.fit import FrequencyErrorStart
 from heli_jax.identification.identifiability.verdict import Z95, Combination
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Fit

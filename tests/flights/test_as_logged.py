@@ -11,7 +11,7 @@ from heli_jax.flights.flight import Signal
 from heli_jax.flights.marks import strays as strays_of
 from heli_jax.flights.parts import part
 from heli_jax.flights.read import read_flight
-from heli_jax.identification.diagnostics.quality import (
+from heli_jax.identification.diagnostics.record import (
     saturation,
     strays,
     stuck_outputs,

@@ -7,7 +7,7 @@ import pytest
 import scipy.signal
 
 from heli_jax.finding import Distrust, Finding, distrusted, exit_code, rated
-from heli_jax.identification.diagnostics import adequacy
+from heli_jax.identification.diagnostics import residuals
 from heli_jax.identification.diagnostics.context import HeldOut
 from heli_jax.identification.validation.adequacy import assess
 from heli_jax.identification.validation.metrics import metrics, whiteness
@@ -42,7 +42,7 @@ class Judged:
 
     @property
     def findings(self):
-        return list(adequacy.outputs_explained(self))
+        return list(residuals.outputs_explained(self))
 
 
 def denied(found):
@@ -144,6 +144,6 @@ def test_a_misfit_takes_away_the_intervals_that_it_moves_by_more_than_half():
 def test_flights_held_out_are_held_against_their_mean(monkeypatch, vaf, worse):
     at = SimpleNamespace(layout=SimpleNamespace(noise_model="white"))
     fitted = SimpleNamespace(at=at, held_out=HeldOut())
-    monkeypatch.setattr(adequacy, "pooled_metrics", lambda _: {"p": SimpleNamespace(vaf=vaf)})
-    found = list(adequacy.held_out_predicted(fitted))
+    monkeypatch.setattr(residuals, "pooled_metrics", lambda _: {"p": SimpleNamespace(vaf=vaf)})
+    found = list(residuals.held_out_predicted(fitted))
     assert [(f.subjects, f.denies) for f in found] == worse * [(("p",), True)]

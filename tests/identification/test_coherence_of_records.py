@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from heli_jax.identification.diagnostics.timing import of_rates
+from heli_jax.identification.diagnostics.record import of_rates
 from heli_jax.identification.validation.excitation import excitation_of
 from tests.identification.test_enough import DT, TRUTH, flight, problem, response
 

@@ -13,8 +13,7 @@ import scipy.signal
 from heli_jax import Flight, Free, Model, Nuisance, Problem, fit
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.problem import MAX_TIME_SHIFT
-from heli_jax.identification.uncertainty.estimates import estimates_of
-from heli_jax.identification.uncertainty.standard_errors import StandardErrors
+from heli_jax.identification.uncertainty.estimates import StandardErrors, estimates_of
 from heli_jax.identification.validation.excitation import excitation_of
 from heli_jax.naming import Scalar
 from heli_jax.numerics.white_noise import noise_guess, white_part

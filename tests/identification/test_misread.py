@@ -13,7 +13,7 @@ from heli_jax import Flight, linear_model, models
 from heli_jax import config as configuration
 from heli_jax.config.logs import read_flights
 from heli_jax.flights.flight import Signal, Source
-from heli_jax.identification.diagnostics import quality, units
+from heli_jax.identification.diagnostics import record, units
 
 TREX = Path(__file__).parents[3] / "shared" / "data" / "trex550"
 DT, N = 0.02, 1000
@@ -57,7 +57,7 @@ def load(tmp_path):
 
 RECORD_ALONE = (
     units.rate_against_angle, units.against_file, units.size_of_angles,
-    quality.saturation, quality.stuck_outputs,
+    record.saturation, record.stuck_outputs,
 )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.identifiability.analysis import verdict_of
 from heli_jax.identification.search import first_guess
-from heli_jax.identification.uncertainty.standard_errors import through_inputs
+from heli_jax.identification.uncertainty.estimates import through_inputs
 from heli_jax.identification.unknowns.layout import Solution
 
 TRUTH = {"Lb": 95.0, "tau": 0.06, "Blat": 0.11, "kappa": 3.0, "zeta": 0.4}

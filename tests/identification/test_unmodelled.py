@@ -13,7 +13,7 @@ import scipy.signal
 
 from heli_jax import Flight, Free, Model, Problem, fit
 from heli_jax.analysis.response_agreement import ResponseAgreement
-from heli_jax.identification.diagnostics.adequacy import responses_explained
+from heli_jax.identification.diagnostics.residuals import responses_explained
 from heli_jax.identification.validation.score_test import (
     BROAD,
     NARROW,
@@ -21,7 +21,6 @@ from heli_jax.identification.validation.score_test import (
     lines_of,
     strongest,
 )
-from heli_jax.identification.validation.unmodelled import own_samples
 from heli_jax.naming import Scalar
 from tests.identification.lag import LAG, Inputs, Params, Rate, response
 
@@ -304,24 +303,6 @@ def test_an_answer_is_found_beside_a_hole():
     e = rng.standard_normal(N) + 0.4 * answer / answer.std()
     columns = [with_a_hole(v) for v in (e, u[:, None], u[:, None])]
     assert strongest([lines_of(*columns, [700])], STICK).p_value < 0.001
-
-
-def test_where_samples_are_missing():
-    seen = np.ones(2000, bool)
-    seen[[300, 301, 700]] = False
-    own = own_samples(seen)
-    assert own.every == 1
-    assert own.holes == (300, 698)
-    # A slower clock, a random half, and none missing.
-    fourth = own_samples(np.arange(100) % 4 == 3)
-    assert fourth.every == 4
-    np.testing.assert_allclose(fourth.of_input(np.arange(100.0)), np.arange(3, 100, 4) - 1.5)
-    assert own_samples(np.random.default_rng(1).random(100) < 0.5) is None
-    assert own_samples(np.ones(9, bool)).every == 1
-    # A sensor with 7 grid steps and a drifting clock, and one lost sample.
-    slow = np.zeros(2000, bool)
-    slow[np.cumsum([0, *([7] * 100), 8, *([7] * 50), 14, *([7] * 50)])] = True
-    assert own_samples(slow).holes == (152,)
 
 
 def test_records_too_short_are_not_asked():

@@ -9,7 +9,7 @@ import scipy.signal
 
 from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.signal_facts import facts_of_all
-from heli_jax.identification.diagnostics.quality import stuck_outputs
+from heli_jax.identification.diagnostics.record import stuck_outputs
 
 RNG = np.random.default_rng(0)
 T = 0.005 * np.arange(6000)

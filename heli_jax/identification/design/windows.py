@@ -25,14 +25,13 @@ from heli_jax.flights.parts import part
 from heli_jax.flights.signal_facts import DROP_SHARE
 from heli_jax.identification.design.accuracy import (
     expected_sd,
-    sensitivity_at,
     together,
     triangle,
 )
 from heli_jax.identification.estimation.data import runs_away
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.simulated_flights import predict
-from heli_jax.identification.identifiability.analysis import verdict_of
+from heli_jax.identification.identifiability.analysis import sensitivity_at, verdict_of
 from heli_jax.identification.identifiability.verdict import Unknown
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
@@ -45,8 +44,6 @@ from heli_jax.identification.unknowns.layout import (
 ENOUGH = 0.9
 """D-efficiency of the windows that are taken: the q-th root of the determinant of their information
 over that of all windows"""
-DETERMINES = 1.0
-"""relative sd below which a parameter is determined"""
 _RAILS = 0.05
 """share of a window's samples at an end of a signal's range from which on it is left out"""
 _GAP = 0.25

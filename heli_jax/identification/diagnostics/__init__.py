@@ -7,17 +7,7 @@ here, and its words in `messages.yaml`.
 from collections.abc import Callable, Iterable
 
 from heli_jax.finding import Finding, distrusted, rated, without_repeats
-from heli_jax.identification.diagnostics import (
-    adequacy,
-    dynamics,
-    excitation,
-    loop,
-    noise,
-    quality,
-    search,
-    timing,
-    units,
-)
+from heli_jax.identification.diagnostics import loop, record, residuals, search, units
 from heli_jax.identification.diagnostics.context import Context
 
 Diagnostic = Callable[[Context], Iterable[Finding]]
@@ -27,20 +17,18 @@ DIAGNOSTICS: tuple[Diagnostic, ...] = (
     search.log_cautions,
     search.at_bound,
     search.search_stopped,
-    *timing.DIAGNOSTICS,
-    *quality.DIAGNOSTICS,
-    *excitation.DIAGNOSTICS,
+    *record.DIAGNOSTICS,
     loop.inputs_follow_response,
     loop.moved_by_feedback,
     loop.weak_instruments,
-    dynamics.unmodelled_dynamics,
-    dynamics.inputs_prefer_other_values,
-    adequacy.outputs_explained,
-    adequacy.responses_explained,
-    adequacy.residual_follows_excitation,
-    adequacy.held_out_predicted,
-    noise.residuals_white,
-    noise.disturbance_shows,
+    residuals.unmodelled_dynamics,
+    residuals.inputs_prefer_other_values,
+    residuals.outputs_explained,
+    residuals.responses_explained,
+    residuals.residual_follows_excitation,
+    residuals.held_out_predicted,
+    residuals.residuals_white,
+    residuals.disturbance_shows,
     search.search_notes,
     search.prior_contradicted,
     search.profile_intervals,

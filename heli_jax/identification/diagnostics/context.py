@@ -9,12 +9,6 @@ import numpy as np
 
 from heli_jax.analysis.response_agreement import ResponseAgreement
 from heli_jax.flights.flight import Flight, labels
-from heli_jax.identification.agreement import (
-    correlated_residuals,
-    pooled_metrics,
-    signals_of,
-    whiteness_of,
-)
 from heli_jax.identification.estimation.evaluation import Evaluation
 from heli_jax.identification.estimation.filter_error import (
     SECONDS,
@@ -29,23 +23,22 @@ from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Signals, Status
 from heli_jax.identification.uncertainty.estimates import (
+    StandardErrors,
     estimates_of,
     flight_nuisances,
     noise_by_name,
+    standard_errors,
     without_disturbance,
 )
-from heli_jax.identification.uncertainty.standard_errors import StandardErrors, standard_errors
 from heli_jax.identification.unknowns.layout import Solution, scales_of
 from heli_jax.identification.validation.adequacy import (
     EXPECTED,
     Adequacy,
     assess,
     is_unstable,
+    unstable_poles,
 )
-from heli_jax.identification.validation.closed_loop_trust import (
-    held_poles,
-    moved_by_feedback,
-)
+from heli_jax.identification.validation.closed_loop_trust import moved_by_feedback
 from heli_jax.identification.validation.excitation import (
     LEVEL,
     Followed,
@@ -62,7 +55,15 @@ from heli_jax.identification.validation.logging_rate import (
     aliased_parameters,
     measurement_noise,
 )
-from heli_jax.identification.validation.metrics import Metrics, Whiteness, metrics
+from heli_jax.identification.validation.metrics import (
+    Metrics,
+    Whiteness,
+    metrics,
+    outputs_correlated,
+    pooled_metrics,
+    signals_of,
+    whiteness_of,
+)
 from heli_jax.identification.validation.unmodelled import Unmodelled, unmodelled
 from heli_jax.messages import sentence
 
@@ -149,7 +150,7 @@ class Context:
     @cached_property
     def independent(self) -> bool:
         """True if the residuals, or innovations, are white and not correlated between outputs."""
-        return self.white and not correlated_residuals(self.signals)
+        return self.white and not outputs_correlated(self.signals)
 
     # Feedback to the inputs.
 
@@ -166,21 +167,24 @@ class Context:
         return any(one.present for one in self.feedback)
 
     @cached_property
-    def _held_poles(self) -> list[float]:
-        return held_poles(self.at)
+    def _poles(self) -> list[float]:
+        """Poles in a fit of lines that only a loop can keep from growing, see `unstable_poles`."""
+        objective, none = self.at.layout.objective, [0.0] * len(self.flights)
+        lines = objective.noise_model == "spectrum" and not objective.fits_responses
+        return unstable_poles(self.problem, self.params) if lines else none
 
     @property
     def held(self) -> bool:
-        """True for a fit in frequency if the model is unstable and a record does not grow."""
-        return bool(self.moved) and any(pole > 0.0 for pole in self._held_poles)
+        """True for a fit in frequency of an unstable model, which only a loop can hold."""
+        return bool(self.moved) and any(self._poles)
 
     @cached_property
     def moved(self) -> dict[str, float]:
         """Share of information that may be feedback, by unknown of interest, in frequency."""
         if not self.at_optimum or self.unrelated:
             return {}
-        poles = self._held_poles
-        return moved_by_feedback(self.at, [0.0] * len(poles) if self.instruments else poles)
+        poles = [0.0] * len(self._poles) if self.instruments else self._poles
+        return moved_by_feedback(self.at, poles)
 
     @cached_property
     def instruments(self) -> tuple[str, ...]:
@@ -370,10 +374,7 @@ class Context:
         flights = tuple(f for f in problem.flights if f.hold_out)
         if not flights or not self.fitted:
             return HeldOut()
-        checked = validate(problem, at.layout, at.z, at.noise, flights)
-        signals = signals_of(flights, checked.e.simulated, checked.e.innovations)
-        in_one_piece, in_frequency = checked.free_run, None
-        free_run = signals_of(flights, in_one_piece) if in_one_piece is not None else ()
+        (signals, free_run), in_frequency = validate(problem, at, flights), None
         if self.at_optimum:
             feedback = (self.held or self.follows) and not self.instruments
             in_frequency = validate_in_frequency(problem, at, self.e, flights, feedback=feedback)

@@ -78,18 +78,16 @@ def moved_by_feedback(c: Context) -> Iterator[Finding]:
     direct = [one for one in c.feedback if one.input not in by]
     # Feedback to an input with an instrument may go to the other inputs as well.
     inputs = list(dict.fromkeys(one.input for one in [f for f in direct if f.present] or direct))
-    if not (c.moved and closed) or (by and not inputs):
-        return
     limit = BESIDE if by else MAY_BE
-    doubted = tuple(n for n, part in c.moved.items() if part > limit)
-    parts = {n: c.moved[n] for n in doubted or c.moved}
+    parts = {n: part for n, part in c.moved.items() if part > limit}
+    if not (parts and closed) or (by and not inputs):
+        return
     yield found(
-        "loop.no-instrument" if doubted else "loop.no-instrument-harmless",
-        "doubt" if doubted else "note",
+        "loop.no-instrument",
+        "doubt",
         *inputs,
         value=max(parts.values()),
-        distrusts=doubted,
-        of=" and ".join(inputs) if by else "",
+        distrusts=parts,
         inputs=inputs if by else ["the inputs"],
         held="" if c.follows else "the vehicle is held",
         names=list(parts),

@@ -76,22 +76,18 @@ _LARGEST, _LINEAR = {"rad": np.pi, "rad/s": 20.0}, {"rad": np.pi / 2, "rad/s": 8
 
 
 class AngleOverRate(NamedTuple):
-    """Change of an angle over that of its integrated rate.
-
-    With noise on both, the two regressions of one on the other enclose the factor (Frisch, 1934):
-    it lies between `factor * |correlation|` and `factor / |correlation|`.
-    """
+    """Change of an angle over that of its integrated rate."""
 
     factor: float
     """Ratio of the changes; negative if they have opposite signs."""
-    correlation: float
     scale: tuple[float, float]
-    """95 % interval of the rate over the angle's rate of change, with noise on both."""
+    """95 % interval of the size of the rate over that of the angle's rate of change.
 
-    def off(self, by: float) -> bool:
-        """True if the factor is wrong by `by` or more for any noise."""
-        size, alike = abs(self.factor), abs(self.correlation)
-        return size * alike > by or size / alike < 1.0 / by
+    With noise on both, it encloses the two regressions of one on the other (Frisch, 1934)."""
+
+    def beyond(self, most: float) -> bool:
+        """True if the whole interval lies beyond a ratio, or beyond its inverse."""
+        return self.scale[0] > most or self.scale[1] < 1.0 / most
 
 
 def angle_over_rate(
@@ -117,7 +113,7 @@ def angle_over_rate(
         return None
     size, wide = sds[1] / sds[0], float(np.exp(LIMITS.quantile * _log_sd(*both)))
     scale = (size * abs(alike) / wide, size / abs(alike) * wide)
-    return AngleOverRate(float(np.copysign(1.0 / size, alike)), alike, scale)
+    return AngleOverRate(float(np.copysign(1.0 / size, alike)), scale)
 
 
 def _log_sd(first: np.ndarray, second: np.ndarray) -> float:
@@ -147,12 +143,10 @@ def rate_against_angle(c: Context) -> Iterator[Finding]:
             ratio = angle_over_rate(flight.outputs[angle], flight.outputs[rate], flight.dt)
             if ratio is None:
                 continue
-            backward, off = ratio.factor < 0, ratio.off(LIMITS.factor)
-            size = abs(ratio.factor)
-            low, high = ratio.scale
+            backward, size = ratio.factor < 0, abs(ratio.factor)
             most = LIMITS.scale_of_roll if angle in _ROLL else LIMITS.scale
             numbers: dict[str, Any] = {"flight": label, "rate": rate, "angle": angle}
-            if backward or off:
+            if backward or ratio.beyond(LIMITS.factor):
                 far = max(size, 1.0 / size) / _DEGREE
                 # No model follows an angle that runs against its rate, or is in other units.
                 yield found(
@@ -165,7 +159,7 @@ def rate_against_angle(c: Context) -> Iterator[Finding]:
                     limit=LIMITS.factor,
                     **numbers,
                 )
-            elif low > most or high < 1.0 / most:
+            elif ratio.beyond(most):
                 # A scale, a unit or the clock is wrong, and every parameter depends on one of them.
                 yield found(
                     "units.rate-scale",
@@ -174,8 +168,8 @@ def rate_against_angle(c: Context) -> Iterator[Finding]:
                     angle,
                     value=1.0 / size,
                     distrusts=_estimates(c),
-                    low=low,
-                    high=high,
+                    low=ratio.scale[0],
+                    high=ratio.scale[1],
                     limit=most,
                     **numbers,
                 )

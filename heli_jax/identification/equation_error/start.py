@@ -266,8 +266,15 @@ def _residual(
     if not hidden:
         residual = np.concatenate(residual, axis=1)
         return residual, np.zeros((*residual.shape, 0))
+    from scipy.signal import cont2discrete
+
     # h' = A h + f starts from zero; the free motions are separate.
-    phi, first, second = _first_order_hold(matrix[np.ix_(hidden, hidden)], record.step)
+    # With f linear between samples: h(k+1) = phi h(k) + first f(k) + second f(k+1).
+    one = np.eye(len(hidden))
+    system = (matrix[np.ix_(hidden, hidden)], one, one, 0.0 * one)
+    discrete: Any = cont2discrete(system, record.step, "foh")  # SciPy's type is a union
+    phi, B, _, second, _ = discrete
+    first = B - phi @ second
     free = []
     for r, segment in zip(residual, record.segments, strict=True):
         f = matrix[np.ix_(hidden, record.columns)] @ segment.known
@@ -278,21 +285,6 @@ def _residual(
         free.append(np.moveaxis(through @ _recurrence(phi, impulse), 0, 1))
     by_equation = [scipy.linalg.block_diag(*(f[i] for f in free)) for i in range(len(rows))]
     return np.concatenate(residual, axis=1), np.array(by_equation)
-
-
-def _first_order_hold(A: Float[np.ndarray, "h h"], step: float) -> tuple[np.ndarray, ...]:
-    """Return phi, first and second of x(k+1) = phi x(k) + first f(k) + second f(k+1).
-
-    This solves x' = A x + f with f linear between samples, by one matrix exponential (Van Loan,
-    1978).
-    """
-    h = A.shape[0]
-    block = np.zeros((3 * h, 3 * h))
-    block[:h, :h], block[:h, h : 2 * h] = A * step, np.eye(h) * step
-    block[h : 2 * h, 2 * h :] = np.eye(h)
-    whole = scipy.linalg.expm(block)
-    second = whole[:h, 2 * h :]
-    return whole[:h, :h], whole[:h, h : 2 * h] - second, second
 
 
 def _recurrence(

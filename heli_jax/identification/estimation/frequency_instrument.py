@@ -96,7 +96,7 @@ def as_instruments_have_it(data: Data) -> Data:
     direct = tuple(f._replace(by_instrument=None) for f in data.flights)
     if not moving or any(list(f.outputs) != names for f in data.flights):
         return data._replace(flights=direct)
-    outputs = [np.stack([_filled(f.outputs[n]) for n in names], axis=1) for f in data.flights]
+    outputs = [np.stack([filled(f.outputs[n]) for n in names], axis=1) for f in data.flights]
     made = following(
         outputs, [np.stack([np.asarray(u[n]) for n in moving], axis=1) for u in inputs]
     )
@@ -108,7 +108,7 @@ def as_instruments_have_it(data: Data) -> Data:
     return data._replace(flights=tuple(flights))
 
 
-def _filled(y: Any) -> Float[np.ndarray, " N"]:
+def filled(y: Any) -> Float[np.ndarray, " N"]:
     """Return a signal with missing samples interpolated linearly."""
     y = np.asarray(y)
     at, seen = np.arange(y.size), np.isfinite(y)

@@ -48,12 +48,13 @@ _GOOD = 10.0
 """Cost below which a run counts as a fit, whatever the size of the outputs."""
 
 
-class Search:
+class Search(NamedTuple):
     """The optimiser for a problem."""
 
-    def __init__(self, problem: Problem, layout: Layout, data: Data, max_steps: int) -> None:
-        self.problem, self.layout, self.data = problem, layout, data
-        self.max_steps = max_steps
+    problem: Problem
+    layout: Layout
+    data: Data
+    max_steps: int
 
     def run(
         self,

@@ -10,6 +10,7 @@ from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 from scipy.sparse.csgraph import connected_components
 
 from heli_jax.flights.flight import labels
@@ -86,23 +87,32 @@ def _parameter(problem: Problem, name: str, value: float) -> Unknown:
     return Unknown(name, value, log, scale, prior, True, reference, symmetric, at_bound=at_bound)
 
 
-def relative_rows(
-    problem: Problem, layout: Layout, e: Evaluation
-) -> tuple[tuple[Unknown, ...], np.ndarray, np.ndarray]:
-    """Return the parameters of interest, and the rows (n, q) and (n, k) of the data by them, in
-    relative coordinates, and by all other unknowns."""
-    unknowns = unknowns_of(problem, layout, e)
-    J = np.asarray(e.J, dtype=np.float64)
-    q, p = len(layout.of_interest), len(layout.free)
+class Sensitivity(NamedTuple):
+    """Rows of the data at one point, columns in relative coordinates."""
+
+    unknowns: tuple[Unknown, ...]
+    """the parameters of interest"""
+    shared: Float[np.ndarray, "n s"]
+    """by the parameters of interest, then by the noise's parameters of filter error"""
+    own: Float[np.ndarray, "n k"]
+    """by initial states, biases and input offsets, in sds of their weak priors"""
+
+    def part(self, rows: np.ndarray) -> "Sensitivity":
+        """Return some of the rows."""
+        return self._replace(shared=self.shared[rows], own=self.own[rows])
+
+
+def sensitivity_at(problem: Problem, layout: Layout, e: Evaluation) -> Sensitivity:
+    """Return the rows of the data of an evaluation."""
+    unknowns, q = unknowns_of(problem, layout, e), len(layout.of_interest)
+    J, first = np.array(e.J, dtype=np.float64), layout.first_nuisance
+    slopes = np.asarray(e.slopes, dtype=np.float64)
+    relative = np.array([u.reference * u.sign for u in unknowns])
+    J[:, :q] *= np.divide(relative, slopes, out=np.zeros_like(slopes), where=slopes != 0)
     # The last rows are the nuisances' weak priors, before them the parameters' priors; defects
     # between windows count as data.
-    data = J[: J.shape[0] - (layout.size - layout.first_nuisance) - p]
-    slopes = np.asarray(e.slopes, dtype=np.float64)
-    factor = np.divide(
-        [u.reference for u in unknowns], slopes, out=np.zeros_like(slopes), where=slopes != 0
-    )
-    sensitivity = data[:, :q] * np.abs(factor) * np.sign(slopes) * [u.sign for u in unknowns]
-    return unknowns, sensitivity, data[:, q:]
+    data = J[: J.shape[0] - (layout.size - first) - len(layout.free)]
+    return Sensitivity(unknowns, data[:, :first], data[:, first:])
 
 
 def projected(J: np.ndarray, nuisances: np.ndarray) -> np.ndarray:
@@ -241,24 +251,21 @@ def verdict_of(
             "the simulation is not finite at the given values: the model is unstable over this "
             "record; use other start values or a shorter window"
         )
-    unknowns, sensitivity, others = relative_rows(problem, layout, e)
-    weak = np.asarray(e.J, np.float64)[e.J.shape[0] - (layout.size - layout.first_nuisance) :]
+    unknowns, shared, own = sensitivity_at(problem, layout, e)
     unknowns = tuple(u._replace(aliased=u.name in around.aliased) for u in unknowns)
-    q = len(unknowns)
-    R = np.linalg.qr(np.hstack([sensitivity, others]), mode="r")
+    q, k = len(unknowns), own.shape[1]
+    R = np.linalg.qr(np.hstack([shared, own]), mode="r")
     fixed, N = R[:, :q], R[:, q:]
     seen = np.linalg.norm(N, axis=0) > NO_EFFECT
     compensation = np.zeros((N.shape[1], q))
     compensation[seen] = -np.linalg.lstsq(N[:, seen], fixed, rcond=NULL)[0]
     named = flight_unknowns(layout, labels(problem.training))
-    # The parameters of the disturbance and the noise's factors stand before the named nuisances.
     free = projected(fixed, N[:, seen])
-    held = np.vstack([N, weak[:, q:]])
-    bounded = projected(
-        np.vstack([fixed, np.zeros((len(weak), q))]),
-        held[:, np.linalg.norm(held, axis=0) > NO_EFFECT],
-    )
-    nuisances = Nuisances(free, bounded, fixed, compensation[N.shape[1] - len(named) :], named)
+    # The columns of the noise's parameters come before those of the nuisances.
+    seen[N.shape[1] - k :] = True
+    weak = np.eye(N.shape[1])[N.shape[1] - k :]
+    bounded = projected(np.vstack([fixed, np.zeros((k, q))]), np.vstack([N, weak])[:, seen])
+    nuisances = Nuisances(free, bounded, fixed, compensation[N.shape[1] - k :], named)
     to_relative = np.asarray(e.slopes, np.float64) * [u.sign / u.reference for u in unknowns]
     if around.reported is not None:
         around = around._replace(reported=around.reported * np.outer(to_relative, to_relative))

@@ -9,14 +9,15 @@ and the sum of squares shows whether the point fits as well. The values come fro
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
 from heli_jax.analysis.linear import linearize
-from heli_jax.analysis.operating_point import operating_point
+from heli_jax.analysis.operating_point import OperatingPoint, operating_point
+from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate, named
 from heli_jax.identification.estimation.levenberg_marquardt import measured_count, optimise
 from heli_jax.identification.identifiability.verdict import (
@@ -349,39 +350,74 @@ def _alike(a: float, b: float) -> bool:
     return abs(a - b) <= _CHANGED * max(abs(a), abs(b))
 
 
+class Modes(NamedTuple):
+    """Linearised model in its eigenvectors."""
+
+    at: OperatingPoint
+    eigenvalues: np.ndarray
+    """(n,) [1/s]"""
+    right: np.ndarray
+    """right eigenvectors (n, n), one per column"""
+    left: np.ndarray
+    """left eigenvectors (n, n), one per row"""
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+
+
+# Params is Any: a record of the model's own class.
+def modes_of(problem: Problem, params: Any, flight: Flight) -> Modes | None:
+    """Return the model's modes at a flight's operating point; None if a matrix is not finite."""
+    at = operating_point(
+        problem.model, params, flight.inputs, flight.outputs, flight.dt, substeps=problem.substeps
+    )
+    matrices = linearize(problem.model, params, at.state, at.inputs).matrices
+    A, B, C, _ = (np.asarray(M, np.float64) for M in matrices)
+    if not all(np.isfinite(M).all() for M in (A, B, C)):
+        return None
+    eigenvalues, right = np.linalg.eig(A)
+    # The eigenvectors of a defective matrix have no inverse: the pseudoinverse spreads residues.
+    return Modes(at, eigenvalues, right, np.linalg.pinv(right), A, B, C)
+
+
+def relative_slopes(
+    problem: Problem, values: Mapping[str, float], names: Sequence[str], modes: Modes
+) -> dict[str, np.ndarray]:
+    """Return by parameter the relative changes (n,), complex, of the eigenvalues over its own.
+
+    First-order perturbation of simple eigenvalues.
+    """
+    slopes = {}
+    for name in names:
+        there = problem.params_with({**values, name: values[name] * (1.0 + _DIFFERENCE)})
+        A = linearize(problem.model, there, modes.at.state, modes.at.inputs).matrices.A
+        slope = (np.asarray(A, np.float64) - modes.A) / _DIFFERENCE
+        changes = np.einsum("ki,ij,jk->k", modes.left, slope, modes.right)
+        slopes[name] = changes / np.maximum(np.abs(modes.eigenvalues), 1e-300)
+    return slopes
+
+
 @np.errstate(all="ignore")
 def _exchanged_modes(problem: Problem, values: Mapping[str, float]) -> list[dict[str, float]]:
     """Return for each pair of real modes of the linearised model the changed parameters that
     exchange the two, to first order in logarithms."""
-    model, flight = problem.model, problem.training[0]
-    names = [n for n, v in values.items() if v and n not in model.delay_parameters]
-    params = problem.params_with(flight.known | dict(values))
-    about = operating_point(
-        model, params, flight.inputs, flight.outputs, flight.dt, substeps=problem.substeps
-    )
-
-    def poles(**moved: float) -> np.ndarray:
-        params = problem.params_with(flight.known | dict(values) | moved)
-        A = np.asarray(linearize(model, params, about.state, about.inputs).matrices[0], np.float64)
-        return np.linalg.eigvals(A) if np.isfinite(A).all() else np.full(len(A), np.nan + 0j)
-
-    here = poles()
+    flight, found = problem.training[0], list[dict[str, float]]()
+    names = [n for n, v in values.items() if v and n not in problem.model.delay_parameters]
+    known = flight.known | dict(values)
+    modes = modes_of(problem, problem.params_with(known), flight)
+    here = np.zeros(0) if modes is None else modes.eigenvalues
     largest = np.max(np.abs(here), initial=0.0)
     real = np.flatnonzero((abs(np.imag(here)) < 1e-6 * largest) & (abs(here) > 1e-6 * largest))
-    found = []
-    if real.size < 2:
+    if modes is None or real.size < 2 or not names:
         return found
-    # Poles after the small step are matched by distance.
-    slopes = []
-    for n in names:
-        there = poles(**{n: values[n] * (1.0 + _DIFFERENCE)})
-        near = there[np.argmin(np.abs(here[:, None] - there[None, :]), axis=1)]
-        slopes.append(np.nan_to_num(np.real(near / here - 1.0) / _DIFFERENCE))
+    # A shift of a decaying mode is relative to its size: the sign is that of the eigenvalue.
+    relative = relative_slopes(problem, known, names, modes)
+    slopes = np.array([np.real(relative[n]) * np.sign(np.real(here)) for n in names])
     for i, j in itertools.combinations(real, 2):
         ratio = float((here[j] / here[i]).real)
         if not (ratio > 0 and abs(math.log(ratio)) > math.log(_RATIO)):
             continue
-        target, E = math.log(ratio) * np.array([1.0, -1.0]), np.array(slopes).T[[i, j]]
+        target, E = math.log(ratio) * np.array([1.0, -1.0]), slopes.T[[i, j]]
         # The smallest change of the parameters.
         z = np.linalg.pinv(E, rcond=_MAKES) @ target
         z[np.abs(z) < _MAKES] = 0.0

@@ -50,19 +50,25 @@ class OutputAdequacy(NamedTuple):
     """Filter error: power of the simulation's error over that of disturbance and noise."""
 
 
-def is_unstable(problem: Problem, params: Any, growth: float = _GROWTH) -> bool:
-    """True if a mode of the linearised model grows by exp(growth) over the longest window.
+def unstable_poles(problem: Problem, params: Any, growth: float = _GROWTH) -> list[float]:
+    """Return by fitted flight |p| [rad/s] of the fastest unstable mode of the linearised model; 0
+    if no mode grows by exp(growth) over the flight, or over a window.
 
     `params` is a record of the model's Params [SI].
     """
-    # An eigenvalue just right of the axis is a slow drift, which the record does not show.
-    longest = max(f.duration for f in problem.training)
-    longest = longest if problem.window is None else min(longest, problem.window)
+    poles = []
     for flight in problem.training:
         linearised = modes_of_flight(problem.model, params, flight, problem.substeps)
-        if linearised is not None and np.max(np.real(linearised[0])) * longest > growth:
-            return True
-    return False
+        modes = np.zeros(1) if linearised is None else linearised[0]
+        # An eigenvalue just right of the axis is a slow drift, which the record does not show.
+        length = min(flight.duration, problem.window or np.inf)
+        poles.append(float(np.max(np.abs(modes[np.real(modes) * length > growth]), initial=0.0)))
+    return poles
+
+
+def is_unstable(problem: Problem, params: Any, growth: float = _GROWTH) -> bool:
+    """True if a mode grows in a flight; arguments as in `unstable_poles`."""
+    return any(unstable_poles(problem, params, growth))
 
 
 EXPLAINED = 0.8

@@ -12,7 +12,7 @@ but bounds it in two ways:
 
 A parameter's share is the mean over frequency, weighted by the information on the parameter. It
 does not prove a loop. Parameters are reported only if inputs follow the response, or if the model
-is unstable and the record does not grow. Inputs taken by instrument add nothing.
+is unstable. Inputs taken by instrument add nothing.
 
 Sources: L. Ljung, System Identification (1999), 13.4, for the direct estimate's bias; Astrom and
 Murray, Feedback Systems (2008), 11.4, for the bandwidth that an unstable pole requires.
@@ -37,7 +37,6 @@ from heli_jax.identification.estimation.frequency_instrument import (
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines, lines_of, records_of
 from heli_jax.identification.estimation.frequency_noise import (
     LEAST,
-    first_model,
     once_a_length,
     smoothed,
 )
@@ -52,8 +51,6 @@ BESIDE = 0.05
 """The same if other inputs are taken by instrument.
 
 The effect of an input has at least this bias, in a fit that feedback should not affect."""
-_GROWS = 3.0
-"""Growth of the model's fastest mode over a record that only a loop prevents [e-foldings]."""
 _REACHES = 2.0
 """Least bandwidth of the stabilising loop over the unstable pole.
 
@@ -70,7 +67,7 @@ def moved_by_feedback(at: Solution, poles: Sequence[float]) -> dict[str, float]:
     Empty in the time domain, and if every moving input is taken by instrument.
 
     Args:
-        poles: the result of `held_poles`; zero for an estimate by instrument.
+        poles: the result of `unstable_poles`; zero for an estimate by instrument.
     """
     layout = at.layout
     if layout.noise_model != "spectrum":
@@ -136,29 +133,6 @@ def shares(
     of_part = np.diagonal(covariance @ (part / np.outer(sd, sd)) @ covariance)
     with np.errstate(all="ignore"):
         return np.clip(np.nan_to_num(of_part / np.diagonal(covariance)), 0.0, 1.0)
-
-
-def held_poles(at: Solution) -> list[float]:
-    """Return by flight |p| [rad/s] of the fastest unstable mode that a loop stabilises; else 0.
-
-    The record would show the mode's growth and does not.
-    """
-    layout, data, *_, z = at
-    if layout.noise_model != "spectrum" or layout.objective.fits_responses:
-        return [0.0]
-    with np.errstate(divide="ignore"):  # modes at zero
-        modes = np.log(np.linalg.eigvals(first_model(layout, data, z).Ad).astype(complex))
-    held = []
-    for names, flight in zip(layout.outputs, data.flights, strict=True):
-        y = [np.asarray(flight.outputs[n]) for n in names]
-        half = len(y[0]) // 2
-        grown = max(float(np.nanstd(v[half:]) / max(np.nanstd(v[:half]), 1e-300)) for v in y)
-        # Without a loop the second half would exceed the first by half of the e-foldings.
-        growing = modes[2 * half * np.real(modes) > _GROWS]
-        alone = np.max(np.real(growing), initial=0.0)
-        stays = alone > 0.0 and np.log(grown) < 0.5 * half * alone
-        held.append(float(np.max(np.abs(growing))) / float(flight.dt) if stays else 0.0)
-    return held
 
 
 def _room(

@@ -22,7 +22,7 @@ import scipy.special
 from jaxtyping import Complex, Float
 
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.frequency_instrument import instruments_of
+from heli_jax.identification.estimation.frequency_instrument import filled, instruments_of
 from heli_jax.identification.estimation.frequency_lines import (
     lines_of,
     records_of,
@@ -31,7 +31,7 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Solution
 
 LEVEL = 0.01
-"""Significance level of the test of all outputs together."""
+"""Significance level of all tests of one question together: outputs, inputs, lags and flights."""
 _FIRST, _GROWTH = 12, 1.15
 """Lines of the lowest band, and ratio of the widths of one band and the next."""
 _SEEN = 0.8
@@ -59,12 +59,8 @@ def excitation_of(problem: Problem) -> dict[str, float]:
     sums: dict[str, np.ndarray] = {}
     for flight in problem.training:
         X = _drives(flight, by)
-        seen = {n: np.flatnonzero(np.isfinite(y)) for n, y in flight.outputs.items()}
-        measured = {
-            n: np.interp(np.arange(y.size), seen[n], y[seen[n]])
-            for n, y in flight.outputs.items()
-            if seen[n].size >= _SEEN * y.size
-        }
+        seen = {n: y for n, y in flight.outputs.items() if np.mean(np.isfinite(y)) >= _SEEN}
+        measured = {n: filled(y) for n, y in seen.items()}
         measured = {n: y for n, y in measured.items() if np.ptp(y) > 0}
         if X is None or not measured:
             continue

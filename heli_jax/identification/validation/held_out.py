@@ -31,28 +31,18 @@ from heli_jax.identification.unknowns.layout import (
     layout_of,
 )
 from heli_jax.identification.validation.excitation import LEVEL, errors_against_excitation
-
-
-class Validation(NamedTuple):
-    """Held-out flights, at the optimum of their initial states and biases."""
-
-    e: Evaluation
-    free_run: tuple[dict[str, np.ndarray], ...] | None
-    """By flight and output the simulation (N,) in one piece, from the first window's initial state.
-
-    None without windows."""
+from heli_jax.identification.validation.metrics import Signals, signals_of
 
 
 def validate(
-    problem: Problem, layout: Layout, z: Array, noise: Noise, held: tuple[Flight, ...]
-) -> Validation:
-    """Predict held-out flights with the estimates.
+    problem: Problem, at: Solution, held: tuple[Flight, ...]
+) -> tuple[tuple[Signals, ...], tuple[Signals, ...]]:
+    """Return the signals of held-out flights predicted with the estimates of a solution.
 
-    Only their initial states (of every window) and biases are fitted.
-
-    Args:
-        z: (q,) the optimum of the fitted flights in `layout`.
+    Only their initial states (of every window) and biases are fitted. The second result is the
+    simulation in one piece from the first window's initial state; it is empty without windows.
     """
+    layout, _, noise, z = at
     # Shared unknowns come first in z, in the same order for any flights.
     other = layout_of(problem, held)
     # A spectrum contains no initial states and biases: fit them in time.
@@ -72,11 +62,11 @@ def validate(
         full = in_time(other, data, their_noise, full)
     e = evaluate(other, data, their_noise, full)
     # Windows give many short simulations; only a simulation in one piece shows drift.
-    free_run = None
+    free_run: tuple[Signals, ...] = ()
     if any(count > 1 for count, _ in other.windows):
         one_piece, whole = _in_one_piece(other, full)
-        free_run = simulated_outputs(one_piece, data, whole)
-    return Validation(e, free_run)
+        free_run = signals_of(held, simulated_outputs(one_piece, data, whole))
+    return signals_of(held, e.simulated, e.innovations), free_run
 
 
 def _noise_of(problem: Problem, layout: Layout, noise: Noise, held: tuple[Flight, ...]) -> Noise:
@@ -180,7 +170,7 @@ def validate_in_frequency(
         part, one = _comparable(problem, at, flight, feedback=feedback), None
         if part is not None:
             with np.errstate(all="ignore"):
-                one = _judged(problem, at, e, label, part)
+                one = _tested(problem, at, e, label, part)
         if one is None:
             others.append(label)
         else:
@@ -206,7 +196,7 @@ def _comparable(problem: Problem, at: Solution, flight: Flight, *, feedback: boo
     return part if part is not None and parts_of(part) else None
 
 
-def _judged(
+def _tested(
     problem: Problem, at: Solution, fitted: Evaluation, label: str, flight: Flight
 ) -> HeldOutFlight | None:
     """Test one flight; None if its errors have no spectrum."""

@@ -15,10 +15,9 @@ import numpy as np
 from jaxtyping import Float
 
 from heli_jax import naming
-from heli_jax.analysis.linear import linearize
-from heli_jax.analysis.operating_point import OperatingPoint, operating_point
 from heli_jax.dynamics.onboard.filters import states_behind
 from heli_jax.flights.flight import Flight
+from heli_jax.identification.identifiability.equivalents import Modes, modes_of, relative_slopes
 from heli_jax.identification.problem import Problem
 from heli_jax.numerics.white_noise import white_part
 
@@ -52,60 +51,32 @@ class _Limits:
 RATE = _Limits()
 
 
-class Modes(NamedTuple):
-    """Linearised model in its eigenvectors."""
+# The step response of an integrator is infinite.
+@np.errstate(divide="ignore", invalid="ignore")
+def _strongest(
+    modes: Modes, k: int, problem: Problem, flight: Flight, noise: Mapping[str, Any]
+) -> tuple[float, str, str]:
+    """Return the largest part of mode k in an output's step response, with input and output.
 
-    at: OperatingPoint
-    eigenvalues: np.ndarray
-    """Eigenvalues (n,) [1/s]."""
-    right: np.ndarray
-    """Right eigenvectors (n, n), one per column."""
-    left: np.ndarray
-    """Left eigenvectors (n, n), one per row."""
-    A: np.ndarray
-    B: np.ndarray
-    C: np.ndarray
-
-    # The step response of an integrator is infinite.
-    @np.errstate(divide="ignore", invalid="ignore")
-    def strongest(
-        self, k: int, problem: Problem, flight: Flight, noise: Mapping[str, Any]
-    ) -> tuple[float, str, str]:
-        """Return the largest part of mode k in an output's step response, with input and output.
-
-        The step has the input's size; the part is relative to the output's noise (sd, SI). If no
-        input moves, the part is that of the free motion, relative to the most visible mode.
-        """
-        outputs = naming.names(problem.model.Outputs)
-        best = (0.0, "", "")
-        if not any(np.ptp(u) > 0 for u in flight.inputs.values()):
-            for y in flight.outputs:
-                shown = np.abs(self.C[outputs.index(y)] @ self.right)
-                shown *= np.linalg.norm(self.left, axis=1)
-                part = shown[k] / max(float(shown.max()), 1e-300)
-                best = max(best, (part * np.nanstd(flight.outputs[y]) / float(noise[y]), "", y))
-            return best
-        for j, u in enumerate(naming.names(problem.model.Inputs)):
-            size = float(np.std(flight.inputs[u])) / abs(self.eigenvalues[k])
-            for y in flight.outputs:
-                residue = abs(self.C[outputs.index(y)] @ self.right[:, k])
-                residue *= abs(self.left[k] @ self.B[:, j])
-                best = max(best, (residue * size / float(noise[y]), u, y))
+    The step has the input's size; the part is relative to the output's noise (sd, SI). If no input
+    moves, the part is that of the free motion, relative to the most visible mode.
+    """
+    outputs = naming.names(problem.model.Outputs)
+    best = (0.0, "", "")
+    if not any(np.ptp(u) > 0 for u in flight.inputs.values()):
+        for y in flight.outputs:
+            shown = np.abs(modes.C[outputs.index(y)] @ modes.right)
+            shown *= np.linalg.norm(modes.left, axis=1)
+            part = shown[k] / max(float(shown.max()), 1e-300)
+            best = max(best, (part * np.nanstd(flight.outputs[y]) / float(noise[y]), "", y))
         return best
-
-
-def _modes_of(problem: Problem, params: Any, flight: Flight) -> Modes | None:
-    """Return the model's modes at a flight's operating point; None if a matrix is not finite."""
-    at = operating_point(
-        problem.model, params, flight.inputs, flight.outputs, flight.dt, substeps=problem.substeps
-    )
-    matrices = linearize(problem.model, params, at.state, at.inputs).matrices
-    A, B, C, _ = (np.asarray(M, np.float64) for M in matrices)
-    if not all(np.isfinite(M).all() for M in (A, B, C)):
-        return None
-    eigenvalues, right = np.linalg.eig(A)
-    # The eigenvectors of a defective matrix have no inverse: the pseudoinverse spreads residues.
-    return Modes(at, eigenvalues, right, np.linalg.pinv(right), A, B, C)
+    for j, u in enumerate(naming.names(problem.model.Inputs)):
+        size = float(np.std(flight.inputs[u])) / abs(modes.eigenvalues[k])
+        for y in flight.outputs:
+            residue = abs(modes.C[outputs.index(y)] @ modes.right[:, k])
+            residue *= abs(modes.left[k] @ modes.B[:, j])
+            best = max(best, (residue * size / float(noise[y]), u, y))
+    return best
 
 
 # Rates against the visible modes.
@@ -171,7 +142,7 @@ def _modes_that_show(
         if name not in flight.sd and own > 0:
             sizes[name] = min(sizes[name], own)
     known = {n: jnp.asarray(v) for n, v in flight.known.items()}
-    modes = _modes_of(problem, naming.replace(params, **known), flight)
+    modes = modes_of(problem, naming.replace(params, **known), flight)
     behind = states_behind(problem.model)
     vehicle = [n not in behind for n in naming.names(problem.model.State)]
     for k, eigenvalue in enumerate(modes.eigenvalues if modes is not None else ()):
@@ -182,7 +153,7 @@ def _modes_that_show(
         right = modes.right[:, k]
         if np.linalg.norm(right[vehicle]) < 1e-6 * np.linalg.norm(right):
             continue
-        part, u, y = modes.strongest(k, problem, flight, sizes)
+        part, u, y = _strongest(modes, k, problem, flight, sizes)
         if part >= 1.0:
             yield _Mode(abs(eigenvalue) / (2.0 * np.pi), abs(eigenvalue.imag) > 0, u, y)
 
@@ -256,8 +227,6 @@ _TURNED = 0.2
 The ratio is 0.5 if the frequency goes with the parameter's square root."""
 _SWINGS = 10.0
 """Frequency over decay, above which a mode oscillates even if it decays within a sample."""
-_STEP = 1e-4
-"""Relative step of the parameters for these changes."""
 
 
 def measurement_noise(
@@ -283,7 +252,7 @@ def aliased_parameters(
     aliased = set[str]()
     for flight, sd in zip(problem.training, noise, strict=True):
         here = {**{n: v for n, v in values.items() if n in problem.free}, **flight.known}
-        modes = _modes_of(problem, problem.params_with(here), flight)
+        modes = modes_of(problem, problem.params_with(here), flight)
         if modes is None:
             continue
         # Only the imaginary part counts: a fast decay without oscillation has no alias.
@@ -294,7 +263,7 @@ def aliased_parameters(
         lost = [
             k
             for k in np.flatnonzero(past).tolist()
-            if modes.strongest(k, problem, flight, sd)[0] >= RATE.shows
+            if _strongest(modes, k, problem, flight, sd)[0] >= RATE.shows
         ]
         if not lost:
             continue
@@ -306,24 +275,6 @@ def aliased_parameters(
             and problem.free[n].prior is None
             and n not in problem.model.delay_parameters
         ]
-        slopes = _relative_slopes(problem, here, names, modes)
+        slopes = relative_slopes(problem, here, names, modes)
         aliased |= {n for n, s in slopes.items() if np.any(np.abs(np.imag(s[lost])) > _TURNED)}
     return frozenset(aliased)
-
-
-def _relative_slopes(
-    problem: Problem, here: Mapping[str, float], names: Sequence[str], modes: Modes
-) -> dict[str, np.ndarray]:
-    """Return by parameter the relative sensitivities (n,), complex, of the eigenvalues to it.
-
-    First-order perturbation of simple eigenvalues.
-    """
-    slopes = {}
-    for name in names:
-        value = here[name]
-        there = problem.params_with({**here, name: value + _STEP * (abs(value) or 1.0)})
-        A = linearize(problem.model, there, modes.at.state, modes.at.inputs).matrices.A
-        slope = (np.asarray(A, np.float64) - modes.A) / _STEP
-        changes = np.einsum("ki,ij,jk->k", modes.left, slope, modes.right)
-        slopes[name] = changes / np.maximum(np.abs(modes.eigenvalues), 1e-300)
-    return slopes

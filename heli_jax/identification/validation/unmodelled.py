@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.kinematics import is_kinematic
@@ -31,6 +30,7 @@ from heli_jax.identification.estimation.evaluation import (
 from heli_jax.identification.estimation.output_error import OBJECTIVE as OUTPUT_ERROR
 from heli_jax.identification.estimation.simulated_flights import signals
 from heli_jax.identification.unknowns.layout import Solution, flight_places
+from heli_jax.identification.validation.excitation import LEVEL
 from heli_jax.identification.validation.score_test import (
     BROAD,
     NARROW,
@@ -43,64 +43,13 @@ from heli_jax.identification.validation.score_test import (
     strongest,
 )
 
-# Slow outputs are tested at their own samples.
-
-
-_REGULAR = 0.98
-"""Least share of sample intervals with the usual length, for a regular clock."""
-_MOST = 50
-"""Longest sample interval [grid steps]."""
-_JITTERS = 5
-"""Shortest sample interval at which rounding to the grid may add or drop one step [grid steps]."""
-
-
-class OwnSamples(NamedTuple):
-    """Grid rows of an output that was sampled at a regular rate."""
-
-    rows: np.ndarray
-    """Row numbers (M,)."""
-    every: int
-    """Sample interval [grid steps]."""
-
-    @property
-    def holes(self) -> tuple[int, ...]:
-        """Places in `rows` before which a sample is missing; slow signals jump there."""
-        apart = np.diff(self.rows)
-        return tuple((np.flatnonzero(apart > self.every + (self.every >= _JITTERS)) + 1).tolist())
-
-    def of_input(self, u: Float[np.ndarray, " N"]) -> Float[np.ndarray, " M"]:
-        """Return an input's mean over each sample interval; the first starts with the flight.
-
-        Args:
-            u: the input (N,), any unit.
-        """
-        summed = np.concatenate([[0.0], np.cumsum(u)])
-        # The input at an output's sample acts after that sample, and so moves the next one.
-        first = np.maximum(self.rows + 1 - self.every, 0)
-        return (summed[self.rows + 1] - summed[first]) / (self.rows + 1 - first)
-
-
-def own_samples(seen: Bool[np.ndarray, " N"]) -> OwnSamples | None:
-    """Return the rows of an output's samples; None if too many samples are missing."""
-    rows = np.flatnonzero(seen)
-    if rows.size == seen.size:
-        return OwnSamples(rows, 1)
-    if rows.size < 2:
-        return None
-    steps = np.diff(rows)
-    usual = int(np.median(steps))
-    # The interval may be no multiple of the grid step: rounding then adds or drops one step.
-    near = np.abs(steps - usual) <= (0 if usual < _JITTERS else 1)
-    if usual > _MOST or np.mean(near) < _REGULAR:
-        return None
-    return OwnSamples(rows, usual)
-
-
 # Residuals that can be tested, and their sensitivities.
 
 
 _FLIGHTS = 6
 """Largest number of flights that are tested; the longest are taken."""
+_SEEN = 0.95
+"""Least share of an output's samples that are measured."""
 _DIVERGED = -10.0
 """VAF below which a simulation has diverged."""
 _ROUNDING = 1e-5
@@ -109,26 +58,26 @@ _STEP = 1e-4
 """Step of an unknown's coordinate for finite differences."""
 
 
-def of_one_clock(at: Solution, e: Evaluation, name: str) -> list[tuple[int, OwnSamples]]:
-    """Return the flights in which an output's residual can be tested, with the output's samples.
+def tested_flights(at: Solution, e: Evaluation, name: str) -> list[tuple[int, np.ndarray]]:
+    """Return the flights in which an output's residual can be tested, with the output's rows (M,).
 
-    The output moves and the simulation follows it. Of these flights the longest are taken. All
-    share one sample time and one clock of the output, since filters count samples.
+    The output moves, few of its samples are missing, and the simulation follows it. Of these
+    flights the longest are taken. All share one sample time, since filters count samples.
     """
-    flights, tested = at.data.flights, list[tuple[int, OwnSamples]]()
+    flights, tested = at.data.flights, list[tuple[int, np.ndarray]]()
     sizes = [next(iter(f.outputs.values())).shape[0] for f in flights]
     order = np.argsort(sizes, kind="stable")[::-1].tolist()
     dt = float(flights[order[0]].dt)
     for i in sorted([i for i in order if np.isclose(float(flights[i].dt), dt)][:_FLIGHTS]):
         y = np.asarray(flights[i].outputs.get(name, np.nan))
-        own = own_samples(np.isfinite(y)) if name in at.layout.outputs[i] else None
-        if own is None or not np.std(y[own.rows]) > 0:
+        rows = np.flatnonzero(np.isfinite(y))
+        if rows.size < max(_SEEN * y.size, 2) or not np.ptp(y[rows]) > 0:
             continue
         with np.errstate(over="ignore", invalid="ignore"):
-            size = np.std(np.asarray(e.raw[i][name])[own.rows]) / np.std(y[own.rows])
+            size = np.std(np.asarray(e.raw[i][name])[rows]) / np.std(y[rows])
         if _ROUNDING < size < np.sqrt(1.0 - _DIVERGED):
-            tested.append((i, own))
-    return [(i, own) for i, own in tested if own.every == tested[0][1].every]
+            tested.append((i, rows))
+    return tested
 
 
 def sensitivities(at: Solution, e: Evaluation) -> dict[tuple[int, str], np.ndarray]:
@@ -218,8 +167,8 @@ def _normal(v: np.ndarray) -> np.ndarray:
     return v / size if size > 0 else v
 
 
-LEVEL, LEVEL_COLOURED = 0.01, 1e-3
-"""Significance level of all tests together, and the level if residuals in time are autocorrelated.
+LEVEL_COLOURED = 1e-3
+"""Significance level of all tests together if residuals in time are autocorrelated.
 
 In strong gusts the whitening filter is too short to remove all autocorrelation."""
 _ROUNDS = 6
@@ -258,14 +207,14 @@ def unmodelled(
     error also fits the vehicle's response to its disturbance, which biases it if the disturbance
     acts elsewhere or has another spectrum.
 
-    Slow outputs are tested at their own samples. Outputs with gaps, diverged simulations, windows
-    and kinematic models are not tested. The inputs must not follow the response: in a closed loop
-    they contain disturbances, and every residual follows these.
+    Slow outputs, diverged simulations, windows and kinematic models are not tested. The inputs must
+    not follow the response: in a closed loop they contain disturbances, and every residual follows
+    these.
     """
     layout, nothing = at.layout, ([], (1.0, {}))
     if is_kinematic(layout.model) or any(count > 1 for count, _ in layout.windows):
         return nothing
-    names = sorted({n for outputs in layout.outputs for n in outputs if of_one_clock(at, e, n)})
+    names = sorted({n for outputs in layout.outputs for n in outputs if tested_flights(at, e, n)})
     if not names:
         return nothing
     level = (LEVEL_COLOURED if coloured else LEVEL) / len(names)
@@ -279,7 +228,7 @@ def unmodelled(
         if strong.p_value < level and (
             strongest(_lines(at, e, name, J, flights, _WILD)[1], drives).p_value < level
         ):
-            lacking.append(_told(at, e, name, strong, J))
+            lacking.append(_described(at, e, name, strong, J))
     tested, k = [records for _, records in each.values() if records], len(layout.of_interest)
     chances = [pulled_away(records, k) for records in tested]
     p = min(1.0, min(chances) * len(chances)) if chances else 1.0
@@ -295,7 +244,7 @@ def _where_least(
     drives: Sequence[Drive],
     records: Sequence[Lines],
     level: float,
-    called: Sequence[str],
+    labels: Sequence[str],
 ) -> Strongest:
     """Return the strongest drive; if it is significant, where the whitened residual is least.
 
@@ -308,7 +257,7 @@ def _where_least(
             break
         there = at._replace(z=at.z + part * jnp.asarray(strong.step, at.z.dtype))
         e = evaluate(*there)
-        tested, again = _lines(there, e, name, sensitivities(there, e), called)
+        tested, again = _lines(there, e, name, sensitivities(there, e), labels)
         if not tested or not _deviance(again) < _deviance(records):
             part *= 0.25
             continue
@@ -332,7 +281,7 @@ def _lines(
     e: Evaluation,
     name: str,
     J: Mapping[tuple[int, str], np.ndarray],
-    called: Sequence[str],
+    labels: Sequence[str],
     most: float = np.inf,
 ) -> tuple[list[Drive], list[Lines]]:
     """Return the candidate drives of an output's residual, and its lines by flight.
@@ -340,10 +289,10 @@ def _lines(
     No drive is returned if nothing can be tested.
 
     Args:
-        called: the flights' names.
+        labels: the flights' names.
         most: bound of the whitened residual [robust sds].
     """
-    moving, samples = moving_inputs(at), of_one_clock(at, e, name)
+    moving, samples = moving_inputs(at), tested_flights(at, e, name)
     # A step may end where the simulation diverges.
     if not samples:
         return [], []
@@ -351,16 +300,16 @@ def _lines(
     steps, lines = [J[i, name].shape[0] for i, _ in samples], []
     # A parameter changes steadily over the flights in their order, or jumps halfway.
     t = np.split(np.linspace(-1.0, 1.0, sum(steps)), np.cumsum(steps)[:-1])
-    for place, ((i, own), shape) in enumerate(zip(samples, t, strict=True)):
+    for place, ((i, rows), shape) in enumerate(zip(samples, t, strict=True)):
         inputs = naming.asdict(at.data.flights[i].inputs)
         u, slopes = [np.asarray(inputs[n]) for n in moving], J[i, name][:, :k]
         known = np.stack([*u, *nonlinear(np.asarray(e.simulated[i][name]), u)], axis=1)
-        X = [np.stack([own.of_input(v) for v in known.T], axis=1)]
+        X = [known[rows]]
         # One flight's changes come before those over time, since they may also look like a jump.
-        X += [slopes[own.rows] * (other == place) for other in range(len(samples))]
-        X += [(slopes * by[:, None])[own.rows] for by in (shape, np.sign(shape))]
-        left = np.asarray(e.raw[i][name])[own.rows]
-        found = lines_of(left, J[i, name][own.rows], np.concatenate(X, axis=1), own.holes, most)
+        X += [slopes[rows] * (other == place) for other in range(len(samples))]
+        X += [(slopes * by[:, None])[rows] for by in (shape, np.sign(shape))]
+        left, holes = np.asarray(e.raw[i][name])[rows], np.flatnonzero(np.diff(rows) > 1) + 1
+        found = lines_of(left, J[i, name][rows], np.concatenate(X, axis=1), holes.tolist(), most)
         if found is not None:
             lines.append((place, found))
     records = [one for _, one in lines]
@@ -371,7 +320,7 @@ def _lines(
     drives = [Drive(c, "input", (n,), NARROW) for c, n in enumerate(moving)]
     drives += [Drive(c, "amplitude", (), BROAD, tuple(range(m))) for c in range(m, first)]
     if len(records) > 1:
-        names = [called[i] if i < len(called) else f"flight {i + 1}" for i, _ in samples]
+        names = [labels[i] if i < len(labels) else f"flight {i + 1}" for i, _ in samples]
         of = [names[place] for place, _ in lines]
         drives += [
             # With only two flights either may be the odd one.
@@ -388,7 +337,7 @@ def _lines(
     return drives, records
 
 
-def _told(
+def _described(
     at: Solution,
     e: Evaluation,
     name: str,
@@ -409,8 +358,8 @@ def _told(
         change = strong.amount * slopes[drive.unknown]
         there = shifts[drive.unknown] + change
         shifts[drive.unknown] = max((shifts[drive.unknown], there, -change), key=abs)
-    first, own = of_one_clock(at, e, name)[0]
-    frequency = strong.frequency / (float(at.data.flights[first].dt) * own.every)
+    first, _ = tested_flights(at, e, name)[0]
+    frequency = strong.frequency / float(at.data.flights[first].dt)
     return Unmodelled(
         name,
         drive,
@@ -431,9 +380,9 @@ def _by_amplitude(
     residual is regressed on the sensitivities, and on these times the amplitude. It is not
     whitened: a response that depends on amplitude is as slow as the response itself.
     """
-    k, samples = len(at.layout.of_interest), of_one_clock(at, e, name)
-    left = np.concatenate([np.asarray(e.raw[i][name])[own.rows] for i, own in samples])
-    rows = np.concatenate([J[i, name][own.rows] for i, own in samples])
+    k, samples = len(at.layout.of_interest), tested_flights(at, e, name)
+    left = np.concatenate([np.asarray(e.raw[i][name])[seen] for i, seen in samples])
+    rows = np.concatenate([J[i, name][seen] for i, seen in samples])
     inputs = [at.data.flights[i].inputs for i, _ in samples]
     outputs = [np.asarray(e.simulated[i][name]) for i, _ in samples]
     signals = [[np.asarray(getattr(u, drive)) for u in inputs] for drive in moving_inputs(at)]
@@ -441,7 +390,7 @@ def _by_amplitude(
     best, least = np.zeros(k), np.inf
     for signal in signals:
         amplitude = np.abs(
-            np.concatenate([x[own.rows] for x, (_, own) in zip(signal, samples, strict=True)])
+            np.concatenate([x[seen] for x, (_, seen) in zip(signal, samples, strict=True)])
         )
         mean, sd = float(amplitude.mean()), float(np.std(amplitude))
         if not sd > _VARIES * mean:

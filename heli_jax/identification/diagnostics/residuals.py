@@ -1,17 +1,19 @@
-"""Findings on the adequacy of the model."""
+"""Findings on residuals: adequacy, unmodelled dynamics, noise, and held-out flights."""
 
 from collections.abc import Iterator
 
 import numpy as np
 
+from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.finding import Finding, found, note
-from heli_jax.identification.agreement import pooled_metrics
 from heli_jax.identification.diagnostics.context import Context
-from heli_jax.identification.validation.adequacy import (
-    EXPLAINED,
-    WORSE,
-)
+from heli_jax.identification.estimation.noise_covariance import NO_DISTURBANCE
+from heli_jax.identification.validation.adequacy import EXPLAINED, WORSE
 from heli_jax.identification.validation.excitation import LEVEL
+from heli_jax.identification.validation.metrics import pooled_metrics
+from heli_jax.identification.validation.unmodelled import LEVEL_COLOURED
+
+# Adequacy of the model.
 
 
 def outputs_explained(c: Context) -> Iterator[Finding]:
@@ -78,6 +80,95 @@ def residual_follows_excitation(c: Context) -> Iterator[Finding]:
             explained=[max(f.explained, 0.0) for f in failed.values()],
             level=level,
         )
+
+
+# Residuals that still follow an input, the amplitude, or time.
+
+
+RESIDUAL_FOLLOWS_INPUT = "dynamics.residual-follows-input"
+_CODES = {
+    "input": RESIDUAL_FOLLOWS_INPUT,
+    "amplitude": "dynamics.depends-on-amplitude",
+    "flights": "dynamics.flights-differ",
+    "time": "dynamics.changes-over-record",
+}
+
+
+def unmodelled_dynamics(c: Context) -> Iterator[Finding]:
+    """Find a missing mode, or a response that depends on amplitude, flight or time."""
+    for one in c.unmodelled[0]:
+        yield found(
+            _CODES[one.drive.kind],
+            "doubt",
+            one.output,
+            *one.drive.of,
+            value=one.p_value,
+            shifts=one.shifts,
+            distrusts=one.far,
+            output=one.output,
+            of=one.drive.of,
+            gain=one.gain,
+            near=f"{one.frequency:.2g} rad/s" if one.frequency else "",
+            lacks="a mode or a lag" if one.frequency else "dynamics",
+            level=LEVEL,
+        )
+
+
+def inputs_prefer_other_values(c: Context) -> Iterator[Finding]:
+    """Find parameters whose values by the response to the inputs alone differ from the fit's."""
+    p, shifts = c.unmodelled[1]
+    if shifts:
+        yield found(
+            "agreement.inputs-ask-otherwise",
+            "doubt",
+            *c.at.layout.of_interest,
+            value=p,
+            shifts=shifts,
+            level=LEVEL_COLOURED,
+        )
+
+
+# Whiteness of residuals or innovations, and disturbances.
+
+
+COLOURED, TOO_NARROW = "noise.residuals-coloured", "noise.intervals-too-narrow"
+_FAR_TOO_NARROW = 0.2
+"""Autocorrelation at one sample above which intervals that ignore it are not trusted.
+
+They are then too narrow by more than a fifth, or the noise model is wrong."""
+
+
+def residuals_white(c: Context) -> Iterator[Finding]:
+    """Find residuals or innovations that are not white, and the effect on the intervals."""
+    not_white = [name for name, w in c.whiteness.items() if not w.white] if c.fitted else []
+    if not not_white:
+        return
+    # Select by the correlation at one sample, since the message shows this number.
+    worst = max((c.whiteness[n] for n in not_white), key=lambda w: abs(w.lag1))
+    objective, converged = c.at.layout.objective, c.status != "not-converged"
+    allowed = objective.noise_model == "spectrum" or c.errors.coloured
+    narrow = converged and not allowed
+    yield found(
+        TOO_NARROW if narrow else COLOURED,
+        "doubt" if narrow else "note",
+        *not_white,
+        value=worst.lag1,
+        distrusts=c.free if narrow and abs(worst.lag1) > _FAR_TOO_NARROW else (),
+        errors="innovations" if objective.noise_model == "disturbance" else "residuals",
+        outside=worst.outside,
+        limit=_FAR_TOO_NARROW,
+        allowed="the intervals allow for it" if converged and allowed else "",
+    )
+
+
+def disturbance_shows(c: Context) -> Iterator[Finding]:
+    """Find disturbances that were estimated and are not significant."""
+    if c.optimum is None:
+        return
+    absent = c.absent
+    names = [d.name for d in disturbances_of(c.at.layout.model) if d.sigma in absent]
+    if names:
+        yield found("noise.no-disturbance", "note", *names, limit=NO_DISTURBANCE)
 
 
 # Held-out flights.
