@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from pydantic_core import ErrorDetails
 
 from heli_jax import models, naming
-from heli_jax.config.keys import expected
+from heli_jax.config.keys import json_schema
 from heli_jax.config.kinematics import completed
 from heli_jax.config.measurement import OpenedLogs, with_measurement
 from heli_jax.config.onboard import with_onboard
@@ -22,6 +22,7 @@ from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, VehicleError, located, nearest, require_kind, require_known
 from heli_jax.linear_models.read import LinearModel, is_shipped, linear_model
+from heli_jax.schema_keys import expected
 from heli_jax.vehicle import Vehicle, constant, read_vehicle, vehicle_from_mapping
 from heli_jax.yaml_file import EDIT, parse_value, read_mapping
 
@@ -222,7 +223,7 @@ def _index(at: list[Any], name: str, where: str) -> int:
 
 def _validated(content: dict[str, Any], where: str) -> Config:
     try:
-        config = Config.model_validate(content)
+        config = Config.checked(content)
     except pydantic.ValidationError as e:
         # For a key with several allowed kinds pydantic reports errors of each; those of the actual
         # kind are useful. An unknown key comes first, because it is the likeliest cause of the
@@ -278,7 +279,8 @@ def _sentence(error: ErrorDetails) -> str:
     if value == EDIT:
         return _edit_words(error["loc"])
     if _is_of_another_kind(error):
-        kind = expected([part for part in error["loc"] if not _KIND.fullmatch(str(part))])
+        place_of_key = [part for part in error["loc"] if not _KIND.fullmatch(str(part))]
+        kind = expected(json_schema(), place_of_key)
         return f"{place}: got {value!r:.60}, expected {kind}"
     # pydantic's sentence without its beginning becomes part of ours: "Input should be ...".
     message = str(error["msg"]).removeprefix("Value error, ")

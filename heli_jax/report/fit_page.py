@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heli_jax import naming
 from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.identifiability.verdict import FACTOR
 from heli_jax.identification.problem import Problem
@@ -19,11 +20,10 @@ from heli_jax.identification.validation.adequacy import (
     NEARLY_WHITE,
 )
 from heli_jax.identification.validation.metrics import metrics
-from heli_jax.numbers import measured, percent, vaf_percent
+from heli_jax.numbers import percent, vaf_percent
 from heli_jax.report import figures, tables
 from heli_jax.report.card import card, summary
 from heli_jax.report.charts import Numbers
-from heli_jax.report.figures.estimates import MOST
 from heli_jax.report.files import Analysis as Analysis
 from heli_jax.report.fitted_responses import FittedPair
 from heli_jax.report.origin import Origin
@@ -61,7 +61,7 @@ def write_report(
     for name, draw in drawings(analysis).items():
         made = picture(name, draw, numbers, folder=folder, png=png)
         if made is not None:
-            shown.append(made._replace(alt=alt_text(made, analysis)))
+            shown.append(made)
     page = render(analysis, title, vehicle_constants, shown, numbers, origin)
     (directory / "report.html").write_text(page, encoding="utf-8")
     return [made.name for made in shown]
@@ -180,7 +180,9 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
         ):
             note = f"{about}; data without the hold of the input, {whose}"
             for pair in pairs:
-                unit = figures.bode_unit(model, pair.output, pair.input)
+                unit = figures.quotient(
+                    naming.unit(model.Outputs, pair.output), naming.unit(model.Inputs, pair.input)
+                )
                 name = f"{group}_{pair.output}-{pair.input}"
                 rls = baseline if group == "match" and _of(baseline, pair) else None
                 drawings[name] = later(figures.match, pair, unit, note, rls)
@@ -218,27 +220,6 @@ def caption(picture: Picture) -> str:
     """Return the caption of a figure, with the name of its files."""
     [words] = [words for begins, words in GROUPS.items() if picture.name.startswith(begins)]
     return f"{picture.title}. {words} (figures/{picture.name}.svg)"
-
-
-def alt_text(picture: Picture, analysis: Analysis) -> str:
-    """Return the text alternative of a figure."""
-    fit, intervals = analysis.fit, analysis.supplementary.intervals
-    samples: Mapping[str, np.ndarray] = {}
-    if picture.name == "pairs_posterior" and intervals and intervals.posterior:
-        samples = intervals.posterior.draws
-    elif picture.name == "pairs_bootstrap" and intervals and intervals.bootstrap:
-        samples = intervals.bootstrap.values
-    if samples:
-        each = []
-        for name in list(samples)[:MOST]:
-            mean, sd = measured(float(np.std(samples[name])), float(np.mean(samples[name])))
-            each.append(f"{name} {mean}, {sd} {fit.estimates[name].unit}".rstrip())
-        count = next(iter(samples.values())).size
-        return f"{picture.title}. {count} samples, mean and sd: {'; '.join(each)}."
-    for output, m in fit.metrics.items():
-        if picture.name.startswith("response") and picture.name.endswith(f"_{output}"):
-            return f"{picture.alt} Over the fitted flights: VAF {vaf_percent(m.vaf)}."
-    return picture.alt
 
 
 class Line(NamedTuple):

@@ -18,7 +18,7 @@ from heli_jax.numbers import NOTHING, number, with_sd
 from heli_jax.report import tables
 from heli_jax.report.charts import Chart, Numbers
 from heli_jax.report.document import handling_content
-from heli_jax.report.figures.bode import branch_of, draw_response, seen_of
+from heli_jax.report.figures.bode import branch_of, draw_response, quotient, seen_of
 from heli_jax.report.files import as_json
 from heli_jax.report.origin import origin
 from heli_jax.report.page import filled, picture
@@ -387,10 +387,3 @@ def write_netcdf(path: Path, responses: FlightResponses, units: Mapping[str, str
         },
     )
     data.to_netcdf(path, engine="scipy", format="NETCDF3_64BIT")
-
-
-def quotient(output: str, input: str) -> str:
-    """Return the unit of output over input."""
-    if input == "1":
-        return output
-    return f"{output}/({input})" if "/" in input else f"{output}/{input}"
