@@ -36,19 +36,31 @@ def matching(keys: Sequence[Key], pattern: str) -> list[Key]:
 
 def expected(schema: Mapping[str, Any], place: Sequence[str | int]) -> str:
     """Return the allowed values at a place of a file: `number or list of number`."""
+    return _kind(schema, _at(schema, place))
+
+
+def known_keys(schema: Mapping[str, Any], place: Sequence[str | int]) -> list[str]:
+    """Return the keys of the section at a place of a file."""
+    options = _resolved(schema, _at(schema, place))
+    return [name for option in options for name in option.get("properties", {})]
+
+
+def _at(schema: Mapping[str, Any], place: Sequence[str | int]) -> Mapping[str, Any]:
     at: Any = schema
     for part in place:
-        options = [
-            schema["$defs"].get(o.get("$ref", "").rsplit("/", 1)[-1], o) for o in _options(at)
-        ]
         inner = [
             o.get("items")
             if isinstance(part, int)
             else o.get("properties", {}).get(part, o.get("additionalProperties"))
-            for o in options
+            for o in _resolved(schema, at)
         ]
         at = next((i for i in inner if isinstance(i, dict)), {})
-    return _kind(schema, at)
+    return at
+
+
+def _resolved(schema: Mapping[str, Any], at: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    definitions = schema.get("$defs", {})
+    return [definitions.get(o.get("$ref", "").rsplit("/", 1)[-1], o) for o in _options(at)]
 
 
 def _walk(

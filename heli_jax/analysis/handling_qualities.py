@@ -107,7 +107,7 @@ def handling_qualities(curve: Curve, kind: Kind = "rate") -> HandlingQualities:
     response = _Response(x, points.log_gain, phase, points)
     values, by = _values(kind, x, response.gain, phase), _derivatives(kind, response)
     numbers: dict[str, Number] = {}
-    sentences = [curve.caution] if curve.caution else []
+    sentences: list[str] = []
     for name in NUMBERS[kind]:
         if name not in values:
             continue

@@ -21,12 +21,6 @@ from heli_jax.identification.defaults import filtered_noise
 type _Channel = tuple[tuple[Filter, ...], float]
 
 
-_MOST = 2 * 10**8
-"""Largest total size of files kept open [bytes]; a larger one is parsed again to save memory."""
-
-type _Key = tuple[str, int | None, int, int]
-
-
 class OpenedLogs:
     """Logs of one configuration, each parsed once until the flights are read.
 
@@ -34,7 +28,7 @@ class OpenedLogs:
     """
 
     def __init__(self) -> None:
-        self._logs: dict[_Key, Table | ChannelLog] = {}
+        self._logs: dict[tuple[Path, int | None], Table | ChannelLog] = {}
 
     def __reduce__(self) -> tuple:
         # An experiment sent to another process reads its logs there.
@@ -50,35 +44,17 @@ class OpenedLogs:
         Raises:
             InputError: it cannot be read.
         """
-        key = _key(path, number)
-        if key not in self._logs:
-            log = open_log(path, number)
-            if log.size + sum(kept.size for kept in self._logs.values()) > _MOST:
-                return log
-            self._logs[key] = log
-        return self._logs[key]
+        if (path, number) not in self._logs:
+            self._logs[path, number] = open_log(path, number)
+        return self._logs[path, number]
 
     def get(self, path: Path, number: int | None) -> Table | ChannelLog | None:
-        """Return the log if it is open, else None.
-
-        Args:
-            path: path of the log.
-            number: number of the flight in a log of several, from 1.
-        """
-        return self._logs.get(_key(path, number))
+        """Return the log if it is open, else None; arguments as in `open`."""
+        return self._logs.get((path, number))
 
     def close(self) -> None:
         """Release all logs."""
         self._logs.clear()
-
-
-def _key(path: Path, number: int | None) -> _Key:
-    # With time and size, so that a rewritten log counts as another one.
-    try:
-        stat = path.stat()
-    except OSError:  # the reader reports the fault
-        return str(path.absolute()), number, 0, 0
-    return str(path.absolute()), number, stat.st_mtime_ns, stat.st_size
 
 
 def with_measurement(

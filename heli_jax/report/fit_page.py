@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax import naming
-from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.identifiability.verdict import FACTOR
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Fit, Signals
@@ -25,8 +24,7 @@ from heli_jax.report import figures, tables
 from heli_jax.report.card import card, summary
 from heli_jax.report.charts import Numbers
 from heli_jax.report.files import Analysis as Analysis
-from heli_jax.report.fitted_responses import FittedPair
-from heli_jax.report.origin import Origin
+from heli_jax.report.origin import Origin, origin
 from heli_jax.report.page import MOST_FLIGHTS, Draw, Picture, filled, picture
 from heli_jax.vehicle import Constant, of_helicopter
 from heli_jax.versions import versions
@@ -37,7 +35,7 @@ def write_report(
     analysis: Analysis,
     title: str,
     vehicle_constants: Mapping[str, Constant],
-    origin: Origin | None = None,
+    made: Origin | None = None,
     *,
     png: bool = False,
 ) -> list[str]:
@@ -48,47 +46,32 @@ def write_report(
     Args:
         directory: existing output directory.
         vehicle_constants: constants of the vehicle file, by name.
-        origin: command, configuration and files beside the page; default none.
+        made: command, configuration and files beside the page; default this process without files.
         png: write figures/NAME.png too.
 
     Raises:
         OSError: the directory is not writable.
     """
+    fit, problem, baseline, supplementary = analysis
     folder = directory / "figures"
     folder.mkdir(parents=True, exist_ok=True)
-    numbers, shown = Numbers(), list[Picture]()
+    numbers = Numbers()
     # Figures are drawn one by one to save memory.
-    for name, draw in drawings(analysis).items():
-        made = picture(name, draw, numbers, folder=folder, png=png)
-        if made is not None:
-            shown.append(made)
-    page = render(analysis, title, vehicle_constants, shown, numbers, origin)
-    (directory / "report.html").write_text(page, encoding="utf-8")
-    return [made.name for made in shown]
-
-
-def render(
-    analysis: Analysis,
-    title: str,
-    vehicle_constants: Mapping[str, Constant],
-    pictures: list[Picture],
-    numbers: Numbers | None = None,
-    origin: Origin | None = None,
-) -> str:
-    """Return the page as text."""
-    fit, problem = analysis.fit, analysis.problem
-    numbers, first = numbers or Numbers(), None
+    drawn = (
+        picture(name, draw, numbers, folder=folder, png=png)
+        for name, draw in drawings(analysis).items()
+    )
+    pictures, first = [p for p in drawn if p is not None], None
     if (worst := worst_output(fit)) is not None:
-        chart = figures.overview(*worst, problem.model)
-        first = picture("overview", lambda: chart, numbers)
-    return filled(
+        first = picture("overview", lambda: figures.overview(*worst, problem.model), numbers)
+    page = filled(
         "report.html.j2",
         title=title,
         fit=fit,
         problem=problem,
-        baseline=analysis.baseline,
-        more=analysis.supplementary,
-        card=card(fit, analysis.supplementary.responses),
+        baseline=baseline,
+        more=supplementary,
+        card=card(fit, supplementary.responses),
         summary=summary,
         # The template calls this module for its rows.
         lines=lines(fit),
@@ -102,7 +85,7 @@ def render(
         tables=tables,
         constants=tables.constants(problem, vehicle_constants),
         versions=versions(),
-        origin=origin,
+        origin=made or origin(),
         unshown=max(0, len(fit.signals) - MOST_FLIGHTS),
         overview=first,
         pictures={
@@ -111,6 +94,8 @@ def render(
         },
         numbers=numbers.content(),
     )
+    (directory / "report.html").write_text(page, encoding="utf-8")
+    return [p.name for p in pictures]
 
 
 # A group must not be a prefix of another.
@@ -184,7 +169,8 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
                     naming.unit(model.Outputs, pair.output), naming.unit(model.Inputs, pair.input)
                 )
                 name = f"{group}_{pair.output}-{pair.input}"
-                rls = baseline if group == "match" and _of(baseline, pair) else None
+                of = baseline and (baseline.input, baseline.output)
+                rls = baseline if group == "match" and of == (pair.input, pair.output) else None
                 drawings[name] = later(figures.match, pair, unit, note, rls)
     if baseline is not None:
         # Time of the flight's first sample in the log [s].
@@ -210,10 +196,6 @@ def _parts(flights: list[str]) -> list[str]:
         f"_{i + 1}_{re.sub('[^A-Za-z0-9]+', '-', f).strip('-')[:40]}".rstrip("_")
         for i, f in enumerate(flights)
     ]
-
-
-def _of(baseline: Baseline | None, pair: FittedPair) -> bool:
-    return baseline is not None and (baseline.input, baseline.output) == (pair.input, pair.output)
 
 
 def caption(picture: Picture) -> str:
