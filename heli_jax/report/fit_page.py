@@ -152,8 +152,7 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
                     figures.residual_correlation,
                     s,
                     output,
-                    together=len(fit.whiteness),
-                    test=fit.whiteness.get(f"{s.flight}/{output}"),
+                    fit.whiteness.get(f"{s.flight}/{output}"),
                 )
     if (responses := supplementary.responses) is not None:
         about = (

@@ -2,7 +2,7 @@
 
 import functools
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +35,6 @@ _SURE = 0.3
 """Largest relative random error of a usable response, that of five averages at coherence 0.6."""
 _TOO_LARGE = 2.0
 """chi-squared per degree of freedom above which the order of a transfer function is too low."""
-_NEAR_ZERO = 0.1
-"""Relative distance of a zero that nearly cancels a pole."""
 
 
 def write_responses(
@@ -231,23 +229,7 @@ def fit_sentences(fit: TransferFit | str, window: float) -> list[str]:
             f"it is unstable (a pole with the real part +{number(max(growing), 3)} rad/s); if the "
             "vehicle is stable, a late stick, feedback or a wrong order can cause this"
         )
-    if known and all(c.determined for c in fit.numerator) and (cancelled := _cancelled(fit)):
-        remarks.append(
-            f"zeros lie within a tenth of {_root_words(cancelled)} and nearly cancel them: these "
-            "poles may not be modes of the vehicle; try a lower order and compare chi²"
-        )
     return remarks
-
-
-def _cancelled(fit: TransferFit) -> list[complex]:
-    """Return the poles that a zero nearly cancels."""
-    zeros, cancelled = list(fit.zeros), []
-    for pole in fit.poles:
-        distances = [abs(pole - zero) for zero in zeros]
-        if distances and min(distances) < _NEAR_ZERO * abs(pole):
-            zeros.pop(int(np.argmin(distances)))
-            cancelled.append(complex(pole))
-    return cancelled
 
 
 FIT_HEAD = ("numerator", "denominator", "poles [rad/s]", "delay [ms]", "chi² per degree", "J")
@@ -280,12 +262,8 @@ def _roots(fit: TransferFit) -> str:
     """Return poles as text: frequency and damping of a pair, or a number."""
     if not all(c.determined for c in fit.denominator):
         return "not determined"
-    return _root_words(fit.poles)
-
-
-def _root_words(poles: Iterable[complex]) -> str:
     words = []
-    for pole in sorted(poles, key=abs):
+    for pole in sorted(fit.poles, key=abs):
         if pole.imag > 0.0:
             damping = number(-pole.real / abs(pole), 3)
             words.append(f"ω {number(abs(pole), 4)}, ζ {damping}")
