@@ -168,7 +168,7 @@ class SweepConfig(DesignConfig):
     unchanged; runs of `simulate` begin as stated there"""
     solver: str | None = None
     """exact, rk4 or a solver of diffrax; default exact for linear models"""
-    substeps: int | None = None
+    substeps: Annotated[int, Field(ge=1)] | None = None
     """steps of the solver per sample"""
     precision: Literal["float64", "float32"] = "float64"
     """precision of the computation"""

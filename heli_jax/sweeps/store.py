@@ -160,8 +160,8 @@ def create(
     dims = {d for variable in laid_out.values() for d in variable.dims}
     if "flight" in dims:
         _labels(group, "flight", np.asarray([_label(job, i) for i in range(len(job.flights))]))
-    if "time" in dims and job.trajectories is not None:
-        flight, every = job.flights[0], job.trajectories.every
+    if "time" in dims and job.options.trajectories is not None:
+        flight, every = job.flights[0], job.options.trajectories.every
         times = flight.times[::every]
         _labels(group, "time", times, {"units": "s", "long_name": "from the first sample"})
     group.attrs.update(

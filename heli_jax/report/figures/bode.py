@@ -63,10 +63,10 @@ def _curve(
     """Return magnitude [dB] and phase of a response."""
     # A zero has no phase; NaN breaks the line.
     good = np.isfinite(H) & (np.abs(H) > 0)
-    values = _decibels(np.where(good, H, 1.0)), degrees
-    return tuple(
-        Series(label, omega / _TURN, np.where(good, v, np.nan), color, width=width) for v in values
-    )
+    gain = np.where(good, _decibels(np.where(good, H, 1.0)), np.nan)
+    hz, degrees = omega / _TURN, np.where(good, degrees, np.nan)
+    of_gain = Series(label, hz, gain, color, width=width)
+    return of_gain, of_gain._replace(y=degrees)
 
 
 def _decibels(H: np.ndarray) -> np.ndarray:
@@ -161,7 +161,7 @@ def match(pair: FittedPair, unit: str, note: str, baseline: Baseline | None = No
         v, reach = value[modelled], Z95 * sd[modelled]
         edges.append(band(hz, v - reach, v + reach, style.SKY))
         lines.append(Series("model", hz, v, style.BLUE, width=1.4))
-    series = [edges, lines]
+    series: list[Sequence[Series]] = [edges, lines]
     if baseline is not None:
         R = baseline_response(baseline, omega)
         turned = _nearest(np.degrees(np.angle(R)), near)
