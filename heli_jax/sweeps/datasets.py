@@ -1,23 +1,9 @@
-"""Datasets of sweeps: as a grid of the axes, and in pieces to limit the memory."""
+"""Results of a sweep as a grid of its axes."""
 
 import math
-from collections.abc import Iterator
 
 import numpy as np
 import xarray as xr
-
-# 8 MB of float64: large compared with a chunk of the store, small compared with any memory. A chunk
-# of the store that two pieces share is read twice.
-_ELEMENTS = 1 << 20
-
-
-def chunks_of(variable: xr.DataArray) -> Iterator[tuple[slice, np.ndarray]]:
-    """Yield slices of elements and the variable's values for them (k, ...), in order."""
-    # The elements may be stored last; a slice of them is a slice of rows here.
-    variable = variable.transpose("element", ...)
-    for start in range(0, variable.sizes["element"], _ELEMENTS):
-        which = slice(start, min(start + _ELEMENTS, variable.sizes["element"]))
-        yield which, variable.isel(element=which).values
 
 
 def as_grid(dataset: xr.Dataset) -> xr.Dataset:

@@ -192,7 +192,7 @@ def job(
         )
     _check_axes(model, design, flights)
     _check_inputs(model, flights)
-    _check_results(model, design, reduce, flights, options.trajectories)
+    _check_results(model, reduce, flights, options.trajectories)
     _check_precision(model, options.precision)
     # The exact step of a linear model leaves no solver error in the results.
     solver = options.solver or ("exact" if model.linear else "rk4")
@@ -306,7 +306,6 @@ def _check_inputs(model: Model, flights: tuple[Flight, ...]) -> None:
 
 def _check_results(
     model: Model,
-    design: Design,
     reduce: Mapping[str, Reduce],
     flights: tuple[Flight, ...],
     trajectories: Trajectories | None,
@@ -316,10 +315,6 @@ def _check_results(
         raise ValueError("reduce: no result is kept, expected a result or trajectories")
     for name, reducer in reduce.items():
         reducers.check(name, reducer, outputs, inputs)
-        # Reserved names of the store; names that its format cannot have are refused where it is
-        # created.
-        if name in design.names or name in ("status", "element"):
-            raise ValueError(f"reduce.{name}: the name exists already, expected another")
         stream = reducers.streaming(reducer)
         signal = str(reducer.signal)
         for flight in flights if stream is not None and stream.against_flight else ():

@@ -55,10 +55,7 @@ class Store:
         """Return a mask of finished chunks, (number of chunks,)."""
         # The first element of each is enough: the status of a chunk is one file, which is complete
         # or absent.
-        status = self._arrays["status"]
-        count = self.split.chunks(status.shape[0])
-        firsts = [status[k * self.split.chunk] for k in range(count)]
-        return np.asarray(firsts).reshape(-1) != NOT_RUN
+        return np.asarray(self._arrays["status"][:: self.split.chunk]) != NOT_RUN
 
     def whole(self) -> np.ndarray:
         """Return finished chunks as `done`, except those with unreadable files.
