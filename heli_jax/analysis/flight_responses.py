@@ -30,7 +30,6 @@ from heli_jax.analysis.spectra import (
     cross_spectra,
     is_own,
     octave_mean,
-    window_transforms,
 )
 from heli_jax.analysis.transfer_fit import Hold, Measured, TransferFit, fit_transfer
 from heli_jax.finding import Finding, note, sentences
@@ -317,12 +316,15 @@ def _own(records: Sequence[np.ndarray], dt: float, omega: np.ndarray, window: fl
     Elsewhere its spectrum comes from the window's sidelobes, which are coherent too. Two low-passed
     signals would show a response far above their filters.
     """
+    # Imported on demand: it is slow.
+    from scipy.signal import welch
+
     length, power = round(window / dt), 0.0
     for record in records:
-        # The next window begins at the second half of this one.
-        starts = range(0, record.shape[1] - length + 1, length - length // 2)
-        X = window_transforms(record, starts, length, range(length // 2 + 1), dt)
-        power = power + np.sum(np.abs(X) ** 2, axis=1)
+        # Without the best straight line, since a drift would leak into the lowest frequencies.
+        hann = np.hanning(length)
+        S = welch(record, window=hann, noverlap=length // 2, detrend="linear")[1]
+        power = power + S * (1 + (record.shape[1] - length) // (length - length // 2))
     own = np.stack([is_own(S) for S in np.atleast_2d(power)])
     return own[
         :, np.clip(np.round(omega * dt * length / (2.0 * np.pi)).astype(int), 0, own.shape[1] - 1)
