@@ -15,7 +15,7 @@ from heli_jax import config as configuration
 from heli_jax import run_directory
 from heli_jax.analysis.flight_responses import Settings
 from heli_jax.config import Experiment
-from heli_jax.config.frequency import asked_handling, missing_handling
+from heli_jax.config.frequency import missing_handling, requested_handling
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.errors import InputError, located, require_kind
 from heli_jax.finding import Finding, note, without_repeats
@@ -403,7 +403,7 @@ def _with_responses(run: FitRun) -> SupplementaryAnalyses:
     points = options.points or Settings().points
     settings = Settings(options.band, options.window, points)
     logged = {n for f in run.problem.training for n in f.outputs}
-    requested = asked_handling(run.config, logged)
+    requested = requested_handling(run.config, logged)
     responses = fitted_responses(run.fit, run.problem, settings, requested)
     gaps = missing_handling(run.config, logged)
     responses = responses._replace(notes=(*responses.notes, *gaps))

@@ -66,7 +66,7 @@ class Windows(NamedTuple):
     """Length of a window [s]."""
 
 
-class Wanted(NamedTuple):
+class TransferRequest(NamedTuple):
     """A transfer function to fit to one response."""
 
     input: str
@@ -89,7 +89,7 @@ class Settings(NamedTuple):
     """Length [s]; None: a fifth of the longest flight, at most 30 s."""
     points: int = 120
     """Number of frequencies, equally spaced in the logarithm."""
-    transfer_functions: tuple[Wanted, ...] = ()
+    transfer_functions: tuple[TransferRequest, ...] = ()
 
 
 class Pair(NamedTuple):
@@ -131,7 +131,7 @@ class FlightResponses(NamedTuple):
     """Inputs whose responses use a logged excitation."""
     window: float
     """Length of a window [s]."""
-    fits: tuple[tuple[Wanted, TransferFit | str], ...]
+    fits: tuple[tuple[TransferRequest, TransferFit | str], ...]
     """Fits in the requested order; a text gives the reason why one is missing."""
     holds: dict[str, Hold]
     """Hold of each input between samples."""
@@ -354,7 +354,7 @@ def _fits(
     outputs: dict[str, Output],
     windows: dict[str, Windows],
     holds: dict[str, Hold],
-) -> tuple[tuple[Wanted, TransferFit | str], ...]:
+) -> tuple[tuple[TransferRequest, TransferFit | str], ...]:
     """Return the fitted transfer functions, or the reason why one cannot be fitted."""
     fits = []
     for request in settings.transfer_functions:
@@ -372,7 +372,7 @@ def _fits(
 
 
 def _fitted(
-    request: Wanted, output: Output, windows: Windows, holds: dict[str, Hold]
+    request: TransferRequest, output: Output, windows: Windows, holds: dict[str, Hold]
 ) -> TransferFit:
     omega, pair = windows.omega, output.pairs[request.input]
     hz = omega / (2.0 * np.pi)

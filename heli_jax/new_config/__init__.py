@@ -131,7 +131,7 @@ def _outputs(
     log: Log,
     signals: text.Signals | None,
 ) -> Sequence[str]:
-    """Return the log's channels for outputs (`asked` or all of the preset), else for inputs."""
+    """Return the log's channels for the requested outputs, or all outputs, else for the inputs."""
     if signals is not None:
         taken = signals.outputs or signals.inputs
         return [g.channel for g in taken.values() if g is not None]

@@ -213,7 +213,7 @@ class Line(NamedTuple):
     """One sentence."""
 
 
-_SPEAK_AGAINST = ("adequacy", "dynamics", "units", "timing", "quality")
+_DOUBTFUL_TOPICS = ("adequacy", "dynamics", "units", "timing", "quality")
 """Topics of findings that raise doubts about an adequate model."""
 
 
@@ -238,12 +238,14 @@ def lines(fit: Fit) -> tuple[Line, Line, Line]:
         determined = Line("warning", "Identifiable, not trusted", text)
     adequate = Line("bad", "Not adequate", f"{'; '.join(fit.reasons_against)}.")
     if fit.adequate:
-        against = [
+        doubts = [
             f.brief
             for f in fit.findings
-            if f.bad and f.brief and f.code.partition(".")[0] in _SPEAK_AGAINST
+            if f.bad and f.brief and f.code.partition(".")[0] in _DOUBTFUL_TOPICS
         ]
-        told = [f"In the record {against[0]}" if against else "No finding speaks against the model"]
+        statements = [
+            f"In the record {doubts[0]}" if doubts else "No finding speaks against the model"
+        ]
         for agreement, how in (
             (fit.metrics, "simulated"),
             (fit.one_step, "one step ahead"),
@@ -252,9 +254,9 @@ def lines(fit: Fit) -> tuple[Line, Line, Line]:
             shares = {n: m.vaf for n, m in agreement.items() if math.isfinite(m.vaf)}
             if shares:
                 worst = min(shares, key=lambda n: shares[n])
-                told.append(f"VAF of {worst} {vaf_percent(shares[worst])} {how}")
-        kind, word = ("warning", "Adequate, with doubts") if against else ("good", "Adequate")
-        adequate = Line(kind, word, f"{'; '.join(told)}.")
+                statements.append(f"VAF of {worst} {vaf_percent(shares[worst])} {how}")
+        kind, word = ("warning", "Adequate, with doubts") if doubts else ("good", "Adequate")
+        adequate = Line(kind, word, f"{'; '.join(statements)}.")
     return Line("good", "Converged", reached), determined, adequate
 
 

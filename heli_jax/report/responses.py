@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from heli_jax.analysis.attitude_responses import Handling
-from heli_jax.analysis.flight_responses import FlightResponses, Pair, Wanted, decays_within
+from heli_jax.analysis.flight_responses import FlightResponses, Pair, TransferRequest, decays_within
 from heli_jax.analysis.spectra import COHERENT
 from heli_jax.analysis.transfer_fit import Coefficient, TransferFit
 from heli_jax.finding import as_data
@@ -98,7 +98,7 @@ def write_responses(
     (directory / "responses.html").write_text(page, encoding="utf-8")
 
 
-def _averages(responses: FlightResponses, request: Wanted) -> str:
+def _averages(responses: FlightResponses, request: TransferRequest) -> str:
     """Return the number of averages of a fitted response as text."""
     output = responses.outputs.get(request.output)
     return NOTHING if output is None else number(output.averages, 3)
@@ -158,7 +158,7 @@ def transfer_status(fit: TransferFit | str) -> str:
     return "converged" if known else "not-identifiable"
 
 
-def _content(request: Wanted, fit: TransferFit | str, window: float) -> dict[str, Any]:
+def _content(request: TransferRequest, fit: TransferFit | str, window: float) -> dict[str, Any]:
     """Return an entry of transfer_functions.json."""
     status, found = transfer_status(fit), None if isinstance(fit, str) else fit
     numerator: list[dict[str, float]] = [{}] * (request.zeros + 1)
