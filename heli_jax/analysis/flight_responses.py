@@ -322,8 +322,12 @@ def _own(records: Sequence[np.ndarray], dt: float, omega: np.ndarray, window: fl
     length, power = round(window / dt), 0.0
     for record in records:
         # Without the best straight line, since a drift would leak into the lowest frequencies.
-        hann = np.hanning(length)
-        S = welch(record, window=hann, noverlap=length // 2, detrend="linear")[1]
+        S = welch(
+            record,
+            window=np.hanning(length),  # pyright: ignore[reportArgumentType]
+            noverlap=length // 2,
+            detrend="linear",
+        )[1]
         power = power + S * (1 + (record.shape[1] - length) // (length - length // 2))
     own = np.stack([is_own(S) for S in np.atleast_2d(power)])
     return own[
