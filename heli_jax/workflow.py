@@ -15,7 +15,7 @@ from heli_jax import config as configuration
 from heli_jax import run_directory
 from heli_jax.analysis.flight_responses import Settings
 from heli_jax.config import Experiment
-from heli_jax.config.frequency import asked_handling, missing_handling
+from heli_jax.config.frequency import missing_handling, requested_handling
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.errors import InputError, located, require_kind
 from heli_jax.finding import Finding, note, without_repeats
@@ -343,7 +343,7 @@ def compare_models(
         return choose(candidates.problems, candidates.nested, progress=progress)
 
 
-def write_report(run: FitRun, out: str | Path) -> FitRun:
+def write_report(run: FitRun, out: str | Path, *, page: bool = True) -> FitRun:
     """Write a fit's run directory: config.yaml, fit.json, signals.csv, report.html, figures/.
 
     It also writes posterior.nc and bootstrap.nc if there are NUTS draws and bootstrap samples. The
@@ -352,16 +352,17 @@ def write_report(run: FitRun, out: str | Path) -> FitRun:
 
     Args:
         run: result of `run_fit`.
+        page: False for no page and no figures, which take seconds.
 
     Raises:
         InputError: `out` cannot be written to, or the extra `bayes` is missing.
         TypeError: `run` is no FitRun.
     """
     require_kind("run", run, FitRun, "a FitRun, as heli_jax.run_fit(config) returns it")
-    return _write(run, run_directory.free_directory(Path(out)))
+    return _write(run, run_directory.free_directory(Path(out)), page=page)
 
 
-def _write(run: FitRun, out: Path, *, replaces: bool = False) -> FitRun:
+def _write(run: FitRun, out: Path, *, replaces: bool = False, page: bool = True) -> FitRun:
     """Write the run directory; `replaces` overwrites the earlier one of this run."""
     from heli_jax.report.fit_page import Analysis
     from heli_jax.report.fit_page import write_report as write_page
@@ -371,7 +372,7 @@ def _write(run: FitRun, out: Path, *, replaces: bool = False) -> FitRun:
     started = time.perf_counter()
     # Before the figures, since a configuration that cannot be written fails at once.
     text = as_yaml(configuration.resolved(run.config))
-    vehicle, extra = run.config.vehicle, _with_responses(run)
+    vehicle, extra = run.config.vehicle, _with_responses(run) if page else run.supplementary
     with run_directory.whole(out, replaces=replaces, or_beside=not replaces) as folder:
         (folder / "config.yaml").write_text(text, encoding="utf-8")
         files.write_signals(folder / "signals.csv", run.fit.signals)
@@ -382,7 +383,8 @@ def _write(run: FitRun, out: Path, *, replaces: bool = False) -> FitRun:
         made = origin(text, ("config.yaml", "fit.json", "signals.csv", *corrections, *sampled))
         write_samples(folder, run.fit, extra.intervals, made, str(run.config.path))
         png = run.config.config.report.png
-        write_page(folder, analysis, title, vehicle.constants, made, png=png)
+        if page:
+            write_page(folder, analysis, title, vehicle.constants, made, png=png)
         run.fit.timing["report"] = time.perf_counter() - started
         # fit.json comes last, since it holds the times of all other steps.
         run.fit.timing["total"] = time.perf_counter() - run.began
@@ -401,7 +403,7 @@ def _with_responses(run: FitRun) -> SupplementaryAnalyses:
     points = options.points or Settings().points
     settings = Settings(options.band, options.window, points)
     logged = {n for f in run.problem.training for n in f.outputs}
-    requested = asked_handling(run.config, logged)
+    requested = requested_handling(run.config, logged)
     responses = fitted_responses(run.fit, run.problem, settings, requested)
     gaps = missing_handling(run.config, logged)
     responses = responses._replace(notes=(*responses.notes, *gaps))

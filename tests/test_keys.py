@@ -62,7 +62,7 @@ def test_the_schema_and_the_checker_of_configurations_agree(
     at[names[-1]] = content
     assert (not problems(config)) == valid
     try:
-        Config.model_validate(copy.deepcopy(config))
+        Config.checked(copy.deepcopy(config))
         accepted = True
     except ValueError:
         accepted = False

@@ -11,7 +11,7 @@ import scipy.signal
 import xarray as xr
 
 from heli_jax.analysis.attitude_responses import handling_gaps
-from heli_jax.analysis.flight_responses import Pair, Settings, Wanted, flight_responses
+from heli_jax.analysis.flight_responses import Pair, Settings, TransferRequest, flight_responses
 from heli_jax.analysis.transfer_fit import Measured, TransferFit, fit_transfer
 from heli_jax.cli import main
 from heli_jax.dynamics.model import Axis
@@ -117,7 +117,7 @@ def test_a_transfer_function_without_all_of_its_numbers_is_not_converged():
     s = 1j * np.geomspace(0.5, 30.0, 60)
     H = 12.0 / (s + 3.0)
     at = Measured(s.imag, H, 0.02 * np.abs(H), 1e3, np.full(60, 0.95))
-    wanted = [Wanted("lat", "p", 0, poles) for poles in (1, 3)]
+    wanted = [TransferRequest("lat", "p", 0, poles) for poles in (1, 3)]
     enough, more = (_content(w, fit_transfer(at, w.zeros, w.poles), 20.0) for w in wanted)
     assert (enough["status"], enough["converged"]) == ("converged", True)
     assert {} in more["denominator"]
@@ -281,7 +281,7 @@ def test_flights_of_two_rates_are_refused():
 
 def test_an_order_that_is_too_low_is_called_so():
     quick = [flight(s) for s in range(2)]
-    wanted = Wanted("lat", "p", 0, 1, delay=False)
+    wanted = TransferRequest("lat", "p", 0, 1, delay=False)
     [(_, fit)] = flight_responses(quick, Settings(window=10.0, transfer_functions=(wanted,))).fits
     assert isinstance(fit, TransferFit)
     assert fit.chi_squared < 2.0

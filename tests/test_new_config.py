@@ -13,13 +13,12 @@ from heli_jax.config.schema import Config
 from heli_jax.errors import InputError
 from heli_jax.flights.channel_names import quantity_of_output, words_in
 from heli_jax.flights.log import ChannelLog, Topic
-from heli_jax.new_config import scales, tables, write_config
+from heli_jax.new_config import tables, write_config
 from heli_jax.new_config.guess import (
     Series,
     by_motion,
     by_name,
     by_number,
-    full_travel,
     may_be,
     without_unit,
     words_of,
@@ -337,17 +336,13 @@ def test_px4_says_what_vehicle_it_is(name: str, values, is_other: bool) -> None:
 def test_sticks_that_count_to_their_stops() -> None:
     values = np.round(np.linspace(-274, 270, 50))
 
-    def stick(name: str, full: float | None = None) -> tuple[str, float | str]:
-        found = scaled(name, Series(np.arange(50.0), values), "1", full)
+    def stick(name: str) -> tuple[str, float | str]:
+        found = scaled(name, Series(np.arange(50.0), values), "1")
         return found.unit, found.scale
 
-    # Betaflight's commands are in steps of pulse widths; a radio's stick shows its range at one
-    # stop.
+    # Betaflight's commands are in steps of pulse widths.
     assert stick("rcCommand[0]") == ("1", 1 / 500)
     assert stick("Ail") == ("1", 0.001)
-    thr = Series(np.arange(50.0), np.where(np.arange(50) < 9, -1024.0, values))
-    assert stick("Ail", full_travel({"Ail": thr, "Thr": thr})) == ("1", 1 / 1024)
-    assert full_travel({"x": Series(np.arange(50.0), values)}) is None
     # Whole numbers are not rad/s, however small.
     rate = Series(np.arange(50.0), np.round(np.linspace(-5, 6, 50)))
     assert scaled("gyroADC[0]", rate, "rad/s").unit == "deg/s"
@@ -519,37 +514,14 @@ def test_numbered_channels_are_guesses_and_what_follows_one_goes_before(tmp_path
     assert "rollspeed follows it" in taken
 
 
-def test_counts_of_a_converter_are_no_degrees() -> None:
-    counts = Series(T, np.rint(2048 + 300 * np.sin(3 * T)))
-    for si in ("rad", "rad/s"):
-        found = scales.scaled("gyro_x_raw", counts, si)
-        assert (found.unit, found.scale, found.offset) == (si, "EDIT", pytest.approx(2048, abs=150))
-    # A heading in whole degrees or a rotor speed is not a stick.
-    heading = Series(T, np.rint(200 + 90 * np.sin(3 * T)))
-    assert scales.scaled("heading", heading, "rad").unit == "deg"
-    assert scales.scaled("headspeed", counts, "rad/s").scale == 1.0
-
-
-def test_columns_that_cannot_be_read_are_named_where_they_would_be_a_signal(
-    tmp_path: Path,
-) -> None:
-    t = 0.01 * np.arange(400)
-    u, p = np.sign(np.sin(3 * t)), np.cos(3 * t)
-    cells = zip(t, u, p, strict=True)
-    rows = [f"{a:.2f},{b:.4f},{c:.4f},{7 * c:.4f},{c:.4f} deg,{b}" for a, b, c in cells]
-    log = tmp_path / "log.csv"
-    log.write_text("\n".join(["time,aileron,p,P,roll,mode", *rows]) + "\n")
-    written = write_config(log, tmp_path / "c.yaml", model="linear:roll-flybarless")
-    assert [n.subjects for n in written.notes if n.code == "channels.left-out"] == [("roll",)]
-    # With P and p, the one with the model's name is chosen.
-    text = (tmp_path / "c.yaml").read_text()
+def test_of_letters_that_differ_in_case_the_model_s_own_is_taken(tmp_path: Path) -> None:
+    columns = {"time": T, "aileron": STICK, "p": RATE, "P": 7.0 * RATE}
+    log, out = write(tmp_path / "log.csv", columns), tmp_path / "c.yaml"
+    write_config(log, out, model="linear:roll-flybarless")
+    text = out.read_text()
     assert "p: {signal: p, unit: rad/s}" in text
     # Fixed parameters have another vehicle's values.
     assert "    # tau_f: {start: 0.04631}" in text
-    log.write_text("\n".join(["time,aileron,p,p,roll,mode", *rows]) + "\n")
-    written = write_config(log, tmp_path / "d.yaml", model="linear:roll-flybarless")
-    left_out = [n.subjects for n in written.notes if n.code == "channels.left-out"]
-    assert ("p",) in left_out
 
 
 def test_a_latitude_is_no_lateral_stick() -> None:
@@ -568,15 +540,3 @@ def test_a_latitude_is_no_lateral_stick() -> None:
     sticks = log(lat=stick, lon=0.2 + stick, rc__lat=1500 + 5 * stick, rc__lon=1500 + 0 * stick)
     assert not [name for name in sticks if is_place(name, sticks)]
     assert is_place("lat", log(lat=514234567 + 900 * stick))
-
-
-def test_counts_of_a_serial_bus_are_no_pulse_widths() -> None:
-    stick = Series(T, np.rint(992.0 + 250.0 * np.sin(T)))
-    found = scaled("ch1", stick, "1")
-    assert found.offset == 992.0
-    assert found.scale == pytest.approx(1.0 / 819.5)
-    assert "S.BUS" in found.remarks[0]
-    assert scaled("sbus_ch1", Series(T, np.rint(992.0 + 800.0 * np.sin(T))), "1").offset == 992.0
-    # The centre of pulse widths is 1500, also if a throttle stays below.
-    assert "pulse" in scaled("ch1", Series(T, np.rint(1500.0 + 300.0 * np.sin(T))), "1").remarks[0]
-    assert "pulse" in scaled("thr", Series(T, np.rint(1250.0 + 90.0 * np.sin(T))), "1").remarks[0]

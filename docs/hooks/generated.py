@@ -147,7 +147,8 @@ def _cell(text: str) -> str:
 
 
 def _keys() -> str:
-    from heli_jax.config.keys import Key, keys
+    from heli_jax.config.keys import keys
+    from heli_jax.schema_keys import Key
 
     def entry(key: Key) -> str:
         default = "**has to be there**" if key.default is None else f"default `{key.default}`"
@@ -166,7 +167,8 @@ def _keys() -> str:
 
 
 def _fit_keys() -> str:
-    from heli_jax.report.document import Key, fit_keys
+    from heli_jax.report.document import fit_keys
+    from heli_jax.schema_keys import Key
 
     def entry(key: Key) -> str:
         words = f"<br>{_cell(key.meaning)}" if key.meaning else ""

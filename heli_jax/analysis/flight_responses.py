@@ -30,7 +30,6 @@ from heli_jax.analysis.spectra import (
     cross_spectra,
     is_own,
     octave_mean,
-    segment_transforms,
 )
 from heli_jax.analysis.transfer_fit import Hold, Measured, TransferFit, fit_transfer
 from heli_jax.finding import Finding, note, sentences
@@ -67,7 +66,7 @@ class Windows(NamedTuple):
     """Length of a window [s]."""
 
 
-class Wanted(NamedTuple):
+class TransferRequest(NamedTuple):
     """A transfer function to fit to one response."""
 
     input: str
@@ -90,7 +89,7 @@ class Settings(NamedTuple):
     """Length [s]; None: a fifth of the longest flight, at most 30 s."""
     points: int = 120
     """Number of frequencies, equally spaced in the logarithm."""
-    transfer_functions: tuple[Wanted, ...] = ()
+    transfer_functions: tuple[TransferRequest, ...] = ()
 
 
 class Pair(NamedTuple):
@@ -132,7 +131,7 @@ class FlightResponses(NamedTuple):
     """Inputs whose responses use a logged excitation."""
     window: float
     """Length of a window [s]."""
-    fits: tuple[tuple[Wanted, TransferFit | str], ...]
+    fits: tuple[tuple[TransferRequest, TransferFit | str], ...]
     """Fits in the requested order; a text gives the reason why one is missing."""
     holds: dict[str, Hold]
     """Hold of each input between samples."""
@@ -186,7 +185,6 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
         raise ValueError("; ".join(sentences(without[:_MOST_SAID])))
     notes += without
     notes += _moving_as_one(flights, inputs, outputs)
-    notes += _weak(omega, instruments, outputs)
     holds = {n: Hold(flights[0].hold[n], dt) for n in inputs}
     fits = _fits(settings, outputs, windows, holds)
     return FlightResponses(omega, outputs, instruments, window, fits, holds, tuple(notes))
@@ -272,28 +270,6 @@ def _moving_as_one(
     return [Finding("excitation.inputs-as-one", "doubt", words, subjects=tuple(those))]
 
 
-def _weak(
-    omega: np.ndarray, instruments: tuple[str, ...], outputs: dict[str, Output]
-) -> list[Finding]:
-    """Return notes on frequencies at which an instrument hardly moves its input."""
-    notes = []
-    for name in instruments:
-        pairs = [output.pairs[name] for output in outputs.values()]
-        weak = np.all([np.isfinite(p.coherence) & ~np.isfinite(p.sd) for p in pairs], axis=0)
-        if not weak.any():
-            continue
-        hz, at = omega / (2.0 * np.pi), np.flatnonzero(weak)
-        runs = np.split(at, np.flatnonzero(np.diff(at) > 1) + 1)
-        bands = ", ".join(f"{hz[run[0]]:.3g} to {hz[run[-1]]:.3g} Hz" for run in runs)
-        words = (
-            f"{name}: at {at.size} of {omega.size} frequencies ({bands}) feedback and pilot move "
-            "the input far more than the excitation does: these have no response; use a larger "
-            "or longer excitation"
-        )
-        notes.append(note("excitation.weak-instrument", words, name, value=at.size))
-    return notes
-
-
 def _outputs(
     windows: Windows, dt: float, names: tuple[Names, list[str]], steps: np.ndarray
 ) -> dict[str, Output]:
@@ -340,12 +316,20 @@ def _own(records: Sequence[np.ndarray], dt: float, omega: np.ndarray, window: fl
     Elsewhere its spectrum comes from the window's sidelobes, which are coherent too. Two low-passed
     signals would show a response far above their filters.
     """
-    length = round(window / dt)
-    power = 0.0
+    # Imported on demand: it is slow.
+    from scipy.signal import welch
+
+    length, power = round(window / dt), 0.0
     for record in records:
-        of_record = segment_transforms(record, dt, length)
-        power = power + np.sum(np.abs(of_record.X) ** 2, axis=1)
-    own = np.stack([is_own(S) for S in np.transpose(power)])
+        # Without the best straight line, since a drift would leak into the lowest frequencies.
+        S = welch(
+            record,
+            window=np.hanning(length),  # pyright: ignore[reportArgumentType]
+            noverlap=length // 2,
+            detrend="linear",
+        )[1]
+        power = power + S * (1 + (record.shape[1] - length) // (length - length // 2))
+    own = np.stack([is_own(S) for S in np.atleast_2d(power)])
     return own[
         :, np.clip(np.round(omega * dt * length / (2.0 * np.pi)).astype(int), 0, own.shape[1] - 1)
     ]
@@ -374,7 +358,7 @@ def _fits(
     outputs: dict[str, Output],
     windows: dict[str, Windows],
     holds: dict[str, Hold],
-) -> tuple[tuple[Wanted, TransferFit | str], ...]:
+) -> tuple[tuple[TransferRequest, TransferFit | str], ...]:
     """Return the fitted transfer functions, or the reason why one cannot be fitted."""
     fits = []
     for request in settings.transfer_functions:
@@ -392,7 +376,7 @@ def _fits(
 
 
 def _fitted(
-    request: Wanted, output: Output, windows: Windows, holds: dict[str, Hold]
+    request: TransferRequest, output: Output, windows: Windows, holds: dict[str, Hold]
 ) -> TransferFit:
     omega, pair = windows.omega, output.pairs[request.input]
     hz = omega / (2.0 * np.pi)

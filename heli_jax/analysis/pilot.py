@@ -50,11 +50,8 @@ class Pilot(NamedTuple):
         return naming.replace(inputs, **commands)
 
 
-def attitude_hold(model: Model, params: Any, trimmed: Trim, pace: float = PACE) -> Pilot:
+def attitude_hold(model: Model, params: Any, trimmed: Trim) -> Pilot:
     """Return the pilot that holds attitude and heading of `trimmed`, for concrete parameters.
-
-    Args:
-        pace: least decay rate of every attitude mode [1/s].
 
     Raises:
         ValueError: the sticks do not control the whole attitude.
@@ -79,7 +76,7 @@ def attitude_hold(model: Model, params: Any, trimmed: Trim, pace: float = PACE) 
         raise ValueError(f"the sticks of {model.name} do not move all of its attitude")
     # Sticks are scaled to equal effect, since a metre of cyclic and full yaw stick are not
     # comparable.
-    K = _least_energy(A, B / size, pace) / size[:, None]
+    K = _least_energy(A, B / size) / size[:, None]
     gains = {
         stick: {name: jnp.asarray(K[i, j]) for j, name in enumerate(states)}
         for i, stick in enumerate(sticks)
@@ -88,16 +85,16 @@ def attitude_hold(model: Model, params: Any, trimmed: Trim, pace: float = PACE) 
 
 
 def _least_energy(
-    A: Float[np.ndarray, "n n"], B: Float[np.ndarray, "n m"], pace: float
+    A: Float[np.ndarray, "n n"], B: Float[np.ndarray, "n m"]
 ) -> Float[np.ndarray, "m n"]:
-    """Return the gains K of u = -K x that speed up modes slower than `pace` with the least u.
+    """Return the gains K of u = -K x that speed up modes slower than `PACE` with the least u.
 
     Only those modes z = W x matter: P is W^T X^-1 W with X from Lyapunov's equation.
     """
     import scipy.linalg  # simulations without a pilot need not wait for it
 
-    # A decay faster than `pace` is stability of the shifted system.
-    shifted = A + pace * np.eye(A.shape[0])
+    # A decay faster than `PACE` is stability of the shifted system.
+    shifted = A + PACE * np.eye(A.shape[0])
     # Schur vectors are orthogonal, while eigenvectors of equal modes nearly coincide.
     schur: Any = scipy.linalg.schur(shifted.T, sort="rhp")  # three with `sort`, which stubs ignore
     T, Z, k = schur

@@ -73,31 +73,6 @@ class Spectra(NamedTuple):
         return np.conj(np.swapaxes(self.X, 1, 2)) @ self.X / self.X.shape[1]
 
 
-def segment_transforms(signals: Float[np.ndarray, "c N"], dt: float, length: int) -> Spectra:
-    """Transform half-overlapping, detrended Hann segments (Welch 1967) to length // 2 + 1 lines.
-
-    Args:
-        dt: time between samples [s].
-        length: samples of a segment, at most N.
-    """
-    segments = np.lib.stride_tricks.sliding_window_view(signals, length, axis=1)
-    # The next segment begins at the second half of this one.
-    segments = segments[:, :: length - length // 2]
-    # Remove the best straight line, since a drift would leak into the lowest frequencies. With t
-    # symmetric about zero, slope and mean are independent.
-    t, window = np.linspace(-1.0, 1.0, length), np.hanning(length)
-    slopes = (segments @ t / (t @ t))[..., None]
-    segments = (segments - segments.mean(axis=-1, keepdims=True) - slopes * t) * window
-    X = np.moveaxis(np.fft.rfft(segments, axis=-1), -1, 0).swapaxes(1, 2)
-    # Zero frequency and, for even lengths, the Nyquist frequency have no negative counterpart.
-    twins = np.full(len(X), 2.0)
-    twins[[0] if length % 2 else [0, -1]] = 1.0
-    X = X * np.sqrt(twins * dt / np.sum(window**2))[:, None, None]
-    omega = 2.0 * np.pi * np.fft.rfftfreq(length, dt)
-    averages = _independent(window, length - length // 2, X.shape[1])
-    return Spectra(omega, X, averages, length * dt)
-
-
 def octave_mean(
     omega: Float[np.ndarray, " k"], coherence: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, " k"]:

@@ -128,7 +128,6 @@ def equilibrium(
     params: Any,
     condition: Condition = HOVER,
     wind: tuple[Any, Any, Any] = (0.0, 0.0, 0.0),
-    power_off: bool = False,
 ) -> Trim:
     """Return the trim from one start, without the errors of `trim`: for jit, vmap and derivatives.
 
@@ -138,8 +137,8 @@ def equilibrium(
 
     Check `residual`: if it is not small (such as 1e-10), there is no trim.
     """
-    steady = _require(model, power_off)
-    return _equilibrium(model, params, condition, wind, jnp.zeros(len(steady.unknowns)), power_off)
+    offset = jnp.zeros(len(_require(model).unknowns))
+    return _equilibrium(model, params, condition, wind, offset, power_off=False)
 
 
 @eqx.filter_jit

@@ -710,6 +710,7 @@ def _new(options: argparse.Namespace) -> int:
 def _keys(options: argparse.Namespace) -> int:
     from heli_jax.config import keys
     from heli_jax.report import document
+    from heli_jax.schema_keys import matching
 
     if options.schema is not None:
         place = Path(options.schema)
@@ -718,21 +719,20 @@ def _keys(options: argparse.Namespace) -> int:
             temporary.write_text(f"{text}\n", encoding="utf-8")
         options.say(f"wrote {place}")
         return DONE
-    matching = document.matching if options.fit else keys.matching
-    found = matching(options.pattern or "")
+    found = matching(document.fit_keys() if options.fit else keys.keys(), options.pattern or "")
     if options.json:
         print(json.dumps([key._asdict() for key in found], indent=1))
         return DONE
     if not found:
         hint = ""
-        if not options.fit and document.matching(options.pattern):
+        if not options.fit and matching(document.fit_keys(), options.pattern):
             hint = f"; it is a key of fit.json: heli-jax keys --fit {shlex.quote(options.pattern)}"
         raise InputError(f"keys: no key and no meaning contains {options.pattern}{hint}")
     # Longer lines are hard to read.
     width, indent = min(shutil.get_terminal_size().columns, 100), "    "
     for key in found:
-        default = getattr(key, "default", "")
-        default = "has to be there" if default is None else default and f"default {default}"
+        default = key.default and f"default {key.default}"
+        default = "has to be there" if default is None else default
         # A default of null means only that the key may be left out.
         default = "optional" if default == "default null" else default
         head = "; ".join(filter(None, (f"{key.path}: {key.kind}", default)))

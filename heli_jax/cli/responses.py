@@ -10,11 +10,16 @@ from heli_jax.analysis.attitude_responses import (
     Handling,
     measured_handling,
 )
-from heli_jax.analysis.flight_responses import FlightResponses, Settings, Wanted, flight_responses
+from heli_jax.analysis.flight_responses import (
+    FlightResponses,
+    Settings,
+    TransferRequest,
+    flight_responses,
+)
 from heli_jax.analysis.spectra import COHERENT, octave_mean
 from heli_jax.cli.terminal import print_page_table, print_table, print_text
 from heli_jax.config.experiment import Experiment, resolved
-from heli_jax.config.frequency import asked_handling, check_pairs, missing_handling, units_of
+from heli_jax.config.frequency import check_pairs, missing_handling, requested_handling, units_of
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.logs import read_flights, with_log
 from heli_jax.errors import InputError, located
@@ -48,11 +53,11 @@ def responses_of_log(
     """
     experiment = experiment if log is None else with_log(experiment, log)
     config = experiment.config.frequency or FrequencyConfig()
-    requests = tuple(Wanted(**dict(t)) for t in config.transfer_functions)
+    requests = tuple(TransferRequest(**dict(t)) for t in config.transfer_functions)
     points = config.points or Settings().points
     settings = Settings(config.band, config.window, points, requests)
     check_pairs(experiment, "transfer_functions", config.transfer_functions)
-    asked_handling(experiment)  # before the logs are read
+    requested_handling(experiment)  # before the logs are read
     flights = read_flights(experiment)
     for found in (n for f in flights for n in (f.source.notes if f.source else ())):
         progress(Note(found.sentence))
@@ -166,7 +171,7 @@ def run_responses(
 
     responses = responses_of_log(experiment, log, say)
     # Axes that did not move need no message unless they were requested by name.
-    requested = asked_handling(experiment, responses.outputs)
+    requested = requested_handling(experiment, responses.outputs)
     named = (experiment.config.frequency or FrequencyConfig()).handling is not None
     handling = [
         Handling(pair, None, measured_handling(responses, pair))

@@ -72,7 +72,7 @@ def read_corrections(path: Path, where: str) -> Corrections:
     """
     content = read_mapping(path)
     try:
-        return Corrections.model_validate(content)
+        return Corrections.checked(content)
     except pydantic.ValidationError as e:
         error = e.errors()[0]
         place = ".".join(str(part) for part in error["loc"])

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pydantic
-from pydantic import BaseModel
 from pydantic_core import ErrorDetails
 
 from heli_jax import models, naming
-from heli_jax.config.keys import expected
+from heli_jax.config.keys import json_schema
 from heli_jax.config.kinematics import completed
 from heli_jax.config.measurement import OpenedLogs, with_measurement
 from heli_jax.config.onboard import with_onboard
@@ -22,6 +21,7 @@ from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, VehicleError, located, nearest, require_kind, require_known
 from heli_jax.linear_models.read import LinearModel, is_shipped, linear_model
+from heli_jax.schema_keys import expected, known_keys
 from heli_jax.vehicle import Vehicle, constant, read_vehicle, vehicle_from_mapping
 from heli_jax.yaml_file import EDIT, parse_value, read_mapping
 
@@ -222,7 +222,7 @@ def _index(at: list[Any], name: str, where: str) -> int:
 
 def _validated(content: dict[str, Any], where: str) -> Config:
     try:
-        config = Config.model_validate(content)
+        config = Config.checked(content)
     except pydantic.ValidationError as e:
         # For a key with several allowed kinds pydantic reports errors of each; those of the actual
         # kind are useful. An unknown key comes first, because it is the likeliest cause of the
@@ -269,17 +269,18 @@ def _is_of_another_kind(error: ErrorDetails) -> bool:
 def _sentence(error: ErrorDetails) -> str:
     place = _place(error["loc"])
     value = error.get("input")
+    # pydantic inserts members of unions.
+    keys = [part for part in error["loc"] if not _KIND.fullmatch(str(part))]
     if error["type"] == "extra_forbidden":
         # Only keys of the same section are useful suggestions.
-        known = _known_keys(error["loc"])
-        return f"{place}: unknown key{nearest(str(error['loc'][-1]), known)}"
+        known = known_keys(json_schema(), keys[:-1])
+        return f"{place}: unknown key{nearest(str(keys[-1]), known)}"
     if error["type"] == "missing":
         return f"{place}: missing"
     if value == EDIT:
         return _edit_words(error["loc"])
     if _is_of_another_kind(error):
-        kind = expected([part for part in error["loc"] if not _KIND.fullmatch(str(part))])
-        return f"{place}: got {value!r:.60}, expected {kind}"
+        return f"{place}: got {value!r:.60}, expected {expected(json_schema(), keys)}"
     # pydantic's sentence without its beginning becomes part of ours: "Input should be ...".
     message = str(error["msg"]).removeprefix("Value error, ")
     message = message[0].lower() + message[1:]
@@ -317,32 +318,6 @@ def _place(loc: tuple[int | str, ...]) -> str:
         elif not _KIND.fullmatch(part):
             text += f".{part}" if text else str(part)
     return text or "the configuration"
-
-
-def _known_keys(loc: tuple[int | str, ...]) -> list[str]:
-    """Return the known keys of the section that contains an unknown key."""
-    section: Any = Config
-    for part in loc[:-1]:
-        if isinstance(part, int):
-            continue
-        fields = getattr(section, "model_fields", None)
-        # A user's own name, such as a parameter below `free`, is in no section. The section is then
-        # that of the mapping's values.
-        if fields is None or part not in fields:
-            continue
-        section = _section(fields[part].annotation) or section
-    return list(section.model_fields)
-
-
-def _section(annotation: Any) -> Any:
-    """Return the configuration class within an annotation such as list[FlightConfig] | None."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    for inner in getattr(annotation, "__args__", ()):
-        section = _section(inner)
-        if section is not None:
-            return section
-    return None
 
 
 def _vehicle(config: Config, path: Path, model: Model) -> Vehicle:

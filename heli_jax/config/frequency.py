@@ -10,7 +10,7 @@ from heli_jax.errors import InputError, require_known
 from heli_jax.finding import Finding, note
 
 
-def asked_handling(
+def requested_handling(
     experiment: Experiment, logged: Collection[str] = ()
 ) -> tuple[HandlingPair, ...]:
     """Return the responses for handling qualities: those configured, or those of the model's axes.

@@ -15,7 +15,6 @@ from heli_jax.config.kinematics import between_samples, prepared
 from heli_jax.config.measurement import (
     coloured_noise_cautions,
     filter_cautions,
-    unfiltered_cautions,
 )
 from heli_jax.config.preset_signals import Resolved, resolve
 from heli_jax.config.schema import (
@@ -133,7 +132,6 @@ def _read_flight(experiment: Experiment, i: int, f: FlightConfig, gain: bool) ->
     first, *others = _treated(experiment, flights, f, where)
     cautions = (
         *filter_cautions(first.source, everything.outputs),
-        *unfiltered_cautions(first, everything.outputs),
         *(coloured_noise_cautions(first, experiment.model) if _noise_given(experiment) else ()),
         *_pulse_width_doubts(first),
         *vibration_notes(experiment, first, f, where),

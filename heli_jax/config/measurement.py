@@ -2,34 +2,23 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from heli_jax import naming
 from heli_jax.config.firmware_filters import LoggedFilters, logged_filters
 from heli_jax.config.onboard import FROM_LOG
 from heli_jax.config.schema import FlightConfig, OutputConfig
 from heli_jax.dynamics.model import Model
-from heli_jax.dynamics.onboard.filters import Filter, cutoff, gain, with_filters
+from heli_jax.dynamics.onboard.filters import Filter, cutoff, with_filters
 from heli_jax.errors import InputError, located, nearest
 from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.log import ChannelLog, Table, shown
 from heli_jax.flights.open_log import open_log
-from heli_jax.flights.signal_facts import quantum
 from heli_jax.identification.defaults import filtered_noise
-from heli_jax.numbers import percent
 
 type _Channel = tuple[tuple[Filter, ...], float]
-
-
-_MOST = 2 * 10**8
-"""Largest total size of files kept open [bytes]; a larger one is parsed again to save memory."""
-
-type _Key = tuple[str, int | None, int, int]
 
 
 class OpenedLogs:
@@ -39,7 +28,7 @@ class OpenedLogs:
     """
 
     def __init__(self) -> None:
-        self._logs: dict[_Key, Table | ChannelLog] = {}
+        self._logs: dict[tuple[Path, int | None], Table | ChannelLog] = {}
 
     def __reduce__(self) -> tuple:
         # An experiment sent to another process reads its logs there.
@@ -55,35 +44,17 @@ class OpenedLogs:
         Raises:
             InputError: it cannot be read.
         """
-        key = _key(path, number)
-        if key not in self._logs:
-            log = open_log(path, number)
-            if log.size + sum(kept.size for kept in self._logs.values()) > _MOST:
-                return log
-            self._logs[key] = log
-        return self._logs[key]
+        if (path, number) not in self._logs:
+            self._logs[path, number] = open_log(path, number)
+        return self._logs[path, number]
 
     def get(self, path: Path, number: int | None) -> Table | ChannelLog | None:
-        """Return the log if it is open, else None.
-
-        Args:
-            path: path of the log.
-            number: number of the flight in a log of several, from 1.
-        """
-        return self._logs.get(_key(path, number))
+        """Return the log if it is open, else None; arguments as in `open`."""
+        return self._logs.get((path, number))
 
     def close(self) -> None:
         """Release all logs."""
         self._logs.clear()
-
-
-def _key(path: Path, number: int | None) -> _Key:
-    # With time and size, so that a rewritten log counts as another one.
-    try:
-        stat = path.stat()
-    except OSError:  # the reader reports the fault
-        return str(path.absolute()), number, 0, 0
-    return str(path.absolute()), number, stat.st_mtime_ns, stat.st_size
 
 
 def with_measurement(
@@ -233,81 +204,3 @@ def _not_modelled(name: str, output: OutputConfig, logged: LoggedFilters) -> Fin
 
 def _short(setting: str) -> str:
     return setting if len(setting) <= 48 else f"{setting[:45]}..."
-
-
-_BANDS = 12
-"""Number of frequency bands, of equal logarithmic width."""
-_LOWEST, _HIGHEST = 0.05, 0.4
-"""Lowest and highest frequency of the bands, relative to the rate. Below is motion; above,
-resampling removes the noise."""
-_LEFT, _THERE = 0.25, 0.6
-"""Largest power ratio of a faster to a slower band that the filter leaves, and smallest measured
-ratio."""
-_FOLDS = 20
-"""Multiples of the rate from which noise is aliased."""
-_ROUNDED = 10.0
-"""Smallest ratio of noise to the power of the log's rounding, which is white after any filter."""
-_SEGMENT, _FEWEST = 256, 1500
-"""Samples of a spectral segment, and fewest samples of a record, for an accuracy of 10 %."""
-
-
-def unfiltered_cautions(flight: Flight, outputs: Mapping[str, OutputConfig]) -> tuple[Finding, ...]:
-    """Return a doubt for each output whose noise did not pass its stated filter."""
-    doubts = []
-    for name, output in outputs.items():
-        filters = [f for f in _stated(flight, output) if f.kind != "notch"]
-        y = flight.outputs.get(name)
-        if not filters or y is None or y.size < _FEWEST or not np.isfinite(y).all():
-            continue
-        found = _unfiltered_bands(y, flight.dt, filters)
-        if found is not None:
-            slow, fast, there, left = found
-            words = (
-                f"{name}: its noise at {fast:.3g} Hz has {percent(there, 0)} of its power at "
-                f"{slow:.3g} Hz, but the stated low-pass of {cutoff(filters):.3g} Hz would leave "
-                f"{percent(left, 0)}. If it was logged before the filter, the fit makes the "
-                "vehicle too fast by the filter's lag; remove the filter and compare"
-            )
-            doubts.append(Finding("filters.not-passed", "doubt", words, there, "power", (name,)))
-    return tuple(doubts)
-
-
-def _stated(flight: Flight, output: OutputConfig) -> list[Filter]:
-    filters: list[Filter] = []
-    for config in output.filter or ():
-        if config.kind != FROM_LOG:
-            filters.append(config.filter)
-        elif flight.source is not None:
-            source = flight.source
-            logged = logged_filters(source.firmware, source.parameters, output.signal)
-            filters += logged.filters if logged else ()
-    return filters
-
-
-def _unfiltered_bands(
-    y: np.ndarray, dt: float, filters: list[Filter]
-) -> tuple[float, float, float, float] | None:
-    """Return the most significant pair of bands, or None if the noise was filtered.
-
-    The four values are their frequencies [Hz], the power of the faster over that of the slower
-    band, and the part that the filters leave.
-    """
-    from scipy.signal import welch
-
-    rate = 1.0 / dt
-    hz, power = welch(y, rate, nperseg=_SEGMENT)
-    edges = np.geomspace(_LOWEST, _HIGHEST, _BANDS + 1) * rate
-    folds = np.arange(-_FOLDS, _FOLDS + 1) * rate
-    # Medians, because vibration is in narrow lines.
-    rows = [(hz >= low) & (hz < high) for low, high in pairwise(edges)]
-    measured = np.array([np.median(power[row]) for row in rows if row.any()])
-    centre = np.array([np.mean(hz[row]) for row in rows if row.any()])
-    passed = np.array([np.sum(gain(filters, np.abs(c + folds)) ** 2) for c in centre])
-    rounding = quantum(y) ** 2 / 12.0 * 2.0 * dt
-    best = None
-    for i, j in zip(*np.triu_indices(centre.size, 1), strict=True):
-        there, left = measured[j] / measured[i], passed[j] / passed[i]
-        sure = left <= _LEFT and there >= _THERE and measured[j] >= _ROUNDED * rounding
-        if sure and (best is None or left < best[3]):
-            best = (float(centre[i]), float(centre[j]), float(there), float(left))
-    return best

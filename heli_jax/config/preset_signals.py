@@ -77,7 +77,7 @@ def resolve(
             inputs[name] = InputConfig(**_keys(chosen))
             origins["inputs", name] = search.origin(chosen)
     left: dict[str, str] = {}
-    for name in _wanted(model, stated, where):
+    for name in _requested_outputs(model, stated, where):
         if name in outputs or name in elsewhere:
             continue
         chosen, why = search.output(name)
@@ -111,7 +111,7 @@ def _pilot(onboard: OnboardConfig | None) -> set[str]:
     }
 
 
-def _wanted(model: Model, stated: SignalsConfig, where: str) -> tuple[str, ...]:
+def _requested_outputs(model: Model, stated: SignalsConfig, where: str) -> tuple[str, ...]:
     known = naming.names(model.Outputs)
     place, words = f"{where}.preset_outputs", f"model {model.name} has no output"
     require_known(stated.preset_outputs or (), known, place, words)

@@ -95,7 +95,7 @@ def read_study(
         InputError: something in the file or an option is wrong.
     """
     path = Path(path)
-    single, repeated = _told_apart(overrides)
+    single, repeated = _single_and_repeated(overrides)
     content = read_overridden(path, single)
     # A single override replaces an axis of the file, as for any other key.
     named = single if isinstance(single, Mapping) else [parse_override(t)[0] for t in single]
@@ -113,7 +113,7 @@ def read_study(
     return study
 
 
-def _told_apart(
+def _single_and_repeated(
     overrides: Sequence[str] | Mapping[str, Any],
 ) -> tuple[Sequence[str] | Mapping[str, Any], Axes]:
     """Return the overrides with one value, and the values by key of those given several times."""

@@ -1,22 +1,19 @@
 """`heli-jax new LOG`: a configuration made from a log, with its guesses marked."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from heli_jax import naming
 from heli_jax.errors import InputError
-from heli_jax.finding import LEFT_OUT, Finding, note
-from heli_jax.flights.log import shown
+from heli_jax.finding import Finding, note
 from heli_jax.flights.preset import fitting_presets
 from heli_jax.linear_models import read as linear_models
-from heli_jax.new_config import guess, tables, text
+from heli_jax.new_config import tables, text
 from heli_jax.new_config.logs import Log, read_log
 from heli_jax.new_config.model_choice import chosen_model, other_models, other_vehicle
 from heli_jax.new_config.rate import channels_of_preset, common_rate, rate_of_outputs
 from heli_jax.new_config.signals import (
-    names_of_input,
-    names_of_output,
     rate_by_angle,
     signals_of,
 )
@@ -79,7 +76,7 @@ def write_config(
         signals = signals._replace(filtered={c: words for c, words in named.items() if words})
     content = text.configuration(
         chosen=chosen,
-        log=_relative(Path(log), out),
+        log=_near(Path(log), out),
         time=read.time,
         flight=read.flight if read.several else None,
         preset=preset,
@@ -112,11 +109,6 @@ def write_config(
             "{signal: EDIT} by {constant: 0} if the stick was not moved"
         )
         notes.append(note("channels.lacking", words, *lacking))
-    if signals is not None:
-        absent = [n for n in naming.names(chosen.model.Outputs) if n not in signals.outputs]
-        absent = [n for n in absent if n not in signals.wandering]
-        called = {n: names_of_output(n) for n in absent} | {n: names_of_input(n) for n in lacking}
-        notes += _unread_notes((*lacking, *absent), called, read.unread)
     if vehicle_of_log := other_vehicle(read.autopilot):
         words = f"the log is of {vehicle_of_log}: check that the model fits it"
         notes.append(note("model.other-vehicle", words))
@@ -139,7 +131,7 @@ def _outputs(
     log: Log,
     signals: text.Signals | None,
 ) -> Sequence[str]:
-    """Return the log's channels for outputs (`asked` or all of the preset), else for inputs."""
+    """Return the log's channels for the requested outputs, or all outputs, else for the inputs."""
     if signals is not None:
         taken = signals.outputs or signals.inputs
         return [g.channel for g in taken.values() if g is not None]
@@ -162,18 +154,11 @@ def _rate(log: Log, outputs: Sequence[str]) -> float | None:
     return rate_of_outputs(log.series, outputs)
 
 
-def _relative(log: Path, out: Path) -> str:
-    """Return the log's path as in a configuration at `out`."""
-    # Relative if the log is beside or below the configuration, so that both can move together.
-    folder, path = out.absolute().parent.resolve(), log.absolute().resolve()
-    return str(path.relative_to(folder) if path.is_relative_to(folder) else path)
-
-
-def _near(vehicle: Path, out: Path) -> str:
-    """Return the vehicle file's path as in a configuration at `out`."""
-    # Relative too if the vehicle's folder is beside that of the configurations, so that both can
-    # move together.
-    folder, path = out.absolute().parent.resolve(), vehicle.absolute().resolve()
+def _near(file: Path, out: Path) -> str:
+    """Return the path of a log or a vehicle file as in a configuration at `out`."""
+    # Relative if it is below or beside the folder of the configuration, so that both can move
+    # together.
+    folder, path = out.absolute().parent.resolve(), file.absolute().resolve()
     close = folder.parent != Path(folder.anchor) and path.is_relative_to(folder.parent)
     together = close or path.is_relative_to(folder)
     return path.relative_to(folder, walk_up=True).as_posix() if together else str(path)
@@ -226,21 +211,3 @@ def _held(chosen: text.Chosen, free: Mapping[str, Any]) -> dict[str, float]:
     own = linear_models.linear_model(chosen.name["linear"]).vehicle().constants
     values = {name: constant.value for name, constant in own.items()}
     return {n: v for n, v in values.items() if v and n not in free and n not in _GRAVITY}
-
-
-_MOST = 4
-"""Most columns named."""
-
-
-def _unread_notes(
-    lacking: Collection[str], called: Mapping[str, Sequence[str]], unread: Mapping[str, str]
-) -> list[Finding]:
-    """Return notes on unreadable columns whose names match a missing signal."""
-    columns: dict[str, str] = {}
-    for signal in lacking:
-        for name in guess.by_name(called[signal], list(unread))[:1]:
-            columns.setdefault(name, signal)
-    return [
-        note(LEFT_OUT, f"{signal} may be the column {shown(name)}, which {unread[name]}", name)
-        for name, signal in list(columns.items())[:_MOST]
-    ]

@@ -234,16 +234,6 @@ def _finite(series: Series) -> tuple[np.ndarray, np.ndarray]:
     return series.times[good], series.values[good]
 
 
-def full_travel(sticks: Mapping[str, Series]) -> float | None:
-    """Return the count of a log's sticks at their stops, if one reached it; else None."""
-    for series in sticks.values():
-        values = series.values[np.isfinite(series.values)]
-        # EdgeTX radios count to 1024, in integers.
-        if values.size and np.max(np.abs(values)) == 1024.0 and are_whole(values):
-            return 1024.0
-    return None
-
-
 def are_whole(values: np.ndarray) -> bool:
     """True if samples (N,) are whole numbers."""
     return bool(np.all(values == np.rint(values)))

@@ -4,7 +4,6 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -43,8 +42,6 @@ class Log(NamedTuple):
     several: bool
     notes: Sequence[Finding] = ()
     """Notes on the parts of the log that are left out."""
-    unread: Mapping[str, str] = MappingProxyType({})
-    """Reasons by column of a table why it cannot be read."""
     autopilot: ChannelLog | None = None
     """The log itself with the firmware's settings, if topics have separate clocks."""
 
@@ -138,7 +135,7 @@ def _read_table(table: Table, rate: float | None) -> Log:
         words = shown(clock) if clock != ROWS else "the others"
         words = f"left out, because they are not as long as {words}: {listed}"
         notes += (note(LEFT_OUT, words, *others),)
-    return Log(table.path, table.format, series, time, None, False, notes, _unread(table, info))
+    return Log(table.path, table.format, series, time, None, False, notes)
 
 
 def _require_whole_clock(table: Table, info: LogInfo) -> None:
@@ -150,18 +147,6 @@ def _require_whole_clock(table: Table, info: LogInfo) -> None:
         if c.strays and is_called_time(c.name):
             problem = f"column {shown(c.name)}: {c.strays}; expected times: delete such rows"
             raise wrong(table.path, f"{problem} (--time-rate counts every row as a sample)")
-
-
-def _unread(table: Table, info: LogInfo) -> dict[str, str]:
-    """Return the columns without numbers or with a repeated name, with the reason."""
-    reasons = {}
-    for c in info.columns:
-        if table.names.count(c.name) > 1:
-            reasons[c.name] = "is the name of several columns"
-        elif c.kind == "text" and c.count:
-            first = c.strays or f"{c.count} cells of text, such as {table.cell_text(c.name, 0)}"
-            reasons[c.name] = f"holds no numbers alone: {first}"
-    return reasons
 
 
 def _from_first(stamps: np.ndarray, duration: float) -> np.ndarray:

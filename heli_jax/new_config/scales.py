@@ -13,11 +13,8 @@ _FULL_PULSE = 500.0
 """Pulse width from the middle to the end [us]."""
 _MIDDLE, _TRIM = 1500.0, 150.0
 """Pulse width of a stick at rest, and largest shift by trims [us]."""
-_SBUS_REST, _SBUS_STOP = 992.0, 819.5
-"""Counts of a receiver's serial bus at rest, and from there to the end: 172 to 1811."""
 _LONG = 0.2
 """Share of a record above which a stick's value is its rest position."""
-_ROTORS = {"rpm", "omega", "rotor", "headspeed", "head", "nr", "speed"}
 _FULL_COMMAND = 500.0
 """Count at a stick's stop in firmware that commands in pulse widths around the middle."""
 _PARTS = 1.5
@@ -28,15 +25,12 @@ _FASTEST_TURN = 8.0
 """Fastest turn [rad/s] of a small helicopter in a log for identification."""
 
 
-def scaled(
-    channel: str, series: Series, si: str, full: float | None = None, is_input: bool = False
-) -> Guess:
+def scaled(channel: str, series: Series, si: str, *, is_input: bool = False) -> Guess:
     """Return a channel with unit and scale, from its name, the log or its numbers.
 
     Args:
         channel: name of the channel.
         si: SI unit of the model's signal.
-        full: count of the log's sticks at their stops, if known.
         is_input: True for a stick or a servo.
     """
     values = series.values[np.isfinite(series.values)]
@@ -46,12 +40,8 @@ def scaled(
         stated, source = without_unit(channel)[1], "its name"
     if stated and units.fits(stated, si):
         return Guess(channel, stated, remarks=(f"unit by {source}",))
-    if _is_sbus(channel, values):
-        return _about(channel, si, ("counts of S.BUS", "", "a count"), _SBUS_REST, _SBUS_STOP)
     if _PULSES[0] < low and high < _PULSES[1] and high - low > 20:
         return _of_pulses(channel, values, si)
-    if _are_counts(channel, values, si):
-        return _of_counts(channel, values, si)
     if si == "rad":
         # A heading may count from 0 to a turn; a pitch angle ends at a quarter turn.
         most = np.pi / 2 if {"pitch", "theta"} & set(words_of(channel)) else 2 * np.pi
@@ -73,27 +63,13 @@ def scaled(
         remark = f"GUESS: {low:.4g} to {high:.4g} {stated}; scale: 1 / full travel in the log"
         return Guess(channel, "1", EDIT, remarks=(remark,))
     elif si == "1":
-        return _of_stick(channel, low, high, full)
+        return _of_stick(channel, low, high)
     elif units.fits("m", si):
         guess = "GUESS: scale unknown: full travel of the input per unit of the log"
         return Guess(channel, si, EDIT, remarks=(guess,))
     else:
         unit = si
     return Guess(channel, unit, remarks=(f"GUESS: {low:.4g} to {high:.4g} taken for {unit}",))
-
-
-def _is_sbus(channel: str, values: np.ndarray) -> bool:
-    """True if whole numbers are counts of S.BUS.
-
-    The criterion is the name, or a centre and range that pulses do not have.
-    """
-    low, high = float(np.min(values)), float(np.max(values))
-    if not are_whole(values) or abs(low - high) <= 20 or not 0 <= low <= high < 2048:
-        return False
-    if "sbus" in words_of(channel):
-        return True
-    rests = float(np.median(values))
-    return abs(rests - _SBUS_REST) < 0.5 * _TRIM and high < _MIDDLE - _TRIM and low > _PULSES[0]
 
 
 def _of_pulses(channel: str, values: np.ndarray, si: str) -> Guess:
@@ -104,44 +80,20 @@ def _of_pulses(channel: str, values: np.ndarray, si: str) -> Guess:
     is_still = np.ptp(begin) < small
     is_middle = abs(first - _MIDDLE) < _TRIM or np.mean(np.abs(values - first) < small) > _LONG
     rest = first if is_still and is_middle else _MIDDLE
-    return _about(channel, si, ("pulse widths", " us", "a microsecond"), rest, _FULL_PULSE)
-
-
-def _about(channel: str, si: str, words: tuple[str, str, str], rest: float, stop: float) -> Guess:
-    """Return the scale of numbers with a rest position and a travel of `stop`.
-
-    `words` are their description, their unit, and one of them.
-    """
-    what, unit, one = words
-    remark = f"GUESS: {what}, {rest:g}{unit} at rest"
+    remark = f"GUESS: pulse widths, {rest:g} us at rest"
     if si == "1":
-        return Guess(channel, "1", 1.0 / stop, rest, (f"{remark}, {stop:g}{unit} to the stop",))
-    return Guess(channel, si, EDIT, rest, (f"{remark}; scale: {si} for {one}",))
+        remark = f"{remark}, {_FULL_PULSE:g} us to the stop"
+        return Guess(channel, "1", 1.0 / _FULL_PULSE, rest, (remark,))
+    return Guess(channel, si, EDIT, rest, (f"{remark}; scale: {si} for a microsecond",))
 
 
-def _are_counts(channel: str, values: np.ndarray, si: str) -> bool:
-    """True if whole numbers far from zero are counts of a converter, and no angle or rate."""
-    low, high = float(np.min(values)), float(np.max(values))
-    if not are_whole(values) or low < 0.1 * high or _ROTORS & set(words_of(channel)):
-        return False
-    # A heading has 360 degrees; nothing turns faster than 100 deg/s all the time.
-    return (si == "rad" and high > 2 * 360.0) or (si == "rad/s" and low > 100.0)
-
-
-def _of_counts(channel: str, values: np.ndarray, si: str) -> Guess:
-    rest = float(np.median(values[: max(len(values) // 100, 5)]))
-    words = f"GUESS: counts, {rest:g} at the start; scale: {si} per count"
-    return Guess(channel, si, EDIT, rest, (words,))
-
-
-def _of_stick(channel: str, low: float, high: float, full: float | None) -> Guess:
+def _of_stick(channel: str, low: float, high: float) -> Guess:
     largest = max(-low, high)
     # Betaflight-type commands count to 500, their collective to about 1000.
     commanded = words_of(channel)[-3:-1] == ("rc", "command") and largest <= _FULL_COMMAND
-    travel = _FULL_COMMAND if commanded else full
-    if travel and _PARTS < largest <= travel:
-        remark = f"GUESS: {low:.4g} to {high:.4g}, full travel {travel:g}"
-        return Guess(channel, "1", 1.0 / travel, remarks=(remark,))
+    if commanded and largest > _PARTS:
+        remark = f"GUESS: {low:.4g} to {high:.4g}, full travel {_FULL_COMMAND:g}"
+        return Guess(channel, "1", 1.0 / _FULL_COMMAND, remarks=(remark,))
     for most, unit, scale in ((_PARTS, "1", 1.0), (105.0, "%", 1.0), (1050.0, "1", 0.001)):
         if largest <= most:
             what = "thousandths" if scale != 1.0 else {"1": "parts of full travel"}.get(unit, unit)

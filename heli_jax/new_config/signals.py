@@ -90,14 +90,6 @@ def names_of_output(name: str) -> list[str]:
     return [words_of(name), *tables.names()["outputs"].get(model_outputs().get(name, name), [])]
 
 
-def names_of_input(name: str) -> list[str]:
-    """Return usual names of an input of a model, words separated by blanks."""
-    stick, called = _stick(name), tables.names()
-    if name == "Omega":
-        return [words_of(name), *called["rotor_speed"]]
-    return [words_of(name), *(called["inputs"][stick] if stick is not None else ())]
-
-
 def _stick(name: str) -> str | None:
     """Return the stick of a model's input, as in the table of names; None for other inputs."""
     signal = model_inputs().get(name)
@@ -138,16 +130,12 @@ def _found(
         return None
     chosen = guess.of_known_unit(candidates, log.series, si)
     taken.append(chosen)
-    scaled = scales.scaled(chosen, log.series[chosen], si, _full_travel(log), is_input)
+    scaled = scales.scaled(chosen, log.series[chosen], si, is_input=is_input)
     others = [n for n in candidates if n != chosen]
     if not others:
         return scaled
     remark = f"could be {', '.join(others[:3])} as well"
     return scaled._replace(remarks=(*scaled.remarks, remark))
-
-
-def _full_travel(log: Log) -> float | None:
-    return guess.full_travel({n: s for n, s in log.series.items() if is_stick_name(n)})
 
 
 def _by_number(
@@ -197,7 +185,7 @@ def _by_correlation(
         if best is None:
             continue
         channel, related = best
-        made = scales.scaled(channel, log.series[channel], si, _full_travel(log), is_input=True)
+        made = scales.scaled(channel, log.series[channel], si, is_input=True)
         why = f"GUESS: no name matches; {known[-1]} follows it with a correlation of {related:.2f}"
         inputs[name] = made._replace(remarks=(why, *made.remarks))
         taken.append(channel)

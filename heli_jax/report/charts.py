@@ -46,8 +46,6 @@ class Panel(NamedTuple):
     """Height [inch]."""
     levels: tuple[float, ...] = ()
     """Horizontal lines."""
-    marks: tuple[float, ...] = ()
-    """Vertical lines."""
     shades: tuple[tuple[float, float], ...] = ()
     """Shaded ranges of x."""
     logarithmic: bool = False
@@ -78,15 +76,15 @@ def panel(
     return Panel(label, tuple(series), limits or limits_of(series), height, **more)
 
 
-def limits_of(series: Sequence[Series], margin: float = 0.05) -> tuple[float, float]:
-    """Return limits that contain every series; 0 to 1 without numbers."""
+def limits_of(series: Sequence[Series]) -> tuple[float, float]:
+    """Return limits that contain every series with a margin of 5 %; 0 to 1 without numbers."""
     parts = [v for s in series for v in (s.y, s.low, s.high) if v is not None and v.size]
     y = np.concatenate(parts) if parts else np.empty(0)
     y = y[np.isfinite(y)]
     if not y.size:
         return 0.0, 1.0
     low, high = float(y.min()), float(y.max())
-    room = margin * (high - low) or 0.05 * abs(high) or 0.05
+    room = 0.05 * (high - low) or 0.05 * abs(high) or 0.05
     return low - room, high + room
 
 
@@ -112,9 +110,9 @@ def bars(label: str, x: np.ndarray, y: np.ndarray, reach: Any, color: str) -> Se
     return Series(label, x, y, color, "bars", y - down, y + up, width=2.2)
 
 
-def band(x: np.ndarray, low: np.ndarray, high: np.ndarray, color: str, label: str = "") -> Series:
+def band(x: np.ndarray, low: np.ndarray, high: np.ndarray, color: str) -> Series:
     """Return the band between two lines."""
-    return Series(label, x, low, color, "band", low, high, width=0.0)
+    return Series("", x, low, color, "band", low, high, width=0.0)
 
 
 def time_limits(t: np.ndarray) -> tuple[float, float]:
@@ -143,7 +141,7 @@ def thinned(x: np.ndarray, y: np.ndarray, most: int) -> tuple[np.ndarray, np.nda
     return x[keep], y[keep]
 
 
-_TOLD = 6
+_DESCRIBED = 6
 """Lines of a panel in the text alternative."""
 
 
@@ -151,20 +149,20 @@ def described(chart: Chart) -> str:
     """Return the text alternative: title, note, and the lines of each panel with their ranges."""
     low, high = chart.x_limits
     over = f"Over {chart.x_label}, {number(low, 3)} to {number(high, 3)}" if chart.x_label else ""
-    told = [text for p in chart.panels if (text := _panel_in_words(p))]
-    return ". ".join(s for s in (chart.title, chart.note, over, *told) if s) + "."
+    panels = [text for p in chart.panels if (text := _panel_in_words(p))]
+    return ". ".join(s for s in (chart.title, chart.note, over, *panels) if s) + "."
 
 
 def _panel_in_words(panel: Panel) -> str:
     series = [s for s in panel.series if s.kind != "band" and np.isfinite(s.y).any()]
     words = []
-    for s in series[:_TOLD]:
+    for s in series[:_DESCRIBED]:
         y = s.y[np.isfinite(s.y)]
         low, high = number(float(y.min()), 3), number(float(y.max()), 3)
         name = s.label or panel.label.partition(" [")[0]
         words.append(f"{name} {low}" + (f" to {high}" if low != high else ""))
-    if len(series) > _TOLD:
-        words.append(f"{len(series) - _TOLD} further lines")
+    if len(series) > _DESCRIBED:
+        words.append(f"{len(series) - _DESCRIBED} further lines")
     return f"{panel.label}: {', '.join(words)}" if words else ""
 
 

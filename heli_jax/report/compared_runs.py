@@ -44,15 +44,12 @@ class ComparedRuns(NamedTuple):
         rows, of_runs = [], self._by_run()
         for name in _in_order(of_runs):
             estimates = [of_run.get(name) for of_run in of_runs]
-            units = {pretty(e.unit) for e in estimates if e is not None}
-            cells = [
-                _measured(e, run, with_unit=len(units) > 1)
-                for e, run in zip(estimates, self.runs, strict=True)
-            ]
-            pairs = zip(estimates, self.runs, strict=True)
+            units = dict.fromkeys(pretty(e.unit) for e in estimates if e is not None)
+            pairs = list(zip(estimates, self.runs, strict=True))
+            cells = [_measured(e, run) for e, run in pairs]
             first_one, *others = (e if _converged(run) else None for e, run in pairs)
             apart = [_difference(first_one, other) for other in others]
-            rows.append((name, *cells, *apart, units.pop() if len(units) == 1 else ""))
+            rows.append((name, *cells, *apart, ", ".join(units)))
         return Table(("parameter", *self.labels, *several, "unit"), rows)
 
     def _by_run(self) -> list[dict[str, Estimate]]:
@@ -135,20 +132,16 @@ class ComparedRuns(NamedTuple):
         """
         from heli_jax.exports import runs_frame
 
-        estimates = self._usable()
-        return runs_frame(dict(zip(self.labels, estimates, strict=True)))
+        none = {"sd": None, "lower95": None, "upper95": None}
+        usable = (
+            of_run if _converged(run) else {name: e._replace(**none) for name, e in of_run.items()}
+            for run, of_run in zip(self.runs, self._by_run(), strict=True)
+        )
+        return runs_frame(dict(zip(self.labels, usable, strict=True)))
 
     def to_csv(self) -> str:
         """Return `to_dataframe` as CSV."""
         return self.to_dataframe().to_csv(index=False, lineterminator="\n")
-
-    def _usable(self) -> list[dict[str, Estimate]]:
-        """Return `_by_run` without intervals of runs that did not converge."""
-        none = {"sd": None, "lower95": None, "upper95": None}
-        return [
-            of_run if _converged(run) else {name: e._replace(**none) for name, e in of_run.items()}
-            for run, of_run in zip(self.runs, self._by_run(), strict=True)
-        ]
 
     def _summary(self) -> Summary:
         head, rows = self.estimates
@@ -238,7 +231,7 @@ def _converged(run: SavedFit) -> bool:
     return run.status != "not-converged"
 
 
-def _measured(e: Estimate | None, run: SavedFit, *, with_unit: bool) -> str:
+def _measured(e: Estimate | None, run: SavedFit) -> str:
     if e is None:
         return NOTHING
     if not _converged(run):
@@ -246,7 +239,7 @@ def _measured(e: Estimate | None, run: SavedFit, *, with_unit: bool) -> str:
     if e.sd is None:
         # An insignificant disturbance has size zero.
         return "0" if e.at_bound and e.value == 0.0 else NOT_DETERMINED
-    return with_sd(e.value, e.sd) + (f" {pretty(e.unit)}" if with_unit else "")
+    return with_sd(e.value, e.sd)
 
 
 def _difference(first: Estimate | None, other: Estimate | None) -> str:
@@ -274,6 +267,7 @@ def write_page(path: Path, compared: ComparedRuns) -> None:
     def link(file: Path) -> str:
         return urllib.parse.quote(os.path.relpath(file.absolute(), path.absolute().parent))
 
+    named = list(zip(compared.labels, compared.runs, strict=True))
     page = filled(
         "compared.html.j2",
         labels=compared.labels,
@@ -285,21 +279,14 @@ def write_page(path: Path, compared: ComparedRuns) -> None:
         notes=sentences(compared.notes),
         # Paths are relative, so that page and runs can be moved together.
         files=[
-            (
-                label,
-                [(n, link(run.directory / n)) for n in _FILES if _is(run, n)],
-            )
-            for label, run in zip(compared.labels, compared.runs, strict=True)
+            (label, [(n, link(run.directory / n)) for n in _FILES if (run.directory / n).is_file()])
+            for label, run in named
         ],
         configs=[
-            (label, (run.directory / "config.yaml").read_text(encoding="utf-8"))
-            for label, run in zip(compared.labels, compared.runs, strict=True)
-            if _is(run, "config.yaml")
+            (label, config.read_text(encoding="utf-8"))
+            for label, run in named
+            if (config := run.directory / "config.yaml").is_file()
         ],
         origin=origin(),
     )
     path.write_text(page, encoding="utf-8")
-
-
-def _is(run: SavedFit, name: str) -> bool:
-    return (run.directory / name).is_file()

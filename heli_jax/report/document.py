@@ -11,8 +11,8 @@ import math
 import operator
 import types
 import typing
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypedDict
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Literal, TypedDict
 
 import numpy as np
 from pydantic import (
@@ -21,6 +21,7 @@ from pydantic import (
     ConfigDict,
     TypeAdapter,
     ValidationError,
+    WithJsonSchema,
     create_model,
     model_validator,
 )
@@ -56,6 +57,7 @@ from heli_jax.identification.validation.follows_response import LEVEL, Feedback
 from heli_jax.identification.validation.held_out import HeldOutFrequency
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
 from heli_jax.report.card import Gate, card
+from heli_jax.schema_keys import Key, keys_of
 from heli_jax.versions import versions
 
 ABSENT = object()
@@ -602,6 +604,7 @@ class _Section(BaseModel):
     """
 
     model_config = ConfigDict(extra="allow", arbitrary_types_allowed=True, protected_namespaces=())
+    section: ClassVar[Any] = None
     sources: ClassVar[dict[str, Callable[[Any], Any]]] = {}
 
     @model_validator(mode="before")
@@ -617,26 +620,10 @@ class _Section(BaseModel):
 def model_of(section: Any) -> type[_Section]:
     """Return the pydantic model of a section, or of a class whose fields are keys."""
     fields = _fields(section)
-    made = {n: (_read(kind).checked | None, None) for n, (kind, _) in fields.items()}
+    made = {n: (_type(kind) | None, None) for n, (kind, _) in fields.items()}
     model = create_model(section.__name__, __base__=_Section, **made)  # type: ignore[call-overload]
-    model.sources = {n: source for n, (_, source) in fields.items()}
+    model.section, model.sources = section, {n: source for n, (_, source) in fields.items()}
     return model
-
-
-class _Read(NamedTuple):
-    """A kind of value."""
-
-    words: str
-    checked: Any
-    """Type for pydantic; null may replace any number."""
-    sections: tuple[tuple[Any, str], ...] = ()
-    """Inner sections, each with the path from this kind to its keys."""
-
-    def within(self, between: str) -> tuple[tuple[Any, str], ...]:
-        return tuple((section, between + rest) for section, rest in self.sections)
-
-
-_PLAIN = {bool: "true | false", int: "integer", float: "number", str: "text"}
 
 
 def _as_tuple(value: Any) -> Any:
@@ -644,34 +631,30 @@ def _as_tuple(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
+_NUMBERS = Annotated[Any, WithJsonSchema({"type": "array", "items": {"type": "number"}})]
+"""An array of any shape."""
+
+
 @functools.cache
-def _read(kind: Any) -> _Read:
+def _type(kind: Any) -> Any:
+    """Return the type by which pydantic checks a kind of value; null may replace any number."""
     origin, items = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
-        each = [_read(option) for option in items]
-        words = " or ".join(dict.fromkeys(option.words for option in each))
-        union = functools.reduce(operator.or_, (option.checked for option in each))
-        return _Read(words, union, tuple(s for option in each for s in option.sections))
-    if kind in _PLAIN:
-        return _Read(_PLAIN[kind], kind | None)
-    if kind is type(None):
-        return _Read("null", None)
+        return functools.reduce(operator.or_, map(_type, items))
+    if kind in (bool, int, float, str):
+        return kind | None
+    if kind is type(None) or origin is Literal:
+        return None if origin is None else kind
     if typing.is_typeddict(kind) or (isinstance(kind, type) and hasattr(kind, "_fields")):
-        return _Read("section", model_of(kind), ((kind, ""),))
-    if origin is Literal:
-        return _Read(" | ".join(map(str, items)), kind)
+        return model_of(kind)
     if origin in (dict, Mapping):
-        of = _read(items[1])
-        return _Read(f"{of.words} by name", dict[str, of.checked], of.within(".NAME"))
+        return dict[str, _type(items[1])]
     if origin is tuple and Ellipsis not in items:
-        each = [_read(item) for item in items]
-        words = ", ".join(item.words for item in each)
-        numbers = tuple[tuple(item.checked for item in each)]  # type: ignore[misc]
-        return _Read(f"[{words}]", Annotated[numbers, BeforeValidator(_as_tuple)])
+        numbers = tuple[tuple(map(_type, items))]  # type: ignore[misc]
+        return Annotated[numbers, BeforeValidator(_as_tuple)]
     if origin in (list, tuple, Sequence):
-        of = _read(items[0])
-        return _Read(f"list of {of.words}", list[of.checked], of.within("[]"))
-    return _Read("list of numbers", Any)  # an array
+        return list[_type(items[0])]
+    return _NUMBERS
 
 
 @functools.cache
@@ -696,7 +679,7 @@ def written(kind: Any, value: Any) -> Any:
         kind: a section, or a mapping or list of sections.
         value: an object with the sources of the keys, or a mapping of the keys.
     """
-    adapter = TypeAdapter(_read(kind).checked)
+    adapter = TypeAdapter(_type(kind))
     made = adapter.validate_python(value)
     return plain(adapter.dump_python(made, exclude_unset=True))
 
@@ -727,37 +710,17 @@ def checked(data: bytes) -> dict[str, Any]:
     return json.loads(data)
 
 
-class Key(NamedTuple):
-    """One key of fit.json."""
-
-    path: str
-    """Full path: `parameters.NAME.sd`."""
-    kind: str
-    """Kind of the value in words."""
-    meaning: str
-    """Empty if the name is enough."""
-
-
 def fit_keys() -> list[Key]:
     """Return all keys, each before its inner keys."""
-    return list(_walk(FitFile, ""))
-
-
-def matching(text: str) -> list[Key]:
-    """Return the keys whose path contains a text, else those whose meaning does."""
-    words, every = text.strip().lower(), fit_keys()
-    by_path = [k for k in every if words in k.path.lower()]
-    return by_path or [k for k in every if words in k.meaning.lower()]
-
-
-def _walk(section: Any, path: str) -> Iterator[Key]:
-    stated = naming.texts(section) | (
-        naming.texts(ADDED_KEYS[section]) if section in ADDED_KEYS else {}
-    )
-    for name, (kind, _) in _fields(section).items():
-        place, read = f"{path}.{name}" if path else name, _read(kind)
-        yield Key(place, read.words, stated.get(name, ""))
-        # `verdict_before` has the keys of `verdict`.
-        if name not in ("verdict_before", "determined_combinations") or path == "verdict":
-            for inner, between in read.sections:
-                yield from _walk(inner, place + between)
+    schema = model_of(FitFile).model_json_schema()
+    parts = {**schema["$defs"], FitFile.__name__: schema}
+    for model in _Section.__subclasses__():
+        section = model.section
+        added = naming.texts(ADDED_KEYS[section]) if section in ADDED_KEYS else {}
+        for name, text in {**naming.texts(section), **added}.items():
+            parts[model.__name__]["properties"][name]["description"] = text
+    # These have the keys of `verdict`.
+    again = ("verdict_before.", "determined_combinations[].")
+    keys = (key for key in keys_of(schema) if not key.path.startswith(again))
+    # Every key may be missing in the file of another version.
+    return [key._replace(default="") for key in keys]

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heli_jax.identification.equation_error.rls import Baseline
+from heli_jax import naming
 from heli_jax.identification.identifiability.verdict import FACTOR
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Fit, Signals
@@ -19,14 +19,12 @@ from heli_jax.identification.validation.adequacy import (
     NEARLY_WHITE,
 )
 from heli_jax.identification.validation.metrics import metrics
-from heli_jax.numbers import measured, percent, vaf_percent
+from heli_jax.numbers import percent, vaf_percent
 from heli_jax.report import figures, tables
 from heli_jax.report.card import card, summary
 from heli_jax.report.charts import Numbers
-from heli_jax.report.figures.estimates import MOST
 from heli_jax.report.files import Analysis as Analysis
-from heli_jax.report.fitted_responses import FittedPair
-from heli_jax.report.origin import Origin
+from heli_jax.report.origin import Origin, origin
 from heli_jax.report.page import MOST_FLIGHTS, Draw, Picture, filled, picture
 from heli_jax.vehicle import Constant, of_helicopter
 from heli_jax.versions import versions
@@ -37,7 +35,7 @@ def write_report(
     analysis: Analysis,
     title: str,
     vehicle_constants: Mapping[str, Constant],
-    origin: Origin | None = None,
+    made: Origin | None = None,
     *,
     png: bool = False,
 ) -> list[str]:
@@ -48,47 +46,32 @@ def write_report(
     Args:
         directory: existing output directory.
         vehicle_constants: constants of the vehicle file, by name.
-        origin: command, configuration and files beside the page; default none.
+        made: command, configuration and files beside the page; default this process without files.
         png: write figures/NAME.png too.
 
     Raises:
         OSError: the directory is not writable.
     """
+    fit, problem, baseline, supplementary = analysis
     folder = directory / "figures"
     folder.mkdir(parents=True, exist_ok=True)
-    numbers, shown = Numbers(), list[Picture]()
+    numbers = Numbers()
     # Figures are drawn one by one to save memory.
-    for name, draw in drawings(analysis).items():
-        made = picture(name, draw, numbers, folder=folder, png=png)
-        if made is not None:
-            shown.append(made._replace(alt=alt_text(made, analysis)))
-    page = render(analysis, title, vehicle_constants, shown, numbers, origin)
-    (directory / "report.html").write_text(page, encoding="utf-8")
-    return [made.name for made in shown]
-
-
-def render(
-    analysis: Analysis,
-    title: str,
-    vehicle_constants: Mapping[str, Constant],
-    pictures: list[Picture],
-    numbers: Numbers | None = None,
-    origin: Origin | None = None,
-) -> str:
-    """Return the page as text."""
-    fit, problem = analysis.fit, analysis.problem
-    numbers, first = numbers or Numbers(), None
+    drawn = (
+        picture(name, draw, numbers, folder=folder, png=png)
+        for name, draw in drawings(analysis).items()
+    )
+    pictures, first = [p for p in drawn if p is not None], None
     if (worst := worst_output(fit)) is not None:
-        chart = figures.overview(*worst, problem.model)
-        first = picture("overview", lambda: chart, numbers)
-    return filled(
+        first = picture("overview", lambda: figures.overview(*worst, problem.model), numbers)
+    page = filled(
         "report.html.j2",
         title=title,
         fit=fit,
         problem=problem,
-        baseline=analysis.baseline,
-        more=analysis.supplementary,
-        card=card(fit, analysis.supplementary.responses),
+        baseline=baseline,
+        more=supplementary,
+        card=card(fit, supplementary.responses),
         summary=summary,
         # The template calls this module for its rows.
         lines=lines(fit),
@@ -102,7 +85,7 @@ def render(
         tables=tables,
         constants=tables.constants(problem, vehicle_constants),
         versions=versions(),
-        origin=origin,
+        origin=made or origin(),
         unshown=max(0, len(fit.signals) - MOST_FLIGHTS),
         overview=first,
         pictures={
@@ -111,6 +94,8 @@ def render(
         },
         numbers=numbers.content(),
     )
+    (directory / "report.html").write_text(page, encoding="utf-8")
+    return [p.name for p in pictures]
 
 
 # A group must not be a prefix of another.
@@ -167,8 +152,7 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
                     figures.residual_correlation,
                     s,
                     output,
-                    together=len(fit.whiteness),
-                    test=fit.whiteness.get(f"{s.flight}/{output}"),
+                    fit.whiteness.get(f"{s.flight}/{output}"),
                 )
     if (responses := supplementary.responses) is not None:
         about = (
@@ -180,9 +164,12 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
         ):
             note = f"{about}; data without the hold of the input, {whose}"
             for pair in pairs:
-                unit = figures.bode_unit(model, pair.output, pair.input)
+                unit = figures.quotient(
+                    naming.unit(model.Outputs, pair.output), naming.unit(model.Inputs, pair.input)
+                )
                 name = f"{group}_{pair.output}-{pair.input}"
-                rls = baseline if group == "match" and _of(baseline, pair) else None
+                of = baseline and (baseline.input, baseline.output)
+                rls = baseline if group == "match" and of == (pair.input, pair.output) else None
                 drawings[name] = later(figures.match, pair, unit, note, rls)
     if baseline is not None:
         # Time of the flight's first sample in the log [s].
@@ -210,35 +197,10 @@ def _parts(flights: list[str]) -> list[str]:
     ]
 
 
-def _of(baseline: Baseline | None, pair: FittedPair) -> bool:
-    return baseline is not None and (baseline.input, baseline.output) == (pair.input, pair.output)
-
-
 def caption(picture: Picture) -> str:
     """Return the caption of a figure, with the name of its files."""
     [words] = [words for begins, words in GROUPS.items() if picture.name.startswith(begins)]
     return f"{picture.title}. {words} (figures/{picture.name}.svg)"
-
-
-def alt_text(picture: Picture, analysis: Analysis) -> str:
-    """Return the text alternative of a figure."""
-    fit, intervals = analysis.fit, analysis.supplementary.intervals
-    samples: Mapping[str, np.ndarray] = {}
-    if picture.name == "pairs_posterior" and intervals and intervals.posterior:
-        samples = intervals.posterior.draws
-    elif picture.name == "pairs_bootstrap" and intervals and intervals.bootstrap:
-        samples = intervals.bootstrap.values
-    if samples:
-        each = []
-        for name in list(samples)[:MOST]:
-            mean, sd = measured(float(np.std(samples[name])), float(np.mean(samples[name])))
-            each.append(f"{name} {mean}, {sd} {fit.estimates[name].unit}".rstrip())
-        count = next(iter(samples.values())).size
-        return f"{picture.title}. {count} samples, mean and sd: {'; '.join(each)}."
-    for output, m in fit.metrics.items():
-        if picture.name.startswith("response") and picture.name.endswith(f"_{output}"):
-            return f"{picture.alt} Over the fitted flights: VAF {vaf_percent(m.vaf)}."
-    return picture.alt
 
 
 class Line(NamedTuple):
@@ -251,7 +213,7 @@ class Line(NamedTuple):
     """One sentence."""
 
 
-_SPEAK_AGAINST = ("adequacy", "dynamics", "units", "timing", "quality")
+_DOUBTFUL_TOPICS = ("adequacy", "dynamics", "units", "timing", "quality")
 """Topics of findings that raise doubts about an adequate model."""
 
 
@@ -276,12 +238,14 @@ def lines(fit: Fit) -> tuple[Line, Line, Line]:
         determined = Line("warning", "Identifiable, not trusted", text)
     adequate = Line("bad", "Not adequate", f"{'; '.join(fit.reasons_against)}.")
     if fit.adequate:
-        against = [
+        doubts = [
             f.brief
             for f in fit.findings
-            if f.bad and f.brief and f.code.partition(".")[0] in _SPEAK_AGAINST
+            if f.bad and f.brief and f.code.partition(".")[0] in _DOUBTFUL_TOPICS
         ]
-        told = [f"In the record {against[0]}" if against else "No finding speaks against the model"]
+        statements = [
+            f"In the record {doubts[0]}" if doubts else "No finding speaks against the model"
+        ]
         for agreement, how in (
             (fit.metrics, "simulated"),
             (fit.one_step, "one step ahead"),
@@ -290,9 +254,9 @@ def lines(fit: Fit) -> tuple[Line, Line, Line]:
             shares = {n: m.vaf for n, m in agreement.items() if math.isfinite(m.vaf)}
             if shares:
                 worst = min(shares, key=lambda n: shares[n])
-                told.append(f"VAF of {worst} {vaf_percent(shares[worst])} {how}")
-        kind, word = ("warning", "Adequate, with doubts") if against else ("good", "Adequate")
-        adequate = Line(kind, word, f"{'; '.join(told)}.")
+                statements.append(f"VAF of {worst} {vaf_percent(shares[worst])} {how}")
+        kind, word = ("warning", "Adequate, with doubts") if doubts else ("good", "Adequate")
+        adequate = Line(kind, word, f"{'; '.join(statements)}.")
     return Line("good", "Converged", reached), determined, adequate
 
 

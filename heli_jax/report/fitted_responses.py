@@ -18,7 +18,7 @@ from heli_jax.analysis.attitude_responses import (
     prepared,
 )
 from heli_jax.analysis.flight_responses import FlightResponses, Settings, flight_responses
-from heli_jax.analysis.handling_qualities import HandlingQualities, handling_qualities
+from heli_jax.analysis.handling_qualities import handling_qualities
 from heli_jax.analysis.operating_point import OperatingPoint, operating_point
 from heli_jax.analysis.response_curves import (
     COHERENT,
@@ -109,7 +109,11 @@ def fitted_responses(
     means = _octave_means(responses)
     pairs = _pairs(responses, curves, means)
     handling = tuple(
-        Handling(p, _of_model(curves, p), measured_handling(responses, p))
+        Handling(
+            p,
+            handling_qualities(prepared(p, curves.curve(p.input, p.output)), p.kind),
+            measured_handling(responses, p),
+        )
         for p in requested
         if p.input in responses.holds and p.output in responses.outputs
     )
@@ -252,17 +256,3 @@ def _of_held_out(
         f"of {COHERENT:g} over an octave"
     )
     return (), (note("responses.none-held-out", words),)
-
-
-def _of_model(curves: _Curves, pair: HandlingPair) -> HandlingQualities:
-    qualities = handling_qualities(prepared(pair, curves.curve(pair.input, pair.output)), pair.kind)
-    last, w180 = curves.band[1] / _BEYOND, qualities.numbers.get("w180")
-    needed = last if pair.kind == "open-loop" else 0.5 * last
-    if w180 is None or w180.value <= needed:
-        return qualities
-    beyond = "w180" if w180.value > last else "2 w180"
-    words = (
-        f"{beyond} is above the band of the flights' responses, {last / (2.0 * np.pi):.3g} Hz: "
-        "the values there are extrapolated by the model"
-    )
-    return qualities._replace(sentences=(*qualities.sentences, words))

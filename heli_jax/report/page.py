@@ -111,10 +111,10 @@ def picture(
     if isinstance(made, Chart):
         number = numbers.add_chart(made)
         return Picture(name, made.title, described(made), number, file=file)
-    title, size = made.get_suptitle().partition("\n")[0], made.get_size_inches()
-    width, height = (round(96 * v) for v in size)
+    title, _, note = made.get_suptitle().partition("\n")
+    width, height = (round(96 * v) for v in made.get_size_inches())
     image = _address("svg+xml", svg) if svg else ""
-    return Picture(name, title, title, None, image, (width, height), file)
+    return Picture(name, title, f"{title}. {note}", None, image, (width, height), file)
 
 
 def _address(kind: str, data: bytes) -> str:

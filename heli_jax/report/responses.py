@@ -2,14 +2,14 @@
 
 import functools
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from heli_jax.analysis.attitude_responses import Handling
-from heli_jax.analysis.flight_responses import FlightResponses, Pair, Wanted, decays_within
+from heli_jax.analysis.flight_responses import FlightResponses, Pair, TransferRequest, decays_within
 from heli_jax.analysis.spectra import COHERENT
 from heli_jax.analysis.transfer_fit import Coefficient, TransferFit
 from heli_jax.finding import as_data
@@ -18,7 +18,7 @@ from heli_jax.numbers import NOTHING, number, with_sd
 from heli_jax.report import tables
 from heli_jax.report.charts import Chart, Numbers
 from heli_jax.report.document import handling_content
-from heli_jax.report.figures.bode import branch_of, draw_response, seen_of
+from heli_jax.report.figures.bode import branch_of, draw_response, quotient, seen_of
 from heli_jax.report.files import as_json
 from heli_jax.report.origin import origin
 from heli_jax.report.page import filled, picture
@@ -35,8 +35,6 @@ _SURE = 0.3
 """Largest relative random error of a usable response, that of five averages at coherence 0.6."""
 _TOO_LARGE = 2.0
 """chi-squared per degree of freedom above which the order of a transfer function is too low."""
-_NEAR_ZERO = 0.1
-"""Relative distance of a zero that nearly cancels a pole."""
 
 
 def write_responses(
@@ -100,7 +98,7 @@ def write_responses(
     (directory / "responses.html").write_text(page, encoding="utf-8")
 
 
-def _averages(responses: FlightResponses, request: Wanted) -> str:
+def _averages(responses: FlightResponses, request: TransferRequest) -> str:
     """Return the number of averages of a fitted response as text."""
     output = responses.outputs.get(request.output)
     return NOTHING if output is None else number(output.averages, 3)
@@ -160,7 +158,7 @@ def transfer_status(fit: TransferFit | str) -> str:
     return "converged" if known else "not-identifiable"
 
 
-def _content(request: Wanted, fit: TransferFit | str, window: float) -> dict[str, Any]:
+def _content(request: TransferRequest, fit: TransferFit | str, window: float) -> dict[str, Any]:
     """Return an entry of transfer_functions.json."""
     status, found = transfer_status(fit), None if isinstance(fit, str) else fit
     numerator: list[dict[str, float]] = [{}] * (request.zeros + 1)
@@ -231,23 +229,7 @@ def fit_sentences(fit: TransferFit | str, window: float) -> list[str]:
             f"it is unstable (a pole with the real part +{number(max(growing), 3)} rad/s); if the "
             "vehicle is stable, a late stick, feedback or a wrong order can cause this"
         )
-    if known and all(c.determined for c in fit.numerator) and (cancelled := _cancelled(fit)):
-        remarks.append(
-            f"zeros lie within a tenth of {_root_words(cancelled)} and nearly cancel them: these "
-            "poles may not be modes of the vehicle; try a lower order and compare chi²"
-        )
     return remarks
-
-
-def _cancelled(fit: TransferFit) -> list[complex]:
-    """Return the poles that a zero nearly cancels."""
-    zeros, cancelled = list(fit.zeros), []
-    for pole in fit.poles:
-        distances = [abs(pole - zero) for zero in zeros]
-        if distances and min(distances) < _NEAR_ZERO * abs(pole):
-            zeros.pop(int(np.argmin(distances)))
-            cancelled.append(complex(pole))
-    return cancelled
 
 
 FIT_HEAD = ("numerator", "denominator", "poles [rad/s]", "delay [ms]", "chi² per degree", "J")
@@ -280,12 +262,8 @@ def _roots(fit: TransferFit) -> str:
     """Return poles as text: frequency and damping of a pair, or a number."""
     if not all(c.determined for c in fit.denominator):
         return "not determined"
-    return _root_words(fit.poles)
-
-
-def _root_words(poles: Iterable[complex]) -> str:
     words = []
-    for pole in sorted(poles, key=abs):
+    for pole in sorted(fit.poles, key=abs):
         if pole.imag > 0.0:
             damping = number(-pole.real / abs(pole), 3)
             words.append(f"ω {number(abs(pole), 4)}, ζ {damping}")
@@ -387,10 +365,3 @@ def write_netcdf(path: Path, responses: FlightResponses, units: Mapping[str, str
         },
     )
     data.to_netcdf(path, engine="scipy", format="NETCDF3_64BIT")
-
-
-def quotient(output: str, input: str) -> str:
-    """Return the unit of output over input."""
-    if input == "1":
-        return output
-    return f"{output}/({input})" if "/" in input else f"{output}/{input}"

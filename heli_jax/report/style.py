@@ -140,8 +140,6 @@ def _draw(ax: "Axes", p: Panel, most: int) -> None:
             ax.plot(*thinned(s.x, s.y, most), **look)
     for y in p.levels:
         ax.axhline(y, color="#444444", lw=0.7, ls="-" if y == 0.0 else ":")
-    for x in p.marks:
-        ax.axvline(x, color=GREY, lw=0.9, ls="-.")
     ax.set_ylabel(p.label)
     if p.logarithmic:
         ax.set_yscale("log")

@@ -27,7 +27,6 @@ from heli_jax.report import style, tables
 from heli_jax.report.origin import origin
 from heli_jax.report.page import Picture, filled, of_file
 from heli_jax.report.style import pretty
-from heli_jax.sweeps.datasets import chunks_of
 
 RESULTS = 6
 """Results with their own figures."""
@@ -384,11 +383,7 @@ def _numbers(variable: xr.DataArray, elements: np.ndarray) -> np.ndarray:
 
     It is NaN if not finite or too large for Matplotlib.
     """
-    parts = []
-    for which, part in chunks_of(variable):
-        first, last = np.searchsorted(elements, [which.start, which.stop])
-        parts.append(part[elements[first:last] - which.start].astype(np.float64))
-    values = np.concatenate(parts) if parts else np.empty(0)
+    values = variable.isel(element=elements).transpose("element", ...).values.astype(np.float64)
     if values.ndim > 1:
         with np.errstate(invalid="ignore", over="ignore"):
             values = values.mean(axis=1)

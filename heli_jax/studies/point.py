@@ -75,10 +75,7 @@ def _fitted(task: Task) -> Outcome:
         made_for(task.command, _in_words(task.point)),
     ):
         place = Path(folder) / "fit"
-        if task.reports:
-            workflow.write_report(run, place)
-        else:
-            _write_plain(run, place)
+        workflow.write_report(run, place, page=task.reports)
         files = {
             file.relative_to(place).as_posix(): file.read_bytes()
             for file in sorted(place.rglob("*"))
@@ -91,27 +88,6 @@ def _in_words(point: dict[str, Any]) -> str:
     """Return keys and values, as on the Dataset's axes."""
     texts = {k: v if isinstance(v, str) else json.dumps(v) for k, v in point.items()}
     return ", ".join(f"{key} = {text}" for key, text in texts.items())
-
-
-# Any: a FitRun, whose module takes a second to import.
-def _write_plain(run: Any, place: Path) -> None:
-    """Write the files for `load_fit` and `heli-jax compare`, without the page."""
-    import time
-
-    from heli_jax.config import resolved
-    from heli_jax.report import files
-    from heli_jax.report.origin import origin
-    from heli_jax.report.sample_files import write_samples
-    from heli_jax.yaml_file import as_yaml
-
-    place.mkdir()
-    (place / "config.yaml").write_text(as_yaml(resolved(run.config)), encoding="utf-8")
-    files.write_signals(place / "signals.csv", run.fit.signals)
-    further = run.supplementary.intervals
-    write_samples(place, run.fit, further, origin(), str(run.config.path))
-    run.fit.timing["total"] = time.perf_counter() - run.began
-    content = files.fit_json(run.fit, run.problem, run.baseline, run.supplementary)
-    files.write_json(place / "fit.json", content)
 
 
 def _let_programs_go() -> None:

@@ -17,7 +17,7 @@ from heli_jax.report.origin import command
 from heli_jax.stages import Note
 from heli_jax.studies import directory
 from heli_jax.studies.dataset import dataset
-from heli_jax.studies.point import Outcome, Task, failure, fit_point
+from heli_jax.studies.point import Outcome, Task, fit_point
 from heli_jax.sweeps.run import Pace, Progress
 from heli_jax.sweeps.store import only_writer
 from heli_jax.versions import changed_since, versions
@@ -146,9 +146,7 @@ def _outcomes(tasks: Sequence[Task], options: Options) -> Iterator[tuple[int, Ou
         # Here, because dask is an optional extra.
         from heli_jax.sweeps.cluster import mapped
 
-        for number, outcome in mapped(options.client, fit_point, tasks):
-            lost = failure("the dask workers that fitted it died", tasks[number])
-            yield number, lost if outcome is None else outcome
+        yield from mapped(options.client, fit_point, tasks)
         return
     from heli_jax.studies.processes import computed
 

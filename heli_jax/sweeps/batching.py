@@ -19,9 +19,6 @@ _CPU, _GPU = 64, 1 << 17
 _CHUNK_S = 2.0
 # [bytes] Results of a chunk; two chunks are held at once, one in computation and one being written.
 _CHUNK_BYTES = 64e6
-# Approximate number of chunks, if there are enough elements, so that progress is visible. Several
-# processes need twice as many chunks each, so that none waits long for the last one.
-_CHUNKS = 4
 # [bytes] Whole runs held at once, for a user's function.
 _RUN_BYTES = {"cpu": 256e6, "gpu": 8e9}
 # Most elements of a chunk.
@@ -35,7 +32,6 @@ def split_for(
     chunk: int | None = None,
     lanes: int | None = None,
     backend: str = "auto",
-    shares: int = 1,
     say: Callable[[str], None] = lambda _: None,
 ) -> Split:
     """Divide a sweep into chunks that are written at once, and these into batches of the device.
@@ -45,7 +41,6 @@ def split_for(
         chunk: elements written at a time; chosen by default.
         lanes: batch size; chosen by default.
         backend: one of `BACKENDS`.
-        shares: number of processes that compute chunks.
         say: function that reports a note.
 
     Raises:
@@ -62,7 +57,7 @@ def split_for(
         lanes = min(_default(job, kind), _power(share / BLOCKS))
     chosen = "xla" if backend == "xla" else _fused_or_xla(job, devices, lanes, backend, say)
     if chunk is None:
-        chunk = _chunk_for(job, kind, len(devices), lanes, shares)
+        chunk = _chunk_for(job, kind, len(devices), lanes)
     # No larger than the sweep, because missing elements of a chunk are computed all the same.
     step = BLOCKS * lanes * len(devices)
     return Split(min(chunk, math.ceil(job.design.size / step) * step), lanes, chosen)
@@ -84,7 +79,7 @@ def _fused_or_xla(
     return "xla"
 
 
-def _chunk_for(job: Job, kind: str, n_devices: int, lanes: int, shares: int) -> int:
+def _chunk_for(job: Job, kind: str, n_devices: int, lanes: int) -> int:
     """Return the elements of a chunk: whole blocks of all devices, limited by time and memory."""
     step = BLOCKS * lanes * n_devices
     each = (jax.tree.leaves(shapes(job, i)) for i in range(len(job.flights)))
@@ -92,9 +87,7 @@ def _chunk_for(job: Job, kind: str, n_devices: int, lanes: int, shares: int) -> 
     room = min(_MOST_ELEMENTS[kind], 1 << int(math.log2(max(1.0, _CHUNK_BYTES / heaviest))))
     # The estimate is for a core; a GPU finishes any chunk that fits sooner.
     in_time = room if kind == "gpu" else _power(_CHUNK_S * n_devices / _guess(job))
-    chunks = _CHUNKS if shares == 1 else 2 * _CHUNKS * shares
-    each = _power(job.design.size / chunks)
-    return max(step, math.ceil(min(in_time, room, each) / step) * step)
+    return max(step, math.ceil(min(in_time, room) / step) * step)
 
 
 def _power(n: float) -> int:
@@ -112,7 +105,7 @@ def _guess(job: Job) -> float:
     samples = sum(f.n_samples for f in job.flights) if job.simulated else 1
     # The exact step is one product of matrices; the others are assumed to be Runge-Kutta of order
     # 4.
-    stages = 1 if job.solver == "exact" else 4 * job.substeps
+    stages = 1 if job.options.solver == "exact" else 4 * job.options.substeps
     return 1e-9 * samples * stages * len(naming.names(job.model.State))
 
 

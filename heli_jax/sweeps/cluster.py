@@ -234,7 +234,7 @@ def _check_versions(client: Client, where: str) -> None:
 
 def split_there(client: Client, job: Job, **options: Any) -> Split:
     """Divide a sweep in a worker, whose devices may differ, with `options` of `split_for`."""
-    divide = functools.partial(split_for, shares=_threads(client), **options)
+    divide = functools.partial(split_for, **options)
     ((_, split),) = mapped(client, divide, [job])
     return split
 
@@ -320,13 +320,11 @@ def mapped(
     function: Callable[..., Any],
     items: Sequence[Any],
     *shared: Any,
-    may_die: bool = False,
 ) -> Iterator[tuple[int, Any]]:
     """Apply a function to each item and shared arguments; yield in the order of completion.
 
     Yields:
-        The index of an item and the function's result; None if workers died over it and it
-        `may_die`.
+        The index of an item and the function's result.
 
     Raises:
         InputError: the scheduler or its workers are gone.
@@ -348,13 +346,7 @@ def mapped(
     running = _gathered([submitted(k) for _, k in ahead])
     for future, result in _as_completed(client, running):
         with _dask_errors():
-            try:
-                value = result()
-            # dask counts the workers that died over one task; the other tasks continue.
-            except KilledWorker:
-                if not may_die:
-                    raise
-                value = None
+            value = result()
         # Before it is written, otherwise the worker would keep its results until then.
         future.release()
         following = next(waiting, None)

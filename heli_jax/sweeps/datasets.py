@@ -1,22 +1,9 @@
-"""Datasets of sweeps: as a grid of the axes, and in pieces to limit the memory."""
+"""Results of a sweep as a grid of its axes."""
 
-from collections.abc import Iterator
+import math
 
 import numpy as np
 import xarray as xr
-
-# 8 MB of float64: large compared with a chunk of the store, small compared with any memory. A chunk
-# of the store that two pieces share is read twice.
-_ELEMENTS = 1 << 20
-
-
-def chunks_of(variable: xr.DataArray) -> Iterator[tuple[slice, np.ndarray]]:
-    """Yield slices of elements and the variable's values for them (k, ...), in order."""
-    # The elements may be stored last; a slice of them is a slice of rows here.
-    variable = variable.transpose("element", ...)
-    for start in range(0, variable.sizes["element"], _ELEMENTS):
-        which = slice(start, min(start + _ELEMENTS, variable.sizes["element"]))
-        yield which, variable.isel(element=which).values
 
 
 def as_grid(dataset: xr.Dataset) -> xr.Dataset:
@@ -32,32 +19,16 @@ def as_grid(dataset: xr.Dataset) -> xr.Dataset:
     Raises:
         ValueError: the elements are no grid.
     """
-    axes = list(dataset.attrs["axes"])
-    labels, places = {}, []
-    for axis in axes:
-        labels[axis], place = np.unique(dataset[axis].values, return_inverse=True)
-        places.append(place.reshape(-1))
-    shape = tuple(values.size for values in labels.values())
-    size = dataset.sizes["element"]
+    axes, size = list(dataset.attrs["axes"]), dataset.sizes["element"]
+    values = [dataset[axis].values for axis in axes]
+    counts = [np.unique(v).size for v in values]
     # Each cell exactly once.
-    cells = np.ravel_multi_index(tuple(places), shape)
-    if np.unique(cells).size != size or size != np.prod(shape, dtype=float):
-        counts = " x ".join(map(str, shape))
+    if len(set(zip(*values, strict=True))) != size or math.prod(counts) != size:
+        words = " x ".join(map(str, counts))
         raise ValueError(
-            f"as_grid: expected every combination of the axes' values once ({counts}), got {size} "
+            f"as_grid: expected every combination of the axes' values once ({words}), got {size} "
             "elements: a sample has no grid"
         )
-    ordered = dataset.isel(element=np.argsort(cells))
-    variables = {
-        name: (
-            (*axes, *variable.dims[1:]),
-            variable.values.reshape(*shape, *variable.shape[1:]),
-            variable.attrs,
-        )
-        for name, variable in ordered.variables.items()
-        if name not in axes and "element" in variable.dims and name != "element"
-    }
-    kept = {n: c for n, c in dataset.coords.items() if "element" not in c.dims}
-    along = {axis: (axis, labels[axis], dataset[axis].attrs) for axis in axes}
-    grid = xr.Dataset(variables, {**along, **kept}, dataset.attrs)
-    return grid.set_coords("status")
+    if len(axes) == 1:
+        return dataset.swap_dims(element=axes[0]).sortby(axes)
+    return dataset.set_index(element=axes).unstack("element").transpose(*axes, ...)

@@ -38,7 +38,7 @@ def described(job: Job) -> dict[str, Any]:
         }
         for f in job.flights
     ]
-    kept = job.trajectories
+    kept = job.options.trajectories
     return {
         "model": model.name,
         "source": _source(model.vector_field),
@@ -47,20 +47,22 @@ def described(job: Job) -> dict[str, Any]:
         "flights": flights,
         "design": job.design.description,
         "reduce": {n: _reducer(r) for n, r in job.reduce.items()},
-        "solver": job.solver,
-        "substeps": job.substeps,
-        "precision": job.precision,
+        "solver": job.options.solver,
+        "substeps": job.options.substeps,
+        "precision": job.options.precision,
         "trajectories": None if kept is None else [list(kept.signals), kept.every],
         "trimmed": None
-        if job.trimmed is None
+        if job.options.trimmed is None
         else [
-            [float(v) for v in job.trimmed.condition],
-            list(job.trimmed.wind),
-            job.trimmed.sticks,
+            [float(v) for v in job.options.trimmed.condition],
+            list(job.options.trimmed.wind),
+            job.options.trimmed.sticks,
         ],
         "pilot": None
-        if job.pilot is None
-        else digest({str(i): np.asarray(v) for i, v in enumerate(jax.tree.leaves(job.pilot))}),
+        if job.options.pilot is None
+        else digest(
+            {str(i): np.asarray(v) for i, v in enumerate(jax.tree.leaves(job.options.pilot))}
+        ),
     }
 
 

@@ -187,16 +187,13 @@ def grid(axes: Mapping[str, Range | Sequence[float]]) -> Design:
 
     size = math.prod(v.size for v in points.values())
     description = {"design": "grid", "axes": {n: v.tolist() for n, v in points.items()}}
-    logarithmic = frozenset(n for n, v in points.items() if _geometric(v))
-    return Design(tuple(points), size, values, description, logarithmic)
+    return Design(tuple(points), size, values, description, _logarithmic(axes))
 
 
-def _geometric(values: np.ndarray) -> bool:
-    """True if each value is the previous one times the same factor."""
-    if values.size < 3 or not (np.all(values > 0) or np.all(values < 0)):
-        return False
-    steps = np.diff(np.log(np.abs(values)))
-    return bool(steps[0]) and bool(np.allclose(steps, steps[0], rtol=1e-6, atol=0.0))
+def _logarithmic(axes: Mapping[str, Any]) -> frozenset[str]:
+    return frozenset(
+        n for n, axis in axes.items() if isinstance(axis, Range) and axis.scale == "log"
+    )
 
 
 def paired(axes: Mapping[str, Range | Sequence[float]]) -> Design:
@@ -287,8 +284,7 @@ def _sampled(
         return {name: axis.at(cube[:, i]) for i, (name, axis) in enumerate(axes.items())}
 
     description = {"design": kind, "axes": ends, "n": n, "seed": seed}
-    logarithmic = frozenset(name for name, axis in axes.items() if axis.scale == "log")
-    return Design(tuple(axes), n, values, description, logarithmic)
+    return Design(tuple(axes), n, values, description, _logarithmic(axes))
 
 
 @functools.lru_cache(maxsize=8)

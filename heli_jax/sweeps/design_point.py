@@ -48,7 +48,7 @@ class FlightNumbers(NamedTuple):
 def flight_numbers(job: Job, index: int) -> FlightNumbers:
     """Return the numbers of one of the job's flights."""
     # All numbers are cast here, once: a single float64 would make JAX compute in float64.
-    dtype, flight, model = np.dtype(job.precision), job.flights[index], job.model
+    dtype, flight, model = np.dtype(job.options.precision), job.flights[index], job.model
     inputs = {n: flight.inputs[n].astype(dtype) for n in naming.names(model.Inputs)}
     against = {
         name: reducers.measured(flight.outputs[str(r.signal)], dtype)
@@ -61,7 +61,7 @@ def flight_numbers(job: Job, index: int) -> FlightNumbers:
         model.Inputs(**inputs),
         {n: np.asarray(v, dtype) for n, v in flight.known.items()},
         against,
-        jax.tree.map(lambda v: np.asarray(v, dtype), job.pilot),
+        jax.tree.map(lambda v: np.asarray(v, dtype), job.options.pilot),
     )
 
 
@@ -92,22 +92,22 @@ def steady(plan: Plan, numbers: FlightNumbers, values: Scalars) -> InitialTrim:
         numbers: numbers of the flight and the vehicle, SI.
         values: values of the axes, scalars, SI.
     """
-    assert plan.trimmed is not None
-    whole, dtype = plan.trimmed.of or plan.model, numbers.dt.dtype
+    assert plan.options.trimmed is not None
+    whole, dtype = plan.options.trimmed.of or plan.model, numbers.dt.dtype
     params, _ = params_of(plan, numbers, values)
     plain = whole.Params(**{n: getattr(params, n) for n in naming.names(whole.Params)})
     # In the default precision for any sweep: in float32 the final residuals are too large to prove
     # a steady flight.
     plain, condition, wind = jax.tree.map(
         lambda v: jnp.asarray(v, jnp.result_type(float)),
-        (plain, plan.trimmed.condition, tuple(plan.trimmed.wind)),
+        (plain, plan.options.trimmed.condition, tuple(plan.options.trimmed.wind)),
     )
     # Without a disturbance: a steady flight is in still air or steady wind.
     trim = equilibrium(whole, plain, condition, wind)
     sound = _is_trimmed(trim)
     # The states of a disturbance have no trim and keep their own initial values.
     state = naming.replace(plan.model.initial_state(params), **naming.asdict(trim.state))
-    share = 1.0 if plan.trimmed.sticks else 0.0
+    share = 1.0 if plan.options.trimmed.sticks else 0.0
     sticks = jax.tree.map(lambda v: jnp.asarray(share * v, dtype), trim.inputs)
     state = jax.tree.map(lambda v: jnp.asarray(v, dtype), state)
     return InitialTrim(state, sticks, sound)
@@ -376,7 +376,7 @@ def _streamed(plan: Plan, numbers: FlightNumbers, params: Any, state: Any, input
 def _streamed_options(
     plan: Plan, numbers: FlightNumbers, state: Any, block: int
 ) -> SimulationOptions:
-    block = block if plan.solver == "exact" else 1
+    block = block if plan.options.solver == "exact" else 1
     return plan.simulation(dt=numbers.dt, initial_state=state, block=block)
 
 
@@ -409,8 +409,8 @@ def _whole(
         if callable(reducer.how) and reducers.streaming(reducer) is None:
             results |= _of_function(name, reducer.how, run)
     kept = {}
-    if plan.trajectories is not None:
-        every = plan.trajectories.every
-        kept = {n: getattr(run.outputs, n)[::every] for n in plan.trajectories.signals}
+    if plan.options.trajectories is not None:
+        every = plan.options.trajectories.every
+        kept = {n: getattr(run.outputs, n)[::every] for n in plan.options.trajectories.signals}
     last = jax.tree.map(lambda v: v[-1], run.states)
     return results, kept, last, [jnp.any(out) for out in run.outside.values()]

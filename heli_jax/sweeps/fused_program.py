@@ -50,8 +50,8 @@ def refusal(job: Job, devices: Sequence[Any], lanes: int) -> str | None:
         return "it is for CPUs alone"
     if not job.streamed or not job.simulated:
         return "its runs are kept whole, or none is made"
-    if job.solver not in _SOLVERS:
-        return f"the solver {job.solver} cannot be translated"
+    if job.options.solver not in _SOLVERS:
+        return f"the solver {job.options.solver} cannot be translated"
     try:
         # The compiled program is cached for the sweep that follows.
         for index in range(len(job.flights)):
@@ -109,7 +109,7 @@ def _example(job: Job, index: int) -> tuple[Plan, FlightNumbers, Scalars, Any]:
     plan, numbers = job.plan(index), flight_numbers(job, index)
     values = {n: v[0] for n, v in arguments(job, job.design.values(0, 1)).items()}
     trim = None
-    if plan.trimmed is not None:
+    if plan.options.trimmed is not None:
         shape = jax.eval_shape(functools.partial(steady, plan), numbers, values)
         trim = jax.tree.map(lambda v: np.zeros(v.shape, v.dtype), shape)
     return plan, numbers, values, trim
@@ -165,5 +165,7 @@ def _compiled(
 
     before, split = spread(own, devices, lanes)
     conclude, _ = spread(functools.partial(of_steps, plan), devices, lanes)
-    kernel = Kernel(run.run, lanes_for(np.dtype(plan.precision), plan.solver == "exact"))
+    kernel = Kernel(
+        run.run, lanes_for(np.dtype(plan.options.precision), plan.options.solver == "exact")
+    )
     return _Parts(kernel, run, before, common, conclude, split, trims_of(plan, lanes))

@@ -30,7 +30,7 @@ _CPU_OPTIONS = {"xla_cpu_prefer_vector_width": 512}
 
 def arguments(job: Job, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the axes' values in the form for the compiled part."""
-    dtype = np.dtype(job.precision)
+    dtype = np.dtype(job.options.precision)
     # A seed in float32 would lose its last digits beyond 2^24. A NaN seed gets some number, and its
     # element is flagged afterwards.
     whole = {"seed"} - set(naming.names(job.model.Params))
@@ -55,7 +55,7 @@ def _shapes(
 ) -> ElementResults:
     numbers, values = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*v) for v in leaves])
     trim = None
-    if plan.trimmed is not None:
+    if plan.options.trimmed is not None:
         trim = jax.eval_shape(functools.partial(steady, plan), numbers, values)
     return jax.eval_shape(functools.partial(design_point, plan), numbers, values, trim)
 
@@ -78,7 +78,7 @@ def trims_of(plan: Plan, lanes: int) -> Any:
         return _batched(functools.partial(steady, plan, numbers), values, lanes)
 
     # Separate, because lineax does not work within shard_map.
-    return None if plan.trimmed is None else jax.jit(starts)
+    return None if plan.options.trimmed is None else jax.jit(starts)
 
 
 def spread(

@@ -185,7 +185,6 @@ def _notes(job: Job) -> list[Finding]:
 def _resume(job: Job, out: Path, options: Options) -> xr.Dataset:
     """Compute the missing chunks of a store on disk, and write its summary."""
     where = f"--out {out}"
-    stores.require_files(out, where)
     with stores.only_writer(out, where):
         # A new store is opened like an old one, because it may come from a killed process or from a
         # concurrent one.
@@ -221,7 +220,7 @@ def _cut(job: Job, options: Options, words: dict[str, Any]) -> tuple[Split, dict
     else:
         split = split_for(job, devices=options.devices, say=options.say, **requested)
     # Once, when the store is made, so that a resumed sweep keeps the error from its start.
-    if job.precision == "float32":
+    if job.options.precision == "float32":
         words = {**words, "float32_error": float32_error(job)}
     return split, words
 
@@ -300,16 +299,17 @@ def float32_error(job: Job) -> dict[str, float | str]:
     columns = [job.design.values(int(k), int(k) + 1) for k in chosen]
     some = table({name: np.concatenate([c[name] for c in columns]) for name in columns[0]})
     split = Split(len(chosen), len(chosen))
+    exact = job.options._replace(precision="float64")
     # One device: compiling for others would not pay for 64 elements.
     devices = jax.local_devices()[:1]
     single = Worker(job._replace(design=some), split, devices).run(0)
-    double = Worker(job._replace(design=some, precision="float64"), split, devices).run(0)
+    double = Worker(job._replace(design=some, options=exact), split, devices).run(0)
     errors: dict[str, float | str] = {}
-    for name, exact in double.items():
-        if name in some.names or exact.dtype.kind != "f":
+    for name, values in double.items():
+        if name in some.names or values.dtype.kind != "f":
             continue
-        off = np.abs(single[name] - exact)
-        off, size = off[np.isfinite(off)], np.abs(exact[np.isfinite(exact)])
+        off = np.abs(single[name] - values)
+        off, size = off[np.isfinite(off)], np.abs(values[np.isfinite(values)])
         # Relative to the largest value, not to each value: one that is zero up to rounding has no
         # valid digits.
         largest = size.max(initial=0.0)

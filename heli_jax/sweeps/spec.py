@@ -49,10 +49,10 @@ class Trimmed(NamedTuple):
 class RunOptions(NamedTuple):
     """Options of each run of a sweep; each field is also a keyword of `sweep`."""
 
-    solver: str | None = None
-    """Solver with fixed steps: "exact" (linear models, their default), "rk4", or a diffrax solver's
-    name."""
-    substeps: int | None = None
+    solver: str = ""
+    """Solver with fixed steps: "exact" (default of linear models), "rk4" (of others), or a diffrax
+    solver's name."""
+    substeps: int = 0
     """Steps per sample; by default enough for steps of 5 ms."""
     precision: Precision = "float64"
     """Precision. float32 is faster on some devices; its error is measured on 64 elements and stored
@@ -73,11 +73,8 @@ class Plan(NamedTuple):
 
     model: Model
     reduce: tuple[tuple[str, Reduce], ...]
-    solver: str
-    substeps: int
-    precision: Precision
-    trajectories: Trajectories | None
-    trimmed: Trimmed | None
+    options: RunOptions
+    """Without the pilot, whose gains are numbers."""
     streamed: bool
     simulated: bool
     moving: tuple[tuple[str, str], ...] = ()
@@ -86,8 +83,8 @@ class Plan(NamedTuple):
     def simulation(self, **numbers: Any) -> SimulationOptions:  # fields of several types
         """Return the simulation options of a run; `numbers` are the fields that vary by element."""
         return SimulationOptions(
-            solver=solver_named(self.solver),
-            substeps=self.substeps,
+            solver=solver_named(self.options.solver),
+            substeps=self.options.substeps,
             hold={
                 **dict.fromkeys(naming.names(self.model.Inputs), "zero-order"),
                 **dict(self.moving),
@@ -111,23 +108,15 @@ class Job(NamedTuple):
     flights: tuple[Flight, ...]
     design: Design
     reduce: dict[str, Reduce]
-    solver: str
-    substeps: int
-    precision: Precision
-    trajectories: Trajectories | None
-    trimmed: Trimmed | None
-    pilot: Pilot | None
+    options: RunOptions
+    """With the solver and its steps."""
 
     def plan(self, index: int) -> Plan:
         """Return the compiled part for one of its flights."""
         return Plan(
             self.model,
             tuple(self.reduce.items()),
-            self.solver,
-            self.substeps,
-            self.precision,
-            self.trajectories,
-            self.trimmed,
+            self.options._replace(pilot=None),
             self.streamed,
             self.simulated,
             moving_inputs_of(self.model, self.flights[index]),
@@ -141,14 +130,14 @@ class Job(NamedTuple):
         # `accumulate` lacks delay, noise and feedback, which `simulate` has. Such runs are stored
         # whole and reduced afterwards.
         drawn_or_late = {"delay", "seed"} & set(special_axes(self.model, self.design))
-        kept = self.trajectories is not None
-        return not whole and not drawn_or_late and not kept and self.pilot is None
+        kept = self.options.trajectories is not None
+        return not whole and not drawn_or_late and not kept and self.options.pilot is None
 
     @property
     def simulated(self) -> bool:
         """True if anything is simulated."""
         kept = [r for r in self.reduce.values() if r.how not in reducers.LINEAR]
-        return bool(kept) or self.trajectories is not None
+        return bool(kept) or self.options.trajectories is not None
 
 
 def moving_inputs_of(model: Model, flight: Flight) -> tuple[tuple[str, str], ...]:
@@ -203,7 +192,7 @@ def job(
         )
     _check_axes(model, design, flights)
     _check_inputs(model, flights)
-    _check_results(model, design, reduce, flights, options.trajectories)
+    _check_results(model, reduce, flights, options.trajectories)
     _check_precision(model, options.precision)
     # The exact step of a linear model leaves no solver error in the results.
     solver = options.solver or ("exact" if model.linear else "rk4")
@@ -220,16 +209,14 @@ def job(
         raise ValueError(
             f"model {model.name!r} cannot be trimmed: it is not the full nonlinear model"
         )
-    substeps = options.substeps
-    if substeps is None:
-        # One program serves all flights, so the slowest rate decides the number of steps.
-        substeps = substeps_for(max(f.dt for f in flights), model.fastest)
+    # One program serves all flights, so the slowest rate decides the number of steps.
+    substeps = options.substeps or substeps_for(max(f.dt for f in flights), model.fastest)
     if substeps < 1:
         raise ValueError(f"substeps must be at least 1, got {substeps}")
     # Plain numbers, not arrays: they are compared with the store's JSON.
     numbers = {n: float(v) for n, v in naming.asdict(params).items()}
     checked = options._replace(solver=solver, substeps=substeps)
-    return Job(model, numbers, flights, design, dict(reduce), **checked._asdict())
+    return Job(model, numbers, flights, design, dict(reduce), checked)
 
 
 def _check_precision(model: Model, precision: str) -> None:
@@ -319,7 +306,6 @@ def _check_inputs(model: Model, flights: tuple[Flight, ...]) -> None:
 
 def _check_results(
     model: Model,
-    design: Design,
     reduce: Mapping[str, Reduce],
     flights: tuple[Flight, ...],
     trajectories: Trajectories | None,
@@ -329,10 +315,6 @@ def _check_results(
         raise ValueError("reduce: no result is kept, expected a result or trajectories")
     for name, reducer in reduce.items():
         reducers.check(name, reducer, outputs, inputs)
-        # Reserved names of the store; names that its format cannot have are refused where it is
-        # created.
-        if name in design.names or name in ("status", "element"):
-            raise ValueError(f"reduce.{name}: the name exists already, expected another")
         stream = reducers.streaming(reducer)
         signal = str(reducer.signal)
         for flight in flights if stream is not None and stream.against_flight else ():

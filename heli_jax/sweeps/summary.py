@@ -1,9 +1,7 @@
 """Summary of a sweep, as JSON."""
 
 import contextlib
-import functools
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +10,6 @@ import xarray as xr
 
 from heli_jax import run_directory
 from heli_jax.finding import as_data, note
-from heli_jax.sweeps.datasets import chunks_of
 from heli_jax.sweeps.design_point import MEANINGS, OK
 from heli_jax.sweeps.spec import Job
 
@@ -41,7 +38,6 @@ def write_summary(
 
 def summary(dataset: xr.Dataset, job: Job, timing: dict[str, Any]) -> dict[str, Any]:
     """Return counts by status, and quantiles, the worst and the best valid elements by result."""
-    # The status takes a byte per element and is held; results are read in pieces.
     status = dataset["status"].values
     fine = status == OK
     results = {
@@ -85,11 +81,10 @@ def _unit(variable: xr.DataArray) -> dict[str, str]:
 
 def _ends(variable: xr.DataArray) -> dict[str, Any]:
     """Return the smallest and the largest finite value; empty if there is none."""
-    parts = [part for _, values in chunks_of(variable) if (part := _finite(values)).size]
-    if not parts:
+    values = _finite(variable.values)
+    if not values.size:
         return {}
-    ends = {"min": min(float(v.min()) for v in parts), "max": max(float(v.max()) for v in parts)}
-    return {**ends, **_unit(variable)}
+    return {"min": float(values.min()), "max": float(values.max()), **_unit(variable)}
 
 
 def _quantiles(variable: xr.DataArray, fine: np.ndarray) -> dict[str, Any]:
@@ -97,22 +92,13 @@ def _quantiles(variable: xr.DataArray, fine: np.ndarray) -> dict[str, Any]:
 
     Flights and modes are included if a result has them.
     """
-    # The values are stored once, and the partition for the quantiles is made in place. Joining a
-    # list of parts would double the memory, which matters for a million elements.
-    values, n = np.empty(np.count_nonzero(fine) * (variable.size // max(1, fine.size))), 0
-    infinite = nan = 0
-    for which, part in chunks_of(variable):
-        used = part[fine[which]]
-        infinite += int(np.count_nonzero(np.isinf(used)))
-        nan += int(np.count_nonzero(np.isnan(used)))
-        finite = _finite(used)
-        values[n : n + finite.size] = finite
-        n += finite.size
-    others = {"infinite": infinite, "nan": nan}
-    counts = {"n": n} | {k: v for k, v in others.items() if v}
-    if not n:
+    used = _by_element(variable)[fine]
+    values = _finite(used).astype(np.float64)
+    others = {"infinite": int(np.isinf(used).sum()), "nan": int(np.isnan(used).sum())}
+    counts = {"n": values.size} | {k: v for k, v in others.items() if v}
+    if not values.size:
         return {**_unit(variable), **counts}
-    q = np.quantile(values[:n], [0.0, 0.05, 0.5, 0.95, 1.0], overwrite_input=True)
+    q = np.quantile(values, [0.0, 0.05, 0.5, 0.95, 1.0], overwrite_input=True)
     names = ("min", "q05", "median", "q95", "max")
     return {**_unit(variable), **counts, **dict(zip(names, map(float, q), strict=True))}
 
@@ -130,46 +116,27 @@ def worst(dataset: xr.Dataset, job: Job, sign: float = 1.0) -> dict[str, np.ndar
         # which numbers should be small is unknown.
         if name not in dataset.data_vars:
             continue
-        badness = functools.partial(_badness, small_is_bad=reduce.how in _SMALL_IS_BAD, sign=sign)
-        elements = _worst(dataset[name], fine, badness, _WORST_COUNT)
+        # A bool or an integer has no minus.
+        values = _by_element(dataset[name]).astype(np.float64)
+        bad = -values if reduce.how in _SMALL_IS_BAD else np.abs(values)
+        # The worst flight counts, for either sign.
+        bad = sign * bad.reshape(len(values), -1).max(axis=1)
+        usable = np.flatnonzero(fine & np.isfinite(bad))
+        elements = usable[np.argsort(-bad[usable], kind="stable")][:_WORST_COUNT]
         if elements.size:
             by_result[name] = elements
     return by_result
 
 
-def _badness(part: np.ndarray, *, small_is_bad: bool, sign: float) -> np.ndarray:
-    """Return the measure (elements,) of a result (elements, ...), large for the worst."""
-    values = part.astype(np.float64)  # a bool or an integer has no minus
-    bad = -values if small_is_bad else np.abs(values)
-    # The worst flight first, for either sign.
-    return sign * bad.reshape(len(values), -1).max(axis=1)
-
-
-def _worst(
-    variable: xr.DataArray,
-    fine: np.ndarray,
-    badness_of: Callable[[np.ndarray], np.ndarray],
-    count: int,
-) -> np.ndarray:
-    """Return the worst valid elements of a variable, worst first, (count,) or fewer."""
-    badness, element = np.empty(0), np.empty(0, np.int64)
-    for which, part in chunks_of(variable):
-        bad = badness_of(part)
-        usable = np.flatnonzero(fine[which] & np.isfinite(bad))
-        most = min(count, usable.size)
-        # The worst few of each part, then of those the worst: all elements are never sorted or
-        # stored.
-        top = usable[np.argpartition(bad[usable], -most)[-most:]] if most else usable
-        badness = np.concatenate([badness, bad[top]])
-        element = np.concatenate([element, top + which.start])
-    # Ties are sorted by position, so that the order does not depend on the reading.
-    return element[np.lexsort((element, -badness))[:count]]
+def _by_element(variable: xr.DataArray) -> np.ndarray:
+    """Return the values (elements, ...); they may be stored with the elements last."""
+    return variable.transpose("element", ...).values
 
 
 def _rows(dataset: xr.Dataset, job: Job, name: str, elements: np.ndarray) -> list[dict[str, Any]]:
     """Return elements with their value of a result and their axes, as plain data for JSON."""
     few = dataset.isel(element=elements)
-    values = few[name].transpose("element", ...).values.tolist()
+    values = _by_element(few[name]).tolist()
     axes = {n: few[n].values.astype(np.float64) for n in job.design.names}
     return [
         {"element": int(k), "value": v, "axes": {n: float(a[i]) for n, a in axes.items()}}

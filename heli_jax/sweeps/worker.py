@@ -108,7 +108,7 @@ def _result_variables(job: Job) -> Iterator[tuple[str, _Sized]]:
             raise ValueError(
                 f"reduce.{name}: the result has shape {result.shape}, expected one number"
             )
-        yield name, ((), job.precision, _result_words(job, name))
+        yield name, ((), job.options.precision, _result_words(job, name))
     for name, reduce in job.reduce.items():
         if reduce.how == "modes":
             n = len(naming.names(job.model.State))
@@ -122,7 +122,7 @@ def _result_variables(job: Job) -> Iterator[tuple[str, _Sized]]:
     outputs = job.model.Outputs
     for name, kept in shape.trajectories.items():
         words = _words(naming.unit(outputs, name), naming.meaning(outputs, name))
-        yield f"trajectory_{name}", ((("time", kept.shape[0]),), job.precision, words)
+        yield f"trajectory_{name}", ((("time", kept.shape[0]),), job.options.precision, words)
 
 
 def _margin_variables(name: str, loop: str) -> Iterator[tuple[str, _Sized]]:

@@ -5,7 +5,7 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight
-from heli_jax.analysis.flight_responses import Settings, Wanted, flight_responses
+from heli_jax.analysis.flight_responses import Settings, TransferRequest, flight_responses
 from heli_jax.analysis.responses import averaged, student95
 from heli_jax.analysis.transfer_fit import TransferFit
 
@@ -41,7 +41,7 @@ def record(seed: int) -> Flight:
 
 def test_of_little_more_than_two_averages_intervals_hold_the_truth():
     """Test coverage; with 1.96 and each frequency's own error it was 92 % of bins."""
-    wanted = Wanted("lat", "p", zeros=0, poles=2, delay=False)
+    wanted = TransferRequest("lat", "p", zeros=0, poles=2, delay=False)
     settings = Settings((0.4, 4.0), 18.0, points=30, transfer_functions=(wanted,))
     b, a, _ = scipy.signal.cont2discrete(([TRUTH[0]], [1.0, *TRUTH[1:]]), DT)
     bins, numbers = [], []

@@ -4,7 +4,7 @@ import numpy as np
 import scipy.signal
 
 from heli_jax import Flight
-from heli_jax.analysis.flight_responses import Settings, Wanted, flight_responses
+from heli_jax.analysis.flight_responses import Settings, TransferRequest, flight_responses
 from heli_jax.analysis.transfer_fit import TransferFit
 
 DT, N = 0.02, 3000
@@ -22,7 +22,7 @@ def swept() -> tuple[np.ndarray, np.ndarray]:
 def test_a_sweep_in_little_noise_gives_the_transfer_function_that_made_it():
     u, y = swept()
     flight = Flight(dt=DT, inputs={"lat": u}, outputs={"phi": y}, hold={"lat": "zero-order"})
-    wanted = Wanted("lat", "phi", zeros=0, poles=2)
+    wanted = TransferRequest("lat", "phi", zeros=0, poles=2)
     settings = Settings((0.2, 6.0), 15.0, transfer_functions=(wanted,))
     [(_, found)] = flight_responses([flight], settings).fits
     assert isinstance(found, TransferFit)

@@ -49,23 +49,22 @@ def test_a_chart_has_all_points_its_file_fewer_and_words_its_range():
     assert "0 to 50" in words
 
 
-def test_bars_bands_marks_and_shades_are_drawn_where_they_are():
+def test_bars_bands_and_shades_are_drawn_where_they_are():
     x, y = np.arange(1.0, 6.0), np.array([1.0, 3.0, 2.0, 5.0, 4.0])
     series = [
         band(x, y - 0.5, y + 1.5, style.SKY),
         bars("data", x, y, [0.1 * y, 0.2 * y], style.BLUE),
     ]
-    only = panel("y", series, marks=(2.5,), shades=((3.0, 4.0),))
+    only = panel("y", series, shades=((3.0, 4.0),))
     np.testing.assert_allclose([series[1].low, series[1].high], [0.9 * y, 1.2 * y])
     [ax] = style.styled(lambda: Chart("t", "x", (1.0, 5.0), (only,))).axes
     assert ax.get_ylim() == pytest.approx((0.5 - 0.05 * 6.0, 6.5 + 0.05 * 6.0))
     [shade] = ax.collections
     extent = shade.get_datalim(ax.transData)
     assert (extent.y0, extent.y1) == pytest.approx((0.5, 6.5))
-    points, ends, mark = ax.get_lines()
+    points, ends = ax.get_lines()
     np.testing.assert_allclose(points.get_ydata(), y)
     np.testing.assert_allclose(ends.get_ydata()[:2], [0.9, 1.2])
-    assert mark.get_xdata()[0] == 2.5
     assert len(ax.patches) == 1
 
 

@@ -10,7 +10,7 @@ from heli_jax.analysis.attitude_responses import handling_pairs
 from heli_jax.analysis.flight_responses import Settings
 from heli_jax.report.card import card
 from heli_jax.report.files import SupplementaryAnalyses, fit_json
-from heli_jax.report.fit_page import Analysis, drawings, render
+from heli_jax.report.fit_page import Analysis, drawings, write_report
 from heli_jax.report.fitted_responses import NO_RESPONSES, fitted_responses
 from heli_jax.report.tables import handling
 from tests import responses
@@ -53,15 +53,15 @@ def test_the_model_s_response_is_that_of_the_bode_figure_and_moves_with_its_para
     assert np.mean(np.abs(np.stack([z.real, z.imag])) < 2.5) > 0.8
 
 
-def test_they_are_drawn_told_and_written(sound, shown):
+def test_they_are_drawn_told_and_written(sound, shown, tmp_path):
     fit, problem, baseline = sound
     supplementary = SupplementaryAnalyses(responses=shown)
     analysis = Analysis(fit, problem, baseline, supplementary)
     (name,) = [n for n in drawings(analysis) if n.startswith("match")]
     chart = drawings(analysis)[name]()
     assert [p.label for p in chart.panels][2:] == ["coherence", "error [dB]", "error [deg]"]
-    page = render(analysis, "title", {}, [])
-    assert "Handling qualities" in page
+    write_report(tmp_path, analysis, "title", {})
+    assert "Handling qualities" in (tmp_path / "report.html").read_text(encoding="utf-8")
     first = handling(shown.handling).rows[0]
     assert (first[0], first[1], first[-1]) == ("x_roll to roll", "bandwidth", "rad/s")
     (content,) = fit_json(fit, problem, baseline, supplementary)["handling_qualities"]

@@ -9,7 +9,6 @@ import pytest
 import xarray as xr
 
 from heli_jax.report import sweeps
-from heli_jax.sweeps import datasets as pieces
 
 UNITS = {"Ixx": "kg*m^2", "If": "kg*m^2", "initial.phi": "rad", "misfit": "rad", "fit": "%"}
 
@@ -223,7 +222,6 @@ def test_results_of_several_flights_are_means():
 def test_a_large_sweep_is_drawn_by_lot(monkeypatch):
     ds = sweep(4000)
     monkeypatch.setattr(sweeps, "DRAWN", 400)
-    monkeypatch.setattr(pieces, "_ELEMENTS", 300)
     table = sweeps.Table(ds)
     assert (table.size, table.n_ok) == (4000, np.count_nonzero(ds["status"] == 0))
     assert np.count_nonzero(table.ok) == 400

@@ -1,6 +1,5 @@
 """Sentences about a transfer function in terminal, page and JSON."""
 
-import numpy as np
 import pytest
 
 from heli_jax.analysis.transfer_fit import Coefficient, TransferFit
@@ -28,15 +27,3 @@ def _fit(*denominator: float, chi_squared: float = 1.0, converged: bool = True) 
 )
 def test_what_is_to_be_heeded_of_a_transfer_function(fit: TransferFit, sentences: int) -> None:
     assert len(fit_sentences(fit, WINDOW)) == sentences
-
-
-def test_poles_that_zeros_all_but_cancel_are_named() -> None:
-    """Test that 25 (s + 7.7) / ((s + 3) (s + 8)) is close to 25 / (s + 3)."""
-    numerator = tuple(Coefficient(v, 0.1, v - 0.2, v + 0.2) for v in (25.0, 25.0 * 7.7))
-    assert len(fit_sentences(_fit(11.0, 24.0)._replace(numerator=numerator), WINDOW)) == 1
-    away = tuple(Coefficient(v, 0.1, v - 0.2, v + 0.2) for v in (25.0, 25.0 * 5.0))
-    assert not fit_sentences(_fit(11.0, 24.0)._replace(numerator=away), WINDOW)
-    undetermined = numerator[1]._replace(sd=np.inf)
-    assert not fit_sentences(
-        _fit(11.0, 24.0)._replace(numerator=(numerator[0], undetermined)), WINDOW
-    )

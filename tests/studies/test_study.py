@@ -180,7 +180,7 @@ def test_a_page_names_the_studys_command_and_its_point(config, tmp_path, monkeyp
     monkeypatch.setattr("sys.argv", ["/opt/heli_jax/studies/worker.py"])
     page = fit_point(task).files["report.html"].decode()
     assert f">{asked}</pre>" in page
-    assert "Of a study the fit at fit.free.Ixx.start = 0.03<" in page
+    assert "fit.free.Ixx.start = 0.03<" in page
     assert "worker.py" not in page
 
 

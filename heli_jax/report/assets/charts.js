@@ -122,7 +122,6 @@
     ctx.strokeStyle = style("--strong");
     const stroke = (x0, y0, x1, y1) => { ctx.beginPath(); ctx.moveTo(x0, y0); ctx.lineTo(x1, y1); ctx.stroke(); };
     for (const y of panel.levels) stroke(bbox.left, u.valToPos(y, "y", true), bbox.left + bbox.width, u.valToPos(y, "y", true));
-    for (const x of panel.marks) stroke(u.valToPos(x, "x", true), bbox.top, u.valToPos(x, "x", true), bbox.top + bbox.height);
     ctx.setLineDash([]);
     for (const [at, s] of bars) {
       ctx.strokeStyle = shown(s.color);

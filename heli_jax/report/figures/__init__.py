@@ -3,7 +3,7 @@
 Scatter plots of samples use Matplotlib within `style.in_style()` and are images on the page.
 """
 
-from heli_jax.report.figures.bode import bode_unit, draw_response, match
+from heli_jax.report.figures.bode import draw_response, match, quotient
 from heli_jax.report.figures.estimates import (
     bootstrap_pairs,
     posterior_pairs,
@@ -19,13 +19,13 @@ from heli_jax.report.figures.signals import (
 )
 
 __all__ = [
-    "bode_unit",
     "bootstrap_pairs",
     "draw_response",
     "match",
     "motion",
     "overview",
     "posterior_pairs",
+    "quotient",
     "residual_correlation",
     "response",
     "rls_history",

@@ -10,10 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from heli_jax import naming
 from heli_jax.analysis.response_curves import unnoticeable
 from heli_jax.analysis.spectra import COHERENT, octave_mean
-from heli_jax.dynamics.model import Model
 from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.identifiability.verdict import Z95
 from heli_jax.report import style
@@ -24,25 +22,17 @@ _TURN = 2.0 * np.pi
 """rad/s of 1 Hz."""
 _DB = 20.0 / np.log(10.0)
 SEEN, BEYOND_CHANCE = 0.1, 0.3
-"""Mean coherence over an octave below which it is chance, and above which it is not; the axis ends
-at the last bin above the second."""
+"""Mean coherence over an octave below which it is chance, and above which it is not; the axes hold
+the bins above the second."""
 _WIDE, _WIDE_DATA = 1.0, 0.5
 """Relative random error above which a measured response, and one beside a model, is not drawn."""
 _BY_CHANCE = 2.0
 """Least product of mean coherence over an octave and number of averages, for a bin that sets the
-axes and the phase branch."""
+phase branch."""
 _MARGINS = (6.0, 45.0)
 """Margins of the axes [dB, deg]."""
 _ERRORS = (12.0, 90.0)
 """Half range of the error panels [dB, deg]."""
-_FEW = 3
-"""Fewest bins that set the axes."""
-
-
-def _chart(title: str, note: str, limits: Sequence[float], panels: Sequence[Panel]) -> Chart:
-    """Return a chart over frequency with limits [rad/s]."""
-    hz = float(limits[0]) / _TURN, float(limits[-1]) / _TURN
-    return Chart(title, "frequency [Hz]", hz, tuple(panels), note, logarithmic=True)
 
 
 def _nearest(degrees: np.ndarray, along: np.ndarray) -> np.ndarray:
@@ -73,18 +63,19 @@ def _curve(
     """Return magnitude [dB] and phase of a response."""
     # A zero has no phase; NaN breaks the line.
     good = np.isfinite(H) & (np.abs(H) > 0)
-    gain = np.where(good, _DB * np.log(np.where(good, np.abs(H), 1.0)), np.nan)
-    of_phase = np.where(good, degrees, np.nan)
-    hz = omega / _TURN
-    return (
-        Series(label, hz, gain, color, width=width),
-        Series(label, hz, of_phase, color, width=width),
-    )
+    gain = np.where(good, _decibels(np.where(good, H, 1.0)), np.nan)
+    hz, degrees = omega / _TURN, np.where(good, degrees, np.nan)
+    of_gain = Series(label, hz, gain, color, width=width)
+    return of_gain, of_gain._replace(y=degrees)
+
+
+def _decibels(H: np.ndarray) -> np.ndarray:
+    return _DB * np.log(np.abs(H))
 
 
 def _bars(
     omega: np.ndarray,
-    gain: np.ndarray,
+    H: np.ndarray,
     degrees: np.ndarray,
     relative: tuple[np.ndarray, np.ndarray],
     color: str,
@@ -94,37 +85,60 @@ def _bars(
     hz = omega / _TURN
     down = -_DB * np.log(np.maximum(1.0 - relative[0], 1e-2))
     reach = np.degrees(np.minimum(relative[1], np.pi))
-    of_gain = bars(label, hz, gain, [down, _DB * np.log1p(relative[0])], color)
+    of_gain = bars(label, hz, _decibels(H), [down, _DB * np.log1p(relative[0])], color)
     return of_gain, bars(label, hz, degrees, reach, color)
 
 
-def _coherence(omega: np.ndarray, coherence: np.ndarray) -> Panel:
-    series = Series("", omega / _TURN, coherence, style.BLACK, width=0.9)
-    return panel("coherence", [series], 0.8, limits=(0.0, 1.05), levels=(COHERENT,))
+def _bode(
+    heading: tuple[str, str],
+    unit: str,
+    at: tuple[np.ndarray, np.ndarray, np.ndarray],
+    values: tuple[np.ndarray, np.ndarray],
+    series: Sequence[Sequence[Series]],
+    further: Sequence[Panel] = (),
+) -> Chart:
+    """Return gain, phase and coherence over frequency; coherent bins set the axes.
 
-
-def bode_unit(model: Model, output: str, input: str) -> str:
-    """Return `dB re rad/m`; only `dB` if a unit is missing or would need brackets."""
-    out, into = naming.unit(model.Outputs, output), naming.unit(model.Inputs, input)
-    if into == "1":
-        return f"dB re {out}" if out and out != "1" else "dB"
-    return f"dB re {out}/{into}" if out and into and "/" not in into else "dB"
-
-
-def _last_of(omega: np.ndarray, coherence: np.ndarray, known: np.ndarray) -> float:
-    """Return the last frequency of the axes [rad/s], that of a coherent bin."""
+    Args:
+        heading: title and note.
+        at: frequencies [rad/s], coherence, and True for known bins; (k,) each.
+        values: measured gain [dB] and phase [deg], (k,).
+        series: series of gain and phase, in pairs.
+        further: panels below.
+    """
+    omega, coherence, known = at
     mean = octave_mean(omega, coherence)
-    for bins in (known & (mean >= BEYOND_CHANCE), known & (mean >= SEEN), known):
-        if bins.any():
-            return float(omega[np.flatnonzero(bins)[-1]])
-    return float(omega[-1])
+    coherent = (known & (mean >= least) for least in (BEYOND_CHANCE, SEEN))
+    shown = next((bins for bins in coherent if bins.any()), known)
+    gain_label = f"gain [dB re {unit}]" if unit not in ("", "1") else "gain [dB]"
+    looks = ((gain_label, 1.7), ("phase [deg]", 1.4))
+    panels = []
+    for (label, height), v, margin, lines in zip(
+        looks, values, _MARGINS, zip(*series, strict=True), strict=True
+    ):
+        limits = limits_of(lines)
+        if shown.any():
+            limits = float(np.min(v[shown])) - margin, float(np.max(v[shown])) + margin
+        panels.append(panel(label, lines, height, limits=limits))
+    line = Series("", omega / _TURN, coherence, style.BLACK, width=0.9)
+    panels.append(panel("coherence", [line], 0.8, limits=(0.0, 1.05), levels=(COHERENT,)))
+    last = omega[shown][-1] if shown.any() else omega[-1]
+    hz = float(omega[0]) / _TURN, float(last) / _TURN
+    panels = (*panels, *further)
+    return Chart(heading[0], "frequency [Hz]", hz, panels, heading[1], logarithmic=True)
 
 
-def _room(values: np.ndarray, margin: float, series: Sequence[Series]) -> tuple[float, float]:
-    """Return limits that contain given values, or all series if there are none."""
-    if not values.size:
-        return limits_of(series)
-    return float(np.min(values)) - margin, float(np.max(values)) + margin
+def quotient(output: str | None, input: str | None) -> str:
+    """Return the unit of output over input; empty if one is unknown."""
+    if output is None or input is None:
+        return ""
+    if input == "1":
+        return output
+    return f"{output}/({input})" if "/" in input else f"{output}/{input}"
+
+
+def _known(pair: Any, widest: float) -> np.ndarray:
+    return np.isfinite(pair.H) & (pair.sd < widest * np.abs(pair.H))
 
 
 def match(pair: FittedPair, unit: str, note: str, baseline: Baseline | None = None) -> Chart:
@@ -133,59 +147,45 @@ def match(pair: FittedPair, unit: str, note: str, baseline: Baseline | None = No
     Args:
         baseline: the recursive least squares of this input and output, as an additional curve.
     """
-    omega, model = pair.omega, pair.model
-    known = np.isfinite(pair.H) & (pair.sd < _WIDE_DATA * np.abs(pair.H))
+    omega, model, known = pair.omega, pair.model, _known(pair, _WIDE_DATA)
     modelled = np.isfinite(model.log_gain) & np.isfinite(model.phase)
     near = phase(np.exp(1j * np.nan_to_num(model.phase)))
     gain_sd, phase_sd = np.nan_to_num(model.gain_sd), np.nan_to_num(model.phase_sd)
-    f, H = omega[known], pair.H[known]
-    own = pair.half95 * pair.sd[known] / np.abs(H)
-    gain, angle = _DB * np.log(np.abs(H)), np.degrees(np.angle(H))
+    H, own = pair.H, pair.half95 * pair.sd[known] / np.abs(pair.H[known])
+    angle = np.degrees(np.angle(H))
     if modelled.all():
-        angle = _nearest(angle, near[known])
-    data = _bars(f, gain, angle, (own, own), style.BLACK, "data, 95 % intervals")
-    rls = []
+        angle = _nearest(angle, near)
+    hz = omega[modelled] / _TURN
+    edges, lines = [], []
+    for value, sd in ((_DB * model.log_gain, _DB * gain_sd), (near, np.degrees(phase_sd))):
+        v, reach = value[modelled], Z95 * sd[modelled]
+        edges.append(band(hz, v - reach, v + reach, style.SKY))
+        lines.append(Series("model", hz, v, style.BLUE, width=1.4))
+    series: list[Sequence[Series]] = [edges, lines]
     if baseline is not None:
         R = baseline_response(baseline, omega)
         turned = _nearest(np.degrees(np.angle(R)), near)
-        rls = [c._replace(dashed=True) for c in _curve("RLS", omega, R, turned, style.ORANGE, 1.2)]
-    # Incoherent bins do not set the axes.
-    mean = octave_mean(omega, pair.coherence)
-    rule = (np.minimum(pair.coherence, mean) >= BEYOND_CHANCE)[known]
-    rule = rule if np.count_nonzero(rule) >= _FEW else np.ones_like(rule)
-    hz, panels = omega / _TURN, []
-    for k, (words, value, sd, ruling, height) in enumerate(
-        (
-            (f"gain [{unit}]", _DB * model.log_gain, _DB * gain_sd, gain[rule], 1.7),
-            ("phase [deg]", near, np.degrees(phase_sd), angle[rule], 1.4),
-        )
-    ):
-        x, v, reach = hz[modelled], value[modelled], Z95 * sd[modelled]
-        fitted = Series("model", x, v, style.BLUE, width=1.4)
-        series = [
-            band(x, v - reach, v + reach, style.SKY),
-            fitted,
-            *rls[k : k + 1],
-            data[k],
-        ]
-        limits = _room(ruling, _MARGINS[k], series)
-        panels.append(panel(words, series, height, limits=limits))
-    panels.append(_coherence(omega, pair.coherence))
+        curve = _curve("RLS", omega, R, turned, style.ORANGE, 1.2)
+        series.append([c._replace(dashed=True) for c in curve])
+    words = "data, 95 % intervals"
+    series.append(_bars(omega[known], H[known], angle[known], (own, own), style.BLACK, words))
     # The ratio of data and model has the random error and that of the parameters.
-    both = modelled[known]
-    error = H[both] / model.response[known & modelled]
-    reach = [np.hypot(own[both], Z95 * sd[known & modelled]) for sd in (gain_sd, phase_sd)]
-    off = _DB * np.log(np.abs(error)), np.degrees(np.angle(error))
-    errors = _bars(f[both], *off, (reach[0], reach[1]), style.BLACK)
-    envelope = unnoticeable(omega)
+    both = known & modelled
+    error = H[both] / model.response[both]
+    reach = [np.hypot(own[modelled[known]], Z95 * sd[both]) for sd in (gain_sd, phase_sd)]
+    degrees = np.degrees(np.angle(error))
+    errors = _bars(omega[both], error, degrees, (reach[0], reach[1]), style.BLACK)
+    envelope, further = unnoticeable(omega), []
     for (low, high), points, most, words in zip(
         (envelope.gain_db, envelope.phase_deg), errors, _ERRORS, ("dB", "deg"), strict=True
     ):
-        series = [band(hz, low, high, style.PALE), points]
+        drawn = [band(omega / _TURN, low, high, style.PALE), points]
         limits = (-most, most)
-        panels.append(panel(f"error [{words}]", series, 1.05, limits=limits, levels=(0.0,)))
-    limits = omega[0], _last_of(omega, pair.coherence, known)
-    return _chart(f"{pair.input} to {pair.output}: model and data", note, limits, panels)
+        further.append(panel(f"error [{words}]", drawn, 1.05, limits=limits, levels=(0.0,)))
+    heading = f"{pair.input} to {pair.output}: model and data", note
+    with np.errstate(all="ignore"):
+        values = _decibels(H), angle
+    return _bode(heading, unit, (omega, pair.coherence, known), values, series, further)
 
 
 def draw_response(
@@ -204,40 +204,30 @@ def draw_response(
         pair: with H, sd and coherence, (k,) each, and half95 (`flight_responses.Pair`).
         fits: transfer functions, each a label and its response (k,).
     """
-    known = np.isfinite(pair.H) & (pair.sd < _WIDE * np.abs(pair.H))
+    known = _known(pair, _WIDE)
     if left_out := int(np.sum(~known)):
         note += f"; {left_out} of {omega.size} frequencies not drawn"
     seen = seen_of(omega, pair, averages)
-    branch = branch_of(omega, pair.H, seen)
-    relative = pair.half95 * pair.sd[known] / np.abs(pair.H[known])
-    gain = _DB * np.log(np.abs(np.where(known, pair.H, 1.0)))
+    branch, H = branch_of(omega, pair.H, seen), pair.H[known]
+    relative = pair.half95 * pair.sd[known] / np.abs(H)
     error, words = (relative, relative), "95 % intervals"
-    curves = [_bars(omega[known], gain[known], branch[known], error, style.BLUE, words)]
+    series = [_bars(omega[known], H, branch[known], error, style.BLUE, words)]
     colours = itertools.cycle((style.VERMILLION, style.GREEN, style.PURPLE))
-    for (label, H), color in zip(fits, colours, strict=False):
-        turned = phase(H)
+    for (label, fitted), color in zip(fits, colours, strict=False):
+        turned = phase(fitted)
         # The whole curve moves to one branch.
         apart = np.median((branch - turned)[seen]) if seen.any() else 0.0
         turned = turned + 360.0 * np.round(apart / 360.0)
-        curves.append(_curve(label, omega, H, turned, color, 1.4))
-    shown = seen if seen.any() else known
-    of_gain, of_phase = ([c[k] for c in curves] for k in (0, 1))
-    by_gain = _room(gain[shown], _MARGINS[0], of_gain)
-    by_phase = _room(branch[shown], _MARGINS[1], of_phase)
-    panels = (
-        panel(f"gain [dB re {unit}]" if unit != "1" else "gain [dB]", of_gain, 1.9, limits=by_gain),
-        panel("phase [deg]", of_phase, 1.6, limits=by_phase),
-        _coherence(omega, pair.coherence),
-    )
-    limits = omega[0], _last_of(omega, pair.coherence, known)
-    return _chart(f"{names[0]} to {names[1]}: measured response", note, limits, panels)
+        series.append(_curve(label, omega, fitted, turned, color, 1.4))
+    heading = f"{names[0]} to {names[1]}: measured response", note
+    values = _decibels(np.where(known, pair.H, 1.0)), branch
+    return _bode(heading, unit, (omega, pair.coherence, known), values, series)
 
 
 def seen_of(omega: np.ndarray, pair: Any, averages: float) -> np.ndarray:
     """Return a mask (k,) of the frequencies that set the branch of the phase."""
-    known = np.isfinite(pair.H) & (pair.sd < _WIDE * np.abs(pair.H))
     least = min(max(SEEN, _BY_CHANCE / averages), COHERENT)
-    return known & (octave_mean(omega, pair.coherence) >= least)
+    return _known(pair, _WIDE) & (octave_mean(omega, pair.coherence) >= least)
 
 
 def branch_of(omega: np.ndarray, H: np.ndarray, seen: np.ndarray) -> np.ndarray:

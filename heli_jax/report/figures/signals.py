@@ -123,14 +123,11 @@ def _coefficients(words: str, t: np.ndarray, values: np.ndarray, names: list[str
 def residual_correlation(
     signals: Signals,
     output: str,
-    *,
-    together: int = 1,
     test: Whiteness | None = None,
 ) -> Chart:
     """Draw the residual's autocorrelation and its correlation with each input, with 99 % bands.
 
     Args:
-        together: number of residuals tested together (Bonferroni, as in `whiteness`).
         test: whiteness from the fit, whose numbers the figure shows; computed by default.
     """
     residual, dt = signals.error(output), _sample_time(signals.times)
@@ -151,7 +148,7 @@ def residual_correlation(
         c = cross_correlation(signals.inputs[name][seen], residual, lags)
         limit = np.full(c.size, BAND99 / np.sqrt(n))
         panels.append(_stems(f"with {name}", dt * np.arange(-lags, lags + 1), c, limit))
-    test = test or whiteness(residual, together)
+    test = test or whiteness(residual)
     what = "Residual" if signals.innovations is None else "Innovations"
     result = "white" if test.white else "not white"
     lag1 = f"{test.lag1:+.2f}".replace("-", "−")
