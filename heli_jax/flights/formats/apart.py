@@ -1,14 +1,14 @@
 """Reading with a library in a separate process, within limits of time and memory.
 
 With a damaged file a library may loop, crash or fill the memory, and it does not react to Ctrl-C.
-Therefore this module starts itself as a program. It calls one reader, writes the pickled result to
-standard output, and ends.
+Therefore this module starts itself as a program. It calls one reader, writes a line of JSON and
+then the arrays as bytes to standard output, and ends.
 """
 
 import contextlib
 import importlib
+import json
 import os
-import pickle
 import signal
 import subprocess
 import sys
@@ -22,7 +22,7 @@ import numpy as np
 
 from heli_jax import import_path
 from heli_jax.errors import InputError
-from heli_jax.finding import Finding
+from heli_jax.finding import Finding, note
 from heli_jax.flights.log import Budget, wrong
 
 _SECONDS, _RATE = 20, 10**6
@@ -36,7 +36,7 @@ _COPIES = 4
 
 
 class Content(NamedTuple):
-    """Result of a reader: facts, vectors in the order that the facts state, and notes."""
+    """Result of a reader: facts for JSON, vectors in the order that the facts state, and notes."""
 
     facts: dict[str, Any]
     arrays: Sequence[np.ndarray]
@@ -71,20 +71,23 @@ def read_apart(path: Path, reader: Reader, what: str, size: int) -> Content:
     watch = threading.Timer(_PATIENCE * seconds, process.kill)
     watch.daemon = True
     watch.start()
-    answer: Any = process.stdout
     try:
         with process:
-            content = pickle.load(answer)
-    except (EOFError, pickle.UnpicklingError) as e:
-        slow = f"took more than {seconds} s to read: it is damaged, or save it without compression"
-        ended = process.returncode in (-signal.SIGKILL, -getattr(signal, "SIGXCPU", 0))
-        problem = slow if ended else f"is no whole {what} (its reader crashed)"
-        raise wrong(str(path), problem) from e
+            answer: Any = process.stdout
+            head = json.loads(answer.readline() or "{}")
+            arrays = [np.empty(count, dtype) for dtype, count in head.get("arrays", ())]
+            for values in arrays:
+                answer.readinto(values.view(np.uint8))
     finally:
         watch.cancel()
-    if isinstance(content, str):
-        raise InputError(content)
-    return content
+    if "error" in head:
+        raise InputError(head["error"])
+    if process.returncode or not head:
+        slow = f"took more than {seconds} s to read: it is damaged, or save it without compression"
+        ended = process.returncode in (-signal.SIGKILL, -getattr(signal, "SIGXCPU", 0))
+        raise wrong(str(path), slow if ended else f"is no whole {what} (its reader crashed)")
+    notes = [note(code, words, *names, value=value) for code, words, names, value in head["notes"]]
+    return Content(head["facts"], arrays, notes)
 
 
 def guarded[T](path: Path, what: str, read: Callable[[], T]) -> T:
@@ -117,15 +120,20 @@ def main() -> None:
         resource.setrlimit(resource.RLIMIT_CPU, (int(seconds), int(seconds)))
         most = _BESIDE + _COPIES * budget.most
         resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    arrays: Sequence[np.ndarray] = ()
     try:
         reader: Reader = getattr(importlib.import_module(module), function)
-        content = guarded(path, what, lambda: reader(path, budget))
-        # The default of `shifts` cannot be pickled.
-        content = content._replace(notes=[n._replace(shifts={}) for n in content.notes])
+        facts, arrays, notes = guarded(path, what, lambda: reader(path, budget))
+        head = {
+            "arrays": [(x.dtype.str, x.size) for x in arrays],
+            "facts": facts,
+            "notes": [(n.code, n.sentence, n.subjects, n.value) for n in notes],
+        }
     except InputError as e:
-        content = str(e)
-    # Protocol 5 reads the arrays into place, without a copy.
-    pickle.dump(content, out, protocol=5)
+        head = {"error": str(e)}
+    out.write(json.dumps(head).encode() + b"\n")
+    for x in arrays:
+        out.write(np.ascontiguousarray(x).data)
     out.flush()
     # Skips the libraries' exit handlers, which may crash after a damaged file.
     os._exit(0)

@@ -56,7 +56,6 @@ _DELIMITERS = ("\t", "|", ";", ",")
 decimal."""
 _MARK = re.compile(r"\s*(?:#+|//+|%+(?=[\s%]|[^,;\t]*$))\s*")
 """Mark of a comment. A name may begin with a percent sign."""
-_SEPARATOR = re.compile(r'"?sep=([,;|:\t ])"?\s*', re.IGNORECASE)
 MISSING = (
     *("NA", "N/A", "n/a", "null", "NULL", "None", "-", "#N/A", "--", "---", "?", "missing"),
     *("1.#QNAN", "-1.#QNAN", "1.#IND", "-1.#IND", "NaT", "<NA>"),
@@ -137,18 +136,15 @@ def inner_ending(path: Path) -> str:
 
 def unpacked(path: str, data: bytes) -> bytes:
     """Unpack bytes packed by gzip (RFC 1952)."""
-    text, budget = bytearray(), Budget(path, len(data))
+    budget = Budget(path, len(data))
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
-            while piece := file.read(1 << 22):
-                # The numbers take memory too: eight bytes for two characters, a digit and its
-                # delimiter.
-                ends = sum(map(piece.count, (b"\n", b",", b";", b"\t")))
-                budget.take(len(piece) + 8 * ends)
-                text += piece
+            text = file.read(budget.most + 1)
     except (OSError, EOFError, zlib.error) as e:
         raise wrong(path, f"is no whole file of gzip ({type(e).__name__})") from e
-    return bytes(text)
+    # The numbers take memory too: eight bytes for two characters, a digit and its delimiter.
+    budget.require(len(text) + 8 * sum(map(text.count, (b"\n", b",", b";", b"\t"))))
+    return text
 
 
 def as_text(path: str, data: bytes) -> bytes:
@@ -186,9 +182,6 @@ def as_text(path: str, data: bytes) -> bytes:
 def _find_head(path: str, data: bytes, delimiters: Sequence[str]) -> _Head:
     """Find the header of the table, below titles, settings and comments."""
     lines = list(_lines(data))
-    if lines and (separator := _SEPARATOR.fullmatch(lines[0].text)):
-        # Excel's own statement of the delimiter.
-        delimiters, lines = (separator[1],), lines[1:]
     plain = [line for line in lines if not line.is_comment]
     if not plain:
         raise wrong(path, "holds no header, expected names of columns and rows of numbers")
