@@ -180,21 +180,16 @@ def test_settings_of_firmwares():
     assert len(logged.filters) == 2
 
 
-def test_lines_are_found_named_and_unfolded():
+def test_lines_are_found():
     rng = np.random.default_rng(3)
     slow = np.sin(2 * np.pi * 0.4 * TIMES) + 0.05 * rng.standard_normal(TIMES.size)
     shaken = slow + 0.3 * np.sin(2 * np.pi * 24.2 * TIMES) + 0.2 * np.sin(2 * np.pi * 55 * TIMES)
-    first, second = lines(shaken, DT, 24.2)
+    first, second = lines(shaken, DT)
     np.testing.assert_allclose([first.hz, second.hz], [24.2, 55.0], atol=0.13)
     np.testing.assert_allclose(first.share, 0.045 / np.var(shaken), rtol=0.2)
-    assert (first.harmonic, second.harmonic) == (1, 0)
-    # 80 Hz logged at 100 Hz appears at 20 Hz, which is two per rev at 40 Hz.
+    # 80 Hz sampled at 100 Hz appears at 20 Hz.
     assert folded(80.0, 100.0) == 20.0
-    times = 0.01 * np.arange(1500)
-    (line,) = lines(np.sin(2 * np.pi * 80 * times) + 0.1 * rng.standard_normal(1500), 0.01, 40.0)
-    assert line.aliased
-    assert (line.harmonic, line.of_hz) == (2, 80.0)
-    assert lines(slow, DT, 24.2) == ()
+    assert lines(slow, DT) == ()
     assert lines(np.full(300, np.nan), DT) == ()
 
 
@@ -203,7 +198,7 @@ def test_notches_on_both_sides_bias_nothing(load, tmp_path):
     decay = np.exp(-DT / 0.05)
     p = scipy.signal.lfilter([0, 1 - decay], [1, -decay], stick(TIMES))
     write_log(tmp_path / "flight.log", p + 0.05 * np.sin(2 * np.pi * 24.2 * TIMES))
-    shaken = flight() | {"vibration": {"rotor": 24.2, "unit": "Hz"}}
+    shaken = flight()
     (noisy,) = read_flights(load(shaken))
     assert noisy.source.cautions[-1].code == "vibration.lines"
     (clean,) = read_flights(load(shaken | {"notch": [24.2]}))
@@ -218,8 +213,6 @@ def test_notches_on_both_sides_bias_nothing(load, tmp_path):
         read_flights(load(shaken | {"notch": [150.0]}))
     with pytest.raises(InputError, match=r"notch: "):
         load(shaken | {"notch": 24.2})
-    with pytest.raises(InputError, match=r"vibration\.unit"):
-        read_flights(load(flight() | {"vibration": {"rotor": 24.2, "unit": "kg"}}))
 
 
 def test_a_notch_begins_anew_behind_missing_samples():
@@ -262,22 +255,6 @@ def test_a_notch_leaves_a_slow_sensor_what_it_cannot_have():
         ("notches.too-slow", ("h",), pytest.approx(20.0)),
         ("notches.too-slow", ("v",), pytest.approx(200 / 3)),
     ]
-
-
-@pytest.mark.parametrize(
-    ("rotor", "codes"),
-    [
-        ({"rotor": 150}, ["units.assumed"]),
-        ({"rotor": 1450}, ["units.unlikely"]),
-        ({"rotor": 1450, "unit": "rpm"}, []),
-    ],
-)
-def test_a_rotor_in_the_wrong_unit_is_doubted(load, tmp_path, rotor, codes):
-    write_log(tmp_path / "flight.log", np.sin(TIMES))
-    (read,) = read_flights(load(flight() | {"vibration": rotor}))
-    said = [c for c in read.source.cautions if c.code.startswith("units.")]
-    assert [c.code for c in said] == codes
-    assert {c.value for c in said} <= {rotor["rotor"]}
 
 
 def test_raw_pulse_widths_are_doubted(load, tmp_path):

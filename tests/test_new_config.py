@@ -11,9 +11,10 @@ from heli_jax.config import read_flights
 from heli_jax.config.problems import problem
 from heli_jax.config.schema import Config
 from heli_jax.errors import InputError
-from heli_jax.flights.channel_names import quantity_of_output, words_in
+from heli_jax.flights.clock import words_in
 from heli_jax.flights.log import ChannelLog, Topic
 from heli_jax.new_config import tables, write_config
+from heli_jax.new_config.channel_names import quantity_of_output
 from heli_jax.new_config.guess import (
     Series,
     by_motion,

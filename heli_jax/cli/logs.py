@@ -40,7 +40,7 @@ def print_flights(
         chosen: True if the user chose the flights, so that the file may hold others.
     """
     log = flights[0]
-    rows = "" if log.topics else f", {log.n_rows} rows"
+    rows = f", {log.n_rows} rows" if log.is_table else ""
     print_text(f"{log.path}: {log.format}, {log.size} bytes{rows}\nsha256 {log.sha256}")
     for flight in flights:
         _print_flight(flight, flight.flight[1] if chosen else len(flights), pattern)
@@ -48,13 +48,13 @@ def print_flights(
 
 def _print_flight(flight: LogInfo, count: int, pattern: str | None) -> None:
     # A table has one clock and no firmware, so most of these lines would be empty.
-    for line in _flight_lines(flight, count) if flight.topics else _clock_lines(flight.time):
+    for line in _clock_lines(flight.time) if flight.is_table else _flight_lines(flight, count):
         print_text(line)
     # Notes on losses and assumptions come before the numbers they affect.
     for found in flight.notes[:_MOST_LINES]:
         print_text(f"! {found.sentence}")
     # With a pattern of channel names the topics are not shown.
-    if flight.topics and pattern is None:
+    if not flight.is_table and pattern is None:
         _print_topics(flight.topics)
     _print_channels(flight.columns, pattern)
     if pattern is None:
@@ -81,10 +81,8 @@ def _flight_content(flight: LogInfo) -> dict[str, Any]:
     """Return the content of one flight. Any: text, numbers, lists and records, as in JSON."""
     whole = {"number": flight.flight[0], "of": flight.flight[1], "firmware": flight.firmware}
     whole |= {"duration": flight.duration, "notes": [as_data(n) for n in flight.notes]}
-    # A table appears as a log of one topic, so that scripts need only one format.
-    topics = flight.topics or (TopicInfo("", flight.n_rows, flight.time, flight.columns),)
-    whole["topics"] = [_topic_content(topic) for topic in topics]
-    return whole | {"filters": dict(flight.filters), "parameters": dict(flight.parameters)}
+    whole["topics"] = [_topic_content(topic) for topic in flight.topics]
+    return whole | {"filters": flight.filters, "parameters": dict(flight.parameters)}
 
 
 def _topic_content(topic: TopicInfo) -> dict[str, Any]:

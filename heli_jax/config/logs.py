@@ -134,7 +134,7 @@ def _read_flight(experiment: Experiment, i: int, f: FlightConfig, gain: bool) ->
         *filter_cautions(first.source, everything.outputs),
         *(coloured_noise_cautions(first, experiment.model) if _noise_given(experiment) else ()),
         *_pulse_width_doubts(first),
-        *vibration_notes(experiment, first, f, where),
+        *vibration_notes(first),
     )
     return (_with_notes(first, notes, cautions), *others)
 

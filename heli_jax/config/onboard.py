@@ -153,15 +153,6 @@ Delay = Annotated[float, AfterValidator(_delay)]
 Notches = list[_Positive]
 
 
-class VibrationConfig(Section):
-    """Sources of vibration, which identify lines of the spectrum."""
-
-    rotor: _Positive
-    """speed of the rotor, in rad/s unless `unit` is another"""
-    unit: str = "rad/s"
-    """unit of the speed: rad/s, rpm, Hz"""
-
-
 class OnboardConfig(Section):
     """Devices between stick and blade, motion and log, each in series with the previous one."""
 

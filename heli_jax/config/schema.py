@@ -7,7 +7,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from heli_jax.config.disturbance_section import DisturbanceConfig
 from heli_jax.config.frequency_section import FrequencyConfig
-from heli_jax.config.onboard import Delay, Filters, Notches, OnboardConfig, VibrationConfig
+from heli_jax.config.onboard import Delay, Filters, Notches, OnboardConfig
 from heli_jax.config.run_sections import SimulateConfig, SweepConfig
 from heli_jax.config.section import Section
 from heli_jax.config.signal_section import LoggedInputConfig, Numbers, PresetConfig, ScaledConfig
@@ -165,8 +165,6 @@ class FlightConfig(Section):
     """model parameters known for this flight only, in SI: {Ixx_added: 0.01}"""
     notch: Notches | None = None
     """frequencies [Hz] to remove from inputs and outputs alike"""
-    vibration: VibrationConfig | None = None
-    """rotor speed, which identifies vibration lines"""
     corrections: str | None = None
     """file of `heli-jax compatibility` with sensor errors, which are removed from the signals"""
 

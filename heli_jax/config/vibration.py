@@ -1,23 +1,17 @@
 """Vibration lines in a configuration's flights: identified, and removed on request."""
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from heli_jax import naming, units
 from heli_jax.config.corrections import with_notes
-from heli_jax.config.experiment import Experiment
-from heli_jax.config.onboard import VibrationConfig
-from heli_jax.config.schema import FlightConfig
-from heli_jax.errors import InputError, located
+from heli_jax.errors import InputError
 from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.request import FEWEST
 from heli_jax.flights.vibration import (
     folded,
-    line_words,
     lines,
     notched,
     notched_slow,
@@ -31,8 +25,6 @@ _LEFT = 0.5
 """Smallest share of an output's samples that notches must leave."""
 _NAMED = 3
 """Most lines in the note of an output."""
-_FASTEST_ROTOR = 500.0
-"""Fastest rotor [rad/s], or 4800 rpm; the smallest vehicles stay below."""
 
 
 def with_notches(flight: Flight, frequencies: Sequence[float], where: str) -> Flight:
@@ -113,59 +105,15 @@ def _lost(
     return tuple(notes)
 
 
-def vibration_notes(
-    experiment: Experiment, flight: Flight, config: FlightConfig, where: str
-) -> tuple[Finding, ...]:
-    """Return a note for each output with strong lines in its spectrum.
-
-    Raises:
-        InputError: the stated speed has a unit that is none of a rotor.
-    """
-    rotor = _rotor_hz(experiment, flight, config, where)
-    rates = flight.source.rates if flight.source else {}
-    stated = config.vibration
-    notes = [] if stated is None or rotor is None else [*_rotor_doubt(stated, 2 * math.pi * rotor)]
+def vibration_notes(flight: Flight) -> tuple[Finding, ...]:
+    """Return a note for each output with strong lines in its spectrum."""
+    notes = []
     for name, y in flight.outputs.items():
-        vibration = lines(y, flight.dt, rotor, rates.get(name))
-        if vibration:
-            words = "; ".join(line_words(line, rotor) for line in vibration[:_NAMED])
-            largest = max(line.share for line in vibration)
-            notes.append(note("vibration.lines", f"{name} vibrates: {words}", name, value=largest))
+        if vibration := lines(y, flight.dt):
+            each = "; ".join(
+                f"{line.hz:.3g} Hz has {100 * line.share:.2g} % of its variance"
+                for line in vibration[:_NAMED]
+            )
+            words = f"{name} vibrates: {each}"
+            notes.append(note("vibration.lines", words, name, value=vibration[0].share))
     return tuple(notes)
-
-
-def _rotor_hz(
-    experiment: Experiment, flight: Flight, config: FlightConfig, where: str
-) -> float | None:
-    """Return turns per second, as stated, recorded, or known for the vehicle."""
-    if config.vibration is not None:
-        unit = config.vibration.unit
-        with located(f"{where}.vibration.unit"):
-            speed = config.vibration.rotor * units.factor(unit, "rad/s")
-        return speed / (2.0 * math.pi)
-    if "Omega" in flight.inputs:
-        speed = float(np.mean(flight.inputs["Omega"]))
-    elif "Omega" in naming.names(experiment.model.Params):
-        speed = flight.known.get("Omega", float(experiment.vehicle.params.Omega))
-    else:
-        return None
-    return speed / (2.0 * math.pi) if math.isfinite(speed) and speed > 0 else None
-
-
-def _rotor_doubt(vibration: VibrationConfig, speed: float) -> tuple[Finding, ...]:
-    """Return a finding if a rotor's stated speed is implausible, or its unit is not stated.
-
-    Args:
-        speed: stated speed [rad/s].
-    """
-    if speed > _FASTEST_ROTOR:
-        words = (
-            f"vibration: a rotor of {speed:.4g} rad/s turns at {speed * 30 / np.pi:.0f} rpm, "
-            f"expected less than {_FASTEST_ROTOR:g} rad/s; was unit: rpm meant?"
-        )
-        criterion = f"rad/s, {_FASTEST_ROTOR:g}"
-        return (Finding("units.unlikely", "doubt", words, speed, criterion),)
-    if "unit" not in vibration.model_fields_set:
-        words = f"vibration: rotor: no unit stated, {speed:g} taken as rad/s"
-        return (note("units.assumed", words, value=speed),)
-    return ()

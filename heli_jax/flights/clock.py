@@ -15,9 +15,8 @@ import numpy as np
 from heli_jax import units
 from heli_jax.errors import nearest
 from heli_jax.finding import Finding, note
-from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.flight import Signal
-from heli_jax.flights.grid import not_increasing, shared_stamps, without_overflow
+from heli_jax.flights.grid import not_increasing, without_overflow
 from heli_jax.flights.log import (
     Survey,
     Table,
@@ -116,10 +115,9 @@ def likely_unit(stamps: np.ndarray | None) -> str:
     return "ns"
 
 
-# Dates of ISO 8601 and of German spreadsheets, and times of day.
+# Dates of ISO 8601, and times of day.
 
 _ISO = re.compile(r"\d{4}[-/]\d\d[-/]\d\d[T ,]+\d\d:\d\d(?::\d\d.*)?")
-_GERMAN = re.compile(r"(\d\d?)\.(\d\d?)\.(\d{4}),? (\d{1,2}:\d\d:\d\d(?:[.,]\d{1,6})?)")
 _TIME_OF_DAY = re.compile(r"(\d{1,3}):(\d\d):(\d\d(?:[.,]\d{1,12})?)")
 _LONGEST_TIME = 60
 """Longest text of a time; a damaged file may have one cell as long as the file."""
@@ -154,7 +152,7 @@ def seconds_of_dates(cells: Sequence[str | None]) -> np.ndarray | int:
                 hours, minutes, seconds = cell.replace(",", ".").split(":")
                 values[i] = 3600.0 * int(hours) + 60.0 * int(minutes) + float(seconds)
                 continue
-            date = _date(cell, form)
+            date = _date(cell)
             begin = begin or date.replace(hour=0, minute=0, second=0, microsecond=0)
             values[i] = (date - begin).total_seconds()
         # TypeError: dates with an offset from UTC cannot be compared with dates without.
@@ -168,14 +166,10 @@ def seconds_of_dates(cells: Sequence[str | None]) -> np.ndarray | int:
 
 
 def _form_of(cell: str) -> re.Pattern[str] | None:
-    return next((form for form in (_ISO, _GERMAN, _TIME_OF_DAY) if form.fullmatch(cell)), None)
+    return next((form for form in (_ISO, _TIME_OF_DAY) if form.fullmatch(cell)), None)
 
 
-def _date(cell: str, form: re.Pattern[str]) -> datetime.datetime:
-    if form is _GERMAN:
-        date, clock = cell.replace(", ", " ").split(" ", 1)
-        day, month, year = map(int, date.split("."))
-        cell = f"{year}-{month:02d}-{day:02d}T{clock.replace(',', '.').zfill(8)}"
+def _date(cell: str) -> datetime.datetime:
     text = cell.replace("/", "-").removesuffix(" UTC").removesuffix(" GMT")
     return datetime.datetime.fromisoformat(re.sub("[ ,]+", "T", text, count=1))
 
@@ -243,6 +237,13 @@ def is_called_time(name: str) -> bool:
     return leaf in TIME_NAMES or (len(leaf) > 1 and time_unit(leaf) is not None)
 
 
+def words_in(name: str) -> tuple[str, ...]:
+    """Return the words of a name in lower case, as of rollRate, roll_rate and `Roll Rate`."""
+    apart = re.sub(r"([a-z0-9])([A-Z])|([A-Z])(?=[A-Z][a-z])", r"\1\3 \2", name)
+    # ch1, rc2in: a number is no part of a word.
+    return tuple(w for w in re.split(r"[^a-z]+", apart.lower()) if w)
+
+
 def _asked(table: Table, surveys: Sequence[Survey], time: str | Signal) -> Signal:
     """Return a column of times as the user names it."""
     signal = Signal(time, "s", "s") if isinstance(time, str) else time
@@ -279,29 +280,25 @@ def unit_notes(time: Signal, stated: str | None) -> tuple[Finding, ...]:
     if not other or math.isclose(units.factor(other, "s"), factor):
         return ()
     if stated:
-        words = f"taken in {stated}, as the file says, not in {time.unit}"
+        words = f"taken in {stated}, as the file states, not in {time.unit}"
     else:
-        words = f"taken in {time.unit}, though its name says {named}; if the name is right, state"
+        words = f"taken in {time.unit}, though its name states {named}; if the name is right, state"
         words += f" unit: {named} beside it"
     return (note("units.contradicted", f"time: {shown(time.name)} is {words}"),)
 
 
 def require_increasing(table: Table, name: str, stamps: np.ndarray) -> None:
     """Refuse a clock with a stamp that is not later than the one before."""
-    back = not_increasing(stamps)
-    if back is None:
+    if (back := not_increasing(stamps)) is None:
         return
     row, fault = back
     after, now = table.cell_text(name, row - 1), table.cell_text(name, row)
     problem = f"the time {fault}, got {now} after {after}, expected increasing times"
-    # The times increase without the previous row, so that row is the wrong one.
-    if row > 1 and stamps[row - 2] < stamps[row] < stamps[row - 1]:
-        remedy = f"{table.place(row - 1)} is out of order: delete it"
-    elif (starts := restarts(stamps)).size:
-        runs = f"the file holds {starts.size + 1} runs"
-        remedy = f"there are {runs}: gaps: split beside log: makes a flight of each"
+    if (starts := restarts(stamps)).size:
+        remedy = f"the file holds {starts.size + 1} runs: gaps: split makes a flight of each"
     else:
-        remedy = shared_stamps(stamps) or "sort the rows by time, or delete those that go back"
+        remedy = "delete rows that go back or were written twice, log time with more digits, or "
+        remedy += "state the rate (time: {rate: HZ})"
     raise wrong(table.path, f"{problem}; {remedy}", table.place(row), column(name))
 
 
@@ -315,7 +312,7 @@ def require_likely(path: str, time: Signal, stamps: np.ndarray) -> None:
         return
     step, length = float(np.median(np.diff(stamps))), float(stamps[-1] - stamps[0])
     problem = f"in s its stamps are {step:.4g} s apart over {length:.4g} s: they look like {likely}"
-    why = f", as its name says {named}" if named == likely else ""
+    why = f", as its name states {named}" if named == likely else ""
     remedy = f"expected its unit: {{signal: {time.name}, unit: {likely}}}"
     if named != likely:
         remedy += ", or unit: s if it is that slow"

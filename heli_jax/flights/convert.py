@@ -26,6 +26,7 @@ from heli_jax.flights.preset import NamedBy
 from heli_jax.flights.read_table import guessed_log, without_joins
 from heli_jax.flights.request import require_rate_and_window
 from heli_jax.flights.resample import hold, in_gaps, rate_notes, resampled
+from heli_jax.flights.write import write_table
 
 ENDINGS = (".csv", ".parquet", ".nc")
 TIME = "time"
@@ -209,22 +210,14 @@ def _clocks(
 
 
 def _missing(columns: Mapping[str, np.ndarray]) -> list[Finding]:
-    """Return notes on missing samples, one for all signals with the same count."""
-    by_count: dict[int, list[str]] = {}
-    for name, values in columns.items():
-        by_count.setdefault(int(np.isnan(values).sum()), []).append(name)
-    by_count.pop(0, None)
-    size = columns[TIME].size
-    return [
-        note(
-            "samples.missing",
-            f"{count} of {size} samples {'is' if count == 1 else 'are'} missing, in "
-            f"{listed(map(shown, names))}",
-            *names,
-            value=count,
-        )
-        for count, names in by_count.items()
-    ]
+    """Return a note on the missing samples."""
+    counts = {name: int(np.isnan(values).sum()) for name, values in columns.items()}
+    counts = {name: count for name, count in counts.items() if count}
+    if not counts:
+        return []
+    each = listed(f"{shown(name)} ({count})" for name, count in counts.items())
+    words = f"samples are missing, of {columns[TIME].size}: {each}"
+    return [note("samples.missing", words, *counts, value=max(counts.values()))]
 
 
 def _as_logged(
@@ -314,25 +307,9 @@ def write_converted(out: Path, converted: Converted) -> None:
     if out.suffix.lower() == ".nc":
         _write_netcdf(out, converted)
     else:
-        _write_table(out, converted)
-
-
-def _write_table(out: Path, converted: Converted) -> None:
-    import pyarrow as pa
-
-    # Missing cells are nulls: CSV would show a NaN as the word nan.
-    arrays = {name: pa.array(x, mask=np.isnan(x)) for name, x in converted.columns.items()}
-    units = {name: {"unit": unit} for name, unit in converted.units.items() if unit}
-    fields = [pa.field(n, pa.float64(), metadata=units.get(n)) for n in arrays]
-    table = pa.Table.from_arrays(list(arrays.values()), schema=pa.schema(fields))
-    if out.suffix.lower() == ".parquet":
-        import pyarrow.parquet
-
-        pyarrow.parquet.write_table(table, out)
-        return
-    import pyarrow.csv
-
-    pyarrow.csv.write_csv(table, out)
+        # Missing cells are nulls: CSV would show a NaN as the word nan.
+        columns = {n: np.ma.masked_invalid(x) for n, x in converted.columns.items()}
+        write_table(out, columns, converted.units)
 
 
 def _write_netcdf(out: Path, converted: Converted) -> None:

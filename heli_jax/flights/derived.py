@@ -15,7 +15,7 @@ import numpy as np
 from heli_jax.errors import nearest
 from heli_jax.flights.log import ChannelLog, Topic, as_floats, shown, wrong
 from heli_jax.flights.marks import without_marks
-from heli_jax.flights.resample import longest_gap
+from heli_jax.flights.resample import in_gaps
 
 # Servo outputs of a swashplate, unmixed to collective and cyclic (CCPM).
 
@@ -296,9 +296,7 @@ def _on_clock(times: np.ndarray, clock: np.ndarray, q: np.ndarray) -> np.ndarray
     q = q * np.concatenate([[1.0], np.cumprod(flips)])
     between = np.stack([np.interp(times, clock, row, np.nan, np.nan) for row in q])
     # In a gap the attitude is unknown, so the velocity is missing.
-    right = np.clip(np.searchsorted(clock, times), 1, clock.size - 1)
-    inside = (clock[right - 1] < times) & (times < clock[right])
-    between[:, inside & (clock[right] - clock[right - 1] > longest_gap(clock))] = np.nan
+    between[:, in_gaps(clock, times)] = np.nan
     return between
 
 

@@ -21,12 +21,9 @@ from heli_jax.flights.clock import (
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.formats.arrays import clock_notes
 from heli_jax.flights.grid import (
-    LATEST,
-    SHORTEST_STEP,
     Uneven,
-    not_increasing,
+    clock_fault,
     rounding_of,
-    shared_stamps,
     uniform_grid,
     without_overflow,
 )
@@ -128,25 +125,45 @@ class TopicInfo:
 class LogInfo:
     """Content of a log, or of one of its flights.
 
-    `time` is None if no column looks like a clock. An autopilot's log has `topics` with separate
-    clocks, whose channels are also `columns`. `duration` [s] is from the first sample to the last.
-    `filters` are those `parameters` that describe the firmware's filters.
+    A table has one topic without a name, whose `time` is None if no column looks like a clock.
+    `duration` [s] is from the first sample to the last.
     """
 
     path: str
     format: str
     size: int
     sha256: str
-    n_rows: int
-    columns: tuple[ColumnInfo, ...]
-    time: TimeInfo | None
-    topics: tuple[TopicInfo, ...] = ()
+    topics: tuple[TopicInfo, ...]
     duration: float = float("nan")
     flight: tuple[int, int] = (1, 1)
     firmware: str = ""
     parameters: Mapping[str, str | int | float] = field(default_factory=dict)
-    filters: Mapping[str, str | int | float] = field(default_factory=dict)
     notes: tuple[Finding, ...] = ()
+
+    @property
+    def is_table(self) -> bool:
+        """True for rows with a common clock, False for topics with their own."""
+        return not self.topics[0].name
+
+    @property
+    def time(self) -> TimeInfo | None:
+        """Clock of a table."""
+        return self.topics[0].time if self.is_table else None
+
+    @property
+    def n_rows(self) -> int:
+        """Rows of the longest topic."""
+        return max(topic.n_rows for topic in self.topics)
+
+    @property
+    def columns(self) -> tuple[ColumnInfo, ...]:
+        """The columns of all topics."""
+        return tuple(each for topic in self.topics for each in topic.columns)
+
+    @property
+    def filters(self) -> dict[str, str | int | float]:
+        """The parameters that describe the firmware's filters."""
+        return {k: v for k, v in self.parameters.items() if _FILTER.search(k)}
 
 
 def describe_log(
@@ -201,15 +218,11 @@ def _describe_channels(log: ChannelLog) -> LogInfo:
         format=log.format,
         size=log.size,
         sha256=log.sha256,
-        n_rows=max(topic.n_rows for topic in topics),
-        columns=tuple(each for topic in topics for each in topic.columns),
-        time=None,
         topics=topics,
         duration=max(last) - log.first_time if last else float("nan"),
         flight=log.flight,
         firmware=log.firmware,
         parameters=log.parameters,
-        filters={k: v for k, v in log.parameters.items() if _FILTER.search(k)},
         notes=(*log.notes, *mark_notes(c for topic in log.topics for c in topic.columns.items())),
     )
 
@@ -243,6 +256,7 @@ def describe_table(
             scale = clock_scale(table, signal)
             stamps = with_runs(table, signal.name, {signal.name: stamps}, scale)[0][signal.name]
         clock = replace(_describe_time(table, signal, stamps, guessed), runs=runs)
+    columns = tuple(_describe_column(s, table.units.get(s.name, "")) for s in surveys)
     # Stamps have no marks: a wrong one is refused with its row.
     measured = [s for s in surveys if signal is None or s.name != signal.name]
     marks = mark_notes((s.name, s.values) for s in measured if s.values is not None)
@@ -251,9 +265,7 @@ def describe_table(
         format=table.format,
         size=table.size,
         sha256=table.sha256,
-        n_rows=_n_rows(surveys),
-        columns=tuple(_describe_column(s, table.units.get(s.name, "")) for s in surveys),
-        time=clock,
+        topics=(TopicInfo("", _n_rows(surveys), clock, columns),),
         duration=float("nan") if clock is None else clock.duration,
         notes=(
             *table.notes,
@@ -329,13 +341,13 @@ def _describe_stamps(
     with np.errstate(all="ignore"):
         stamps = without_overflow(stamps)
         seconds = stamps * scale
-        steps = np.diff(seconds)
     # A column that the user named as the clock may be anything, so stamps and steps are checked
     # first.
-    problem = _clock_problem(seconds, steps)
+    problem = _clock_problem(seconds)
     nan = float("nan")
     if problem:
         return TimeInfo(name, unit, nan, nan, False, nan, (), problem)
+    steps = np.diff(seconds)
     usual = float(np.median(steps))  # gaps would change the mean
     # The same function as for reading a flight, so that `info` and a fit agree on uniformity.
     grid = uniform_grid(seconds - seconds[0], rounding_of(stamps) * scale)
@@ -355,20 +367,12 @@ def _describe_stamps(
     )
 
 
-def _clock_problem(seconds: np.ndarray, steps: np.ndarray) -> str:
+def _clock_problem(seconds: np.ndarray) -> str:
     if seconds.size < 2:
         return "a single sample"
-    bad = int(np.count_nonzero(~np.isfinite(seconds)))
-    if bad:
+    if bad := int(np.count_nonzero(~np.isfinite(seconds))):
         return f"{bad} time stamps are empty or not finite"
-    if not np.all(np.abs(seconds) <= LATEST):
-        return "the time stamps are too large"
-    back = not_increasing(seconds)
-    if back is not None:
-        row, fault = back
-        where = f"the time {fault} after {seconds[row - 1] - seconds[0]:.6g} s"
-        shared = shared_stamps(seconds)
-        return f"{where}: {shared}" if shared else where
-    if np.median(steps) < SHORTEST_STEP:
-        return "the steps are shorter than 1 ns"
-    return ""
+    if (found := clock_fault(seconds)) is None:
+        return ""
+    row, fault = found
+    return f"the time {fault} in row {row + 1}"

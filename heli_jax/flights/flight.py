@@ -138,7 +138,6 @@ class Source:
         notes: the reader's assumptions and actions.
         firmware: firmware of the autopilot that wrote the log.
         parameters: parameters of that autopilot, by name.
-        rates: usual rates of outputs in an autopilot's log [Hz].
         cautions: causes of bias in any fit to the log, repeated by every fit.
         inputs: signals of the log by the model's name of the input.
         outputs: likewise for outputs.
@@ -151,7 +150,6 @@ class Source:
     notes: tuple[Finding, ...] = ()
     firmware: str = ""
     parameters: Mapping[str, str | int | float] = field(default_factory=dict)
-    rates: Mapping[str, float] = field(default_factory=dict)
     cautions: tuple[Finding, ...] = ()
     inputs: Mapping[str, Signal] = field(default_factory=dict)
     outputs: Mapping[str, Signal] = field(default_factory=dict)

@@ -52,31 +52,26 @@ class Uneven:
 
 
 def not_increasing(stamps: np.ndarray) -> tuple[int, str] | None:
-    """Return the first of the stamps (N,) not later than the previous one: its row and the fault.
-
-    None if all stamps increase.
-    """
+    """Return row and fault of the first of the stamps (N,) not later than the previous one."""
     steps = np.diff(stamps)
-    rows = np.flatnonzero(steps <= 0)
-    if not rows.size:
+    back = np.flatnonzero(steps <= 0)
+    if not back.size:
         return None
-    row = int(rows[0])
+    row = int(back[0])
     return row + 1, "stands still" if steps[row] == 0 else "runs backwards"
 
 
-_MANY = 0.1
-"""Share of the stamps."""
-
-
-def shared_stamps(stamps: np.ndarray) -> str:
-    """Return why many of the stamps (N,) repeat; empty if few do."""
-    still = int(np.count_nonzero(stamps[1:] == stamps[:-1]))
-    if still <= _MANY * stamps.size:
-        return ""
-    return (
-        f"{still} of {stamps.size} rows have the time of the row before: log time with more "
-        "digits, delete rows that were written twice, or state the rate (time: {rate: HZ})"
-    )
+def clock_fault(times: np.ndarray) -> tuple[int, str] | None:
+    """Return the row and the fault of the first of the times (N,) [s] that is none of a clock."""
+    bad = np.flatnonzero(~(np.abs(times) <= LATEST))  # NaN is bad too
+    if bad.size:
+        return int(bad[0]), "is no time"
+    if (back := not_increasing(times)) is not None:
+        return back
+    # The median, because one long gap would raise the mean above any limit.
+    if times.size > 1 and np.median(np.diff(times)) < SHORTEST_STEP:
+        return 0, "has a usual step below 1 ns (look at its unit)"
+    return None
 
 
 _COUNTER = 2.0**32

@@ -90,13 +90,9 @@ class Budget:
         """Refuse more bytes than the file may use."""
         if count <= self.most:
             return
-        problem = f"its content needs at least {size_words(count)} of memory, expected at most"
-        if self.most == _MOST_BYTES:
-            remedy = f"{size_words(self.most)}: save fewer signals, or at a lower rate"
-        else:
-            of = f"from a file of {size_words(self._size)}"
-            remedy = f"{size_words(self.most)} {of}: it is damaged, or no log"
-        raise wrong(self._path, f"{problem} {remedy}")
+        problem = f"its content needs at least {size_words(count)} of memory"
+        expected = f"at most {size_words(self.most)} from a file of {size_words(self._size)}"
+        raise wrong(self._path, f"{problem}, expected {expected}: it is damaged or too large")
 
 
 _LONGEST_NAME = 1000

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from heli_jax.finding import Finding, note
-from heli_jax.flights.log import shown
+from heli_jax.flights.log import listed, sample_count, shown
 
 _FEWEST = 8
 """Fewest samples of a signal besides its marks."""
@@ -15,12 +15,16 @@ _NINES = tuple(
     for nines in (999.0, 9999.0, 99999.0, 999999.0, 999.9, 9999.9, 99999.9, 999.99, 9999.99)
     for sign in (1.0, -1.0)
 )
-_DECIMAL = np.sort([*_NINES, -7777.0, -8888.0, -88888.0])
-"""Numbers that people choose for no value: nines and eights."""
-_BINARY = np.sort([*(2.0**b - 1 for b in (15, 16, 31, 32)), *(-(2.0**b) for b in (15, 31))])
-"""Limits of integer types."""
-_HUNDREDTHS = np.array([-327.68, 327.67, 655.35])
-_KNOWN = np.sort(np.concatenate([_DECIMAL, _BINARY, _HUNDREDTHS]))
+_KNOWN = np.sort(
+    [
+        # Numbers that people choose for no value.
+        *(*_NINES, -7777.0, -8888.0, -88888.0),
+        # Limits of integer types, also in hundredths.
+        *(2.0**b - 1 for b in (15, 16, 31, 32)),
+        *(-(2.0**b) for b in (15, 31)),
+        *(-327.68, 327.67, 655.35),
+    ]
+)
 _SMALLEST = 300.0
 """Smallest magnitude of a mark; it excludes most signals quickly."""
 _SINGLE = 1e-6
@@ -42,7 +46,7 @@ def at_marks(numbers: np.ndarray) -> np.ndarray:
     These are known marks far outside of all other numbers, or the only ones of their sign, and
     numbers too large for any measurement.
     """
-    absurd, known = is_impossible(numbers), _is_one_of(_KNOWN, numbers)
+    absurd, known = is_impossible(numbers), _is_known(numbers)
     none = np.zeros(numbers.shape, bool)
     if not (absurd.any() or known.any()):
         return none
@@ -60,7 +64,7 @@ def at_marks(numbers: np.ndarray) -> np.ndarray:
     far = (numbers > high + away) | (numbers < low - away)
     # Among rotor speeds -9999 is not far away, but it is the only negative number.
     other_sign = (numbers < 0) if low >= 0 else (numbers > 0) if high <= 0 else none
-    return at & (far | (other_sign & _is_one_of(_DECIMAL, numbers)))
+    return at & (far | (other_sign & known))
 
 
 def infinite(values: np.ndarray, numbers: np.ndarray) -> np.ndarray:
@@ -77,17 +81,14 @@ def is_impossible(numbers: np.ndarray) -> np.ndarray:
         return np.abs(numbers) > _ABSURD
 
 
-def _is_one_of(marks: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+def _is_known(numbers: np.ndarray) -> np.ndarray:
     at = np.zeros(numbers.shape, bool)
     with np.errstate(invalid="ignore"):
         rows = np.flatnonzero(np.abs(numbers) > _SMALLEST)
     large = numbers[rows]
-    i = np.clip(np.searchsorted(marks, large), 1, marks.size - 1)
-    nearest = np.minimum(
-        np.abs(large - marks[i - 1]) / np.abs(marks[i - 1]),
-        np.abs(large - marks[i]) / np.abs(marks[i]),
-    )
-    at[rows[nearest <= _SINGLE]] = True
+    i = np.clip(np.searchsorted(_KNOWN, large), 1, _KNOWN.size - 1)
+    for mark in (_KNOWN[i - 1], _KNOWN[i]):
+        at[rows] |= np.abs(large - mark) <= _SINGLE * np.abs(mark)
     return at
 
 
@@ -121,19 +122,11 @@ def marks_note(
 
 
 def mark_words(numbers: np.ndarray, at: np.ndarray) -> str:
-    """Return `10 samples of -9999 and 1 of 1e+10, far outside of all others`, and a large share."""
-    share = np.count_nonzero(at) / np.count_nonzero(~np.isnan(numbers))
-    often = f" ({100 * share:.0f} % of all)" if share > _MOST else ""
-    return f"{value_words(numbers[at])}{often}, far outside the other values"
-
-
-def value_words(values: np.ndarray) -> str:
-    """Return `10 samples of -9999 and 1 of 1e+10`, for at least one value (K,)."""
-    numbers, counts = np.unique(values, return_counts=True)
-    words = [f"{n} of {v:.7g}" for v, n in zip(numbers[:3], counts[:3], strict=True)]
-    words[0] = words[0].replace(" of", " sample of" if counts[0] == 1 else " samples of", 1)
-    more = f" and {numbers.size - 3} more such values" if numbers.size > 3 else ""
-    return " and ".join(words) + more
+    """Describe the marks of a channel (a mask of its numbers (N,)), by value."""
+    values, counts = np.unique(numbers[at], return_counts=True)
+    share = counts.sum() / np.count_nonzero(~np.isnan(numbers))
+    each = listed(f"{n} of {v:.7g}" for v, n in zip(values, counts, strict=True))
+    return f"samples far outside the other values ({each}; {100 * share:.2g} % of all)"
 
 
 # Strays: samples that no motion reaches, and numbers that no sensor measures.
@@ -143,15 +136,14 @@ _MOST_STRAYS = 0.05
 _MOTION = 50
 """Fewest samples that define the range of a motion."""
 _FAR, _FARTHER = 5.0, 20.0
-"""Distance of a stray, in ranges of all other samples. The second is for inputs, because a stick
-may briefly be pushed out of noise, and for signals of few values."""
+"""Distance of a stray output and input, in ranges of all other samples. A stick may briefly be
+pushed out of noise."""
 _QUICK = 0.04
 """Longest usual step [s] within which a motion cannot come and go."""
 _LONGEST = 3
-"""Most strays in a row; a value that a sensor holds counts once."""
-_STRAY_LEVELS, _FEW_LEVELS = 8, 3
-"""Distinct values of a signal besides its strays. Below the first it has few, below the second too
-few to decide."""
+"""Most strays in a row."""
+_STRAY_LEVELS = 8
+"""Fewest distinct values of a signal besides its strays."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,43 +175,29 @@ def strays(seconds: np.ndarray, numbers: np.ndarray, kind: str) -> tuple[Strays,
 
 
 def stray_words(strays: Strays) -> str:
-    """Return `3 samples of -99, the first at 12.3 s, which ...`."""
-    words = value_words(strays.values)
-    if np.unique(strays.values).size > 3:
-        low, high = strays.values.min(), strays.values.max()
-        words = f"{strays.values.size} samples from {low:.4g} to {high:.4g}"
-    at = "at" if strays.times.size == 1 else "the first at"
-    return f"{words}, {at} {strays.times[0]:.6g} s, {strays.why}"
+    """Describe stray samples by count, range and first time."""
+    low, high = strays.values.min(), strays.values.max()
+    return (
+        f"{sample_count(strays.values.size)} from {low:.4g} to {high:.4g}, the first at "
+        f"{strays.times[0]:.6g} s, {strays.why}"
+    )
 
 
 def _unreached(seconds: np.ndarray, numbers: np.ndarray, kind: str) -> tuple[np.ndarray, float]:
     """Return a mask of isolated numbers (N,) that no motion reaches, and their limit [ranges]."""
     seen, none = np.flatnonzero(np.isfinite(numbers)), np.zeros(numbers.shape, bool)
     x, far = numbers[seen], _FAR if kind == "output" else _FARTHER
-    if x.size < _MOTION:
+    if x.size < _MOTION or float(np.median(np.diff(seconds[seen]))) > _QUICK:
         return none, far
-    # A value that a sensor holds counts once. A stick that stays was moved there.
-    new = np.r_[True, x[1:] != x[:-1]] if kind == "output" else np.ones(x.size, bool)
-    if np.count_nonzero(new) < _MOTION:
-        new[:], far = True, _FARTHER
-    y = x[new]
-    quick = float(np.median(np.diff(seconds[seen][new]))) <= _QUICK
-    if not quick and kind == "input":
-        return none, far
-    low, high = np.quantile(y, [_MOST_STRAYS, 1 - _MOST_STRAYS])
-    out = _beyond(y, low, high, far)
-    # A value that stays, begins or ends the record was reached by a motion, and so were values near
-    # it.
-    alone = _alone(out, y, _LONGEST if quick else 1)
+    low, high = np.quantile(x, [_MOST_STRAYS, 1 - _MOST_STRAYS])
+    alone = _alone(_beyond(x, low, high, far), x)
     if not alone.any():
         return none, far
-    rest = y[~alone]
-    levels = np.unique(rest).size
-    far = far if levels >= _STRAY_LEVELS else _FARTHER
-    alone &= _beyond(y, rest.min(), rest.max(), far) & (levels >= _FEW_LEVELS)
-    at = alone[np.cumsum(new) - 1]
-    if np.count_nonzero(at) <= _MOST_STRAYS * x.size:
-        none[seen[at]] = True
+    rest = x[~alone]
+    if np.unique(rest).size >= _STRAY_LEVELS:
+        alone &= _beyond(x, rest.min(), rest.max(), far)
+        if np.count_nonzero(alone) <= _MOST_STRAYS * x.size:
+            none[seen[alone]] = True
     return none, far
 
 
@@ -228,15 +206,15 @@ def _beyond(y: np.ndarray, low: float, high: float, far: float) -> np.ndarray:
     return (y > high + away) | (y < low - away)
 
 
-def _alone(out: np.ndarray, y: np.ndarray, most: int) -> np.ndarray:
-    """Return a mask of the samples `out` (N,) to one side and between others.
+def _alone(out: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return a mask of the samples `out` (N,) of y, a few in a row, to one side of the others.
 
-    At most `most` are in a row.
+    A value that begins or ends the record was reached by a motion.
     """
     edges = np.flatnonzero(np.diff(np.r_[False, out, False].astype(int)))
     at, above = np.zeros(out.shape, bool), y > np.median(y)
     for begin, end in edges.reshape(-1, 2):
-        inside = begin > 0 and end < out.size and end - begin <= most
+        inside = begin > 0 and end < out.size and end - begin <= _LONGEST
         at[begin:end] = inside and np.ptp(above[begin:end].astype(int)) == 0
     return at
 
@@ -258,8 +236,6 @@ _FEWEST_SINGLE = 0.8
 _ONE_COUNT = 0.5
 """Share of jumps by one count of the resolution, from which on a slow motion with coarse resolution
 looks the same."""
-_MOVES = 0.5
-"""Smallest share of samples at which another output must move to show that the vehicle did."""
 _STALE = 0.02, 0.5
 """Smallest and largest share of stale samples."""
 _CHANCE = 0.02
@@ -329,37 +305,23 @@ def repeats_removed(
 ) -> tuple[dict[str, np.ndarray], list[Finding]]:
     """Return outputs (N,), each on its own clock, with repeats as missing samples, and notes."""
     made, notes = dict(outputs), []
-    runs = {n: usual_run(y) for n, y in outputs.items()}
-    moving = any(runs[n] is None and _moves(y) for n, y in outputs.items())
     for name, y in outputs.items():
-        usual, lengths = runs[name], _runs(y)[0]
+        if stated[name] == "keep":
+            continue
+        usual, lengths = usual_run(y), _runs(y)[0]
         if stated[name] == "missing" and usual is None and lengths.size:
             # Stated by the user, so no further evidence is needed.
             usual = round(float(np.median(lengths)))
-        if stated[name] == "auto" and usual is None and (again := stale(y)).any():
-            made[name] = np.where(again, np.nan, y)
-            count = int(np.count_nonzero(again))
-            words = (
-                f"{count} samples of {name} repeat the previous value, which its noise never "
-                "does: they are treated as missing (`repeats: keep` keeps them)"
-            )
-            notes.append(note("repeats.missing", words, name, value=count))
-        if stated[name] == "keep" or usual is None or usual < 2:
-            continue
-        if stated[name] == "auto" and not moving:
-            # The other signals do not show motion while this one was constant.
-            words = (
-                f"{name} keeps each value for {usual} samples; if the sensor is that slow, state "
-                "`repeats: missing`"
-            )
-            notes.append(note("repeats.kept", words, name, value=usual))
-            continue
-        made[name] = without_repeats(y, usual)
-        words = (
-            f"{name} keeps each value for {usual} samples: only the first is used (`repeats: "
-            "keep` keeps all)"
-        )
-        notes.append(note("repeats.missing", words, name, value=usual))
+        if usual is None:
+            again = stale(y)
+            made[name], value = np.where(again, np.nan, y), int(np.count_nonzero(again))
+            words = f"{value} samples of {name} repeat the previous value, as its noise never does"
+        else:
+            made[name], value = without_repeats(y, usual), usual if usual > 1 else 0
+            words = f"{name} keeps each value for {usual} samples"
+        if value:
+            words += ": repeats count as missing (`repeats: keep` keeps them)"
+            notes.append(note("repeats.missing", words, name, value=value))
     return made, notes
 
 
@@ -369,8 +331,3 @@ def _runs(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     at = np.flatnonzero(seen[1:] != seen[:-1])
     with np.errstate(over="ignore"):  # huge values give infinite jumps, which are no less regular
         return np.diff(at), np.abs(seen[at + 1] - seen[at])
-
-
-def _moves(values: np.ndarray) -> bool:
-    seen = values[~np.isnan(values)]
-    return seen.size > 1 and float(np.mean(seen[1:] != seen[:-1])) >= _MOVES

@@ -17,10 +17,9 @@ from heli_jax.flights.as_logged import as_logged
 from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.grid import (
     LATEST,
-    SHORTEST_STEP,
     Grid,
     Uneven,
-    not_increasing,
+    clock_fault,
     rounding_of,
     uniform_grid,
 )
@@ -156,14 +155,12 @@ def topic_clock(log: ChannelLog, topic: Topic, window: tuple[float, float] | Non
     else:
         rows = rows_in_window(log.path, elapsed, window, *place)
     clock = TopicClock(topic.name, elapsed[rows], rows, topic)
-    if (back := not_increasing(clock.seconds)) is not None:
-        row, fault = back
-        problem = f"the time {fault} after {clock.seconds[row - 1]:.6g} s, expected increasing"
-        raise wrong(log.path, f"{problem} times; give a window without it", *place)
-    # The median, because one long gap would raise the mean above any limit.
-    if clock.usual < SHORTEST_STEP:
-        problem = "the usual step is shorter than 1 ns, expected a clock; look at the time's unit;"
-        raise clock.wrong(log.path, f"{problem} it begins", 0)
+    if (found := clock_fault(clock.seconds)) is not None:
+        row, fault = found
+        problem = f"the time {fault} after {clock.seconds[max(row - 1, 0)]:.6g} s"
+        raise wrong(
+            log.path, f"{problem}, expected increasing times; choose another window", *place
+        )
     return clock
 
 
@@ -268,11 +265,9 @@ def flight_of_signals(
         made = at_times(request, {key: s.timed for key, s in signals.items()}, holds, times)
         start, dt = float(times[0]), 1.0 / rate
         end = end if len(clocks) == 1 else float(times[-1])
-    rates = {n: 1.0 / s.clock.usual for (n, kind), s in signals.items() if kind == "output"}
     source = replace(
         source,
         notes=(*source.notes, *notes, *made.notes),
-        rates=rates,
         facts={key: f.within(start, end) for key, f in logged.facts.items()},
     )
     return Flight(
@@ -357,11 +352,7 @@ def _uneven(path: str, clock: TopicClock, uneven: Uneven) -> InputError:
     problem = f"a step of {uneven.step:.6g} s where {uneven.usual:.6g} s is usual"
     if uneven.drift is not None:
         problem = f"the times deviate from a uniform grid by {uneven.drift:.2g} samples"
-    # If a gap is too long to be bridged, a rate would only cause the next error. The parts beside
-    # the gap may be uniform.
-    bridged = np.diff(clock.seconds).max() <= longest_gap(clock.seconds) * (1 + 1e-9)
-    remedy = f"`rate: {1 / uneven.usual:.4g}` to resample, or " if bridged else ""
-    remedy += "a window without such steps" + ("" if bridged else " or `gaps: split`")
+    remedy = f"`rate: {1 / uneven.usual:.4g}` to resample, `gaps: split`, or a window without them"
     return clock.wrong(path, f"{problem}, expected a uniform grid; give {remedy};", uneven.row)
 
 

@@ -7,7 +7,7 @@ other file there is the table of one autopilot.
 import functools
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from importlib.resources.abc import Traversable
 from typing import NamedTuple
@@ -167,8 +167,7 @@ def choose(log: Table | ChannelLog, alternatives: Sequence[Alternative]) -> Alte
             continue
         if isinstance(log, ChannelLog) and not _serves(log, needed, alternative):
             continue
-        values = {**vars(alternative), "channel": channel}
-        return Alternative(**values)
+        return replace(alternative, channel=channel)
     return None
 
 

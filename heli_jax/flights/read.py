@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from heli_jax.errors import InputError
-from heli_jax.finding import LEFT_OUT, Finding, note, sentences
+from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.align import NotAligned, lag_between
 from heli_jax.flights.as_logged import measured
 from heli_jax.flights.derived import with_derived
@@ -39,8 +39,6 @@ _SHORTEST = 0.05
 """Shortest flight [s]: no vehicle responds to a stick sooner."""
 _STILL = 1e-100
 """Largest range of an output that counts as constant [SI]."""
-_SHARED = 0.5
-"""Smallest shared part of two logs of one clock, relative to the shorter one."""
 
 type _Log = str | Path | ChannelLog | Table
 
@@ -200,20 +198,16 @@ def _with_notes(flight: Flight, *notes: Finding) -> Flight:
 # A log, and other logs of the same flight with their own clocks.
 
 
-class _Beside(NamedTuple):
-    """Signals of a further log on the clock of the first [s], and a note on the alignment."""
-
-    signals: Mapping[Key, ClockedSignal]
-    note: Finding
-
-
 class _Opened(NamedTuple):
     """Logs that are read for one flight."""
 
     log: ChannelLog
     keys: frozenset[Key]
     """Signals in the first log."""
-    further: tuple[_Beside, ...]
+    further: Mapping[Key, ClockedSignal]
+    """Signals of further logs, on the clock of the first."""
+    notes: tuple[Finding, ...]
+    """Notes on the alignment."""
     request: Request
     """Request for the signals of all logs."""
     inputs: Mapping[str, Signal]
@@ -234,44 +228,36 @@ def _opened(
     request = Request(path.path if is_open else str(path), time, logged, outputs, options)
     log = _open(request, path if is_open else None)
     request = with_file_units(log, request)
-    keys, everything, further = frozenset(request.signals), copy.copy(request), []
+    keys, everything, further, notes = frozenset(request.signals), copy.copy(request), {}, []
     for also in options.also:
         signals = {(n, "input"): s for n, s in also.inputs.items()}
         signals |= {(n, "output"): s for n, s in also.outputs.items()}
         twice = next((key for key in signals if key in everything.signals), None)
         if twice is not None:
             raise wrong(also.path, f"{twice[1]} {twice[0]!r} comes from two logs, expected one")
-        one, requested = _beside(log, request, also)
+        shifted, notice, requested = _beside(log, request, also)
         everything.signals = {**everything.signals, **requested.signals}
-        further.append(one)
+        further |= shifted
+        notes.append(notice)
         inputs = {**inputs, **also.inputs}
-    return _Opened(log, keys, tuple(further), everything, inputs)
+    return _Opened(log, keys, further, tuple(notes), everything, inputs)
 
 
 def _clocked(logs: _Opened, request: Request) -> dict[Key, ClockedSignal]:
     """Return the signals inside the window on their clocks [s], from the first log's beginning."""
     signals = signals_of(logs.log, _only(request, logs.keys))
-    for one in logs.further:
-        signals |= {key: _within(s, request) for key, s in one.signals.items()}
-    return signals
+    return signals | {key: _within(s, request) for key, s in logs.further.items()}
 
 
 def _flight(logs: _Opened, request: Request) -> Flight:
     """Return the flight inside the window, with its constant inputs."""
     log = logs.log
-    try:
-        notes = (*log.notes, *_beyond(logs, request), *(one.note for one in logs.further))
-        flight = flight_of_signals(
-            _clocked(logs, request),
-            request,
-            Source(log.path, log.sha256, notes, log.firmware, log.parameters, first_time=log.begin),
-        )
-    except InputError as e:
-        # A wrong unit of the clock causes errors of other kinds.
-        notices = [n for n in log.notes if n.code == "units.contradicted"]
-        if not notices:
-            raise
-        raise InputError("; ".join([str(e), *sentences(notices)])) from e
+    notes = (*log.notes, *_beyond(logs, request), *logs.notes)
+    flight = flight_of_signals(
+        _clocked(logs, request),
+        request,
+        Source(log.path, log.sha256, notes, log.firmware, log.parameters, first_time=log.begin),
+    )
     assert flight.source is not None
     values, reasons = dict(flight.inputs), dict(flight.hold_reason)
     for name, signal in logs.inputs.items():
@@ -319,8 +305,10 @@ def _only(request: Request, keys: frozenset[Key], whole: bool = False) -> Reques
     return part
 
 
-def _beside(log: ChannelLog, request: Request, also: Also) -> tuple[_Beside, Request]:
-    """Return the signals of a further log on the first log's clock, and the request with units."""
+def _beside(
+    log: ChannelLog, request: Request, also: Also
+) -> tuple[dict[Key, ClockedSignal], Finding, Request]:
+    """Return the signals of a further log on the first log's clock, a note, and their request."""
     options = ReadOptions(number=also.number)
     requested = Request(also.path, also.time, also.inputs, also.outputs, options)
     # An open log is not opened again, because it may be large.
@@ -331,13 +319,15 @@ def _beside(log: ChannelLog, request: Request, also: Also) -> tuple[_Beside, Req
     name = Path(also.path).name
     stated = f"{name} (sha256 {file.sha256[:12]})"
     if also.same:
-        lag, notices = _aligned(log, request, also, file, stated)
+        lag, notice = _aligned(log, request, also, file, stated)
     else:
         lag = float(other.begin - log.begin)
-        ours = signals_of(log, _only(request, frozenset(request.signals), whole=True))
-        notices = _as_one(
-            request, also, _span(ours, log.begin), _span(signals, other.begin), stated
+        first = Path(request.path).name
+        words = (
+            f"{stated}: its times are taken as those of {first}; if each log counts from its own "
+            "start, state align"
         )
+        notice = note("clock.taken-as-one", words, value=lag)
     shifted = {}
     for key, signal in signals.items():
         # Two files may have topics of the same name.
@@ -345,7 +335,7 @@ def _beside(log: ChannelLog, request: Request, also: Also) -> tuple[_Beside, Req
         called = clock.name if clock.name == name else f"{name}, {clock.name}"
         clock = dataclasses.replace(clock, name=called, seconds=clock.seconds + lag)
         shifted[key] = dataclasses.replace(signal, clock=clock)
-    return _Beside(shifted, notices), requested
+    return shifted, notice, requested
 
 
 def _aligned(
@@ -378,36 +368,6 @@ def _aligned(
     return lag.lag, Finding(
         "clock.aligned", "note", words, lag.lag, "seconds added to its times", (also.same,)
     )
-
-
-def _as_one(
-    request: Request,
-    also: Also,
-    ours: tuple[float, float],
-    theirs: tuple[float, float],
-    name: str,
-) -> Finding:
-    """Return a note that the times of two logs, from first to last [s], share one clock."""
-    first, shared = Path(request.path).name, min(ours[1], theirs[1]) - max(ours[0], theirs[0])
-    if not shared >= _SHARED * min(ours[1] - ours[0], theirs[1] - theirs[0]):
-        raise wrong(
-            also.path,
-            f"its times go from {theirs[0]:.6g} s to {theirs[1]:.6g} s and those of {first} from "
-            f"{ours[0]:.6g} s to {ours[1]:.6g} s, so that their clocks differ; state a motion "
-            "that both logs have, align: {with: ..., to: ...}",
-        )
-    words = (
-        f"{name}: its times are taken as those of {first} ({shared:.4g} s in common); if "
-        "each log counts from its own start, state align"
-    )
-    return note("clock.taken-as-one", words, value=shared)
-
-
-def _span(signals: Mapping[Key, ClockedSignal], first_time: float) -> tuple[float, float]:
-    """Return the first and last time of signals [s], in the log's own count."""
-    clocks = [s.clock.seconds for s in signals.values()]
-    begin, end = min(float(c[0]) for c in clocks), max(float(c[-1]) for c in clocks)
-    return first_time + begin, first_time + end
 
 
 def _within(signal: ClockedSignal, request: Request) -> ClockedSignal:

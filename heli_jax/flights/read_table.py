@@ -130,17 +130,9 @@ def guessed_log(table: Table, time: str | None, unit: str | None, rate: float | 
     """
     info = describe_table(table, time, unit, rate)
     clock, notes = info.time, []
-    texts = [c for c in info.columns if c.kind == "text"]
     if clock is None or clock.problem:
-        why = clock.problem if clock else "no column looks like a clock"
-        remedy = "expected --time NAME, a column of increasing times, or "
-        remedy += (
-            "a file without rows that go back in time"
-            if clock
-            else "--time-rate HZ, samples a second"
-        )
-        if not clock and texts:
-            why += f" ({shown(texts[0].name)} is text{texts[0].strays and ': ' + texts[0].strays})"
+        why = clock.problem if clock else "no column of numbers looks like a clock"
+        remedy = "expected --time NAME, a column of increasing times, or --time-rate HZ"
         raise wrong(table.path, f"{why}, {remedy}")
     if clock.guessed:
         words = f"column {shown(clock.column)} is taken as the clock in {clock.unit}"
@@ -148,14 +140,11 @@ def guessed_log(table: Table, time: str | None, unit: str | None, rate: float | 
     rows = next((c.count for c in info.columns if c.name == clock.column), info.n_rows)
     # Arrays may have different lengths; rows of a table with empty cells have one length.
     whole = not isinstance(table, ArrayTable)
-    numeric = [c for c in info.columns if c.kind == "number"]
-    names = [c.name for c in numeric if whole or c.count == rows]
-    if others := [c.name for c in numeric if c.name not in names]:
-        words = f"{listed(map(shown, others))}, not of {rows} samples as the clock"
-        notes.append(note(LEFT_OUT, f"left out: {words}", *others))
-    if texts:
-        words = listed(f"{shown(c.name)}{f' ({c.strays})' if c.strays else ''}" for c in texts)
-        notes.append(note(LEFT_OUT, f"left out: text in {words}", *(c.name for c in texts)))
+    names = [c.name for c in info.columns if c.kind == "number" and (whole or c.count == rows)]
+    if left := [c for c in info.columns if c.name not in names]:
+        each = listed(f"{shown(c.name)}{c.strays and f' ({c.strays})'}" for c in left)
+        words = f"left out, no {rows} numbers: {each}"
+        notes.append(note(LEFT_OUT, words, *(c.name for c in left)))
     # The columns are keyed by name from here on, so one of two with the same name would be lost.
     twice = next((n for n in names if names.count(n) > 1), None)
     if twice is not None:

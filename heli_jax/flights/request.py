@@ -220,7 +220,7 @@ def other_units(request: Request) -> list[Finding]:
         note(
             "units.contradicted",
             f"{name}: {shown(signal.name)} is taken in {signal.unit or '1'}, as configured;"
-            f" the file says {shown(signal.contradicted)}",
+            f" the file states {shown(signal.contradicted)}",
             name,
         )
         for (name, _), signal in request.signals.items()
@@ -232,5 +232,5 @@ def unit_note(name: str, signal: Signal) -> Finding | None:
     """Return a note on a signal that is read in the file's unit; None for others."""
     if not signal.assumed or signal.unit == signal.si:
         return None
-    words = f"no unit stated, {shown(signal.name)} taken in {signal.unit}, as the file says"
+    words = f"no unit stated, {shown(signal.name)} taken in {signal.unit}, as the file states"
     return note("units.assumed", f"{name}: {words}", name)

@@ -151,8 +151,6 @@ def interpolate(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> n
 SLOWER = 1.5
 """Shortest usual step of an output that counts as slower than the grid [grid steps]. Below it,
 interpolation makes at most three samples from two."""
-_NEAR = 0.75
-"""Largest distance by which a sample is moved along its slope [grid steps]."""
 OWN = 1.1
 """Largest usual step of an output with a sample at each instant [grid steps]."""
 
@@ -203,6 +201,8 @@ def at_nearest(signal: Timed, times: np.ndarray) -> np.ndarray:
         return samples
     few = seconds.size < 3
     away = times[np.clip(nearest, 0, times.size - 1)] - seconds
+    # For stamps at multiples of the grid's step, the remainder is rounding.
+    away = np.where(np.abs(away) > 1e-6 * step, away, 0.0)
     with np.errstate(over="ignore", invalid="ignore"):
         slope = np.zeros(seconds.size) if few else np.gradient(values, seconds, edge_order=2)
         moved = values + slope * away
@@ -215,36 +215,13 @@ def at_nearest(signal: Timed, times: np.ndarray) -> np.ndarray:
 
 
 def at_own_rate(signal: Timed, times: np.ndarray) -> np.ndarray:
-    """Move the nearest sample to each instant along its slope, at the grid's own rate.
+    """Return the samples at their nearest instants (M,), and straight lines at other instants.
 
     This is for signals with the grid's rate but different or uneven stamps. Linear interpolation
-    would give white noise an autocorrelation of up to +0.5, which looks like a disturbance.
-
-    Args:
-        signal: the signal on its own clock.
-        times: (M,) [s], evenly spaced, M >= 2.
-
-    Returns:
-        (M,), in the samples' unit; NaN beside a missing sample. Interpolated where samples are far
-        apart.
+    alone would give white noise an autocorrelation of up to +0.5, which looks like a disturbance.
     """
-    lines, seen = interpolate(signal.seconds, signal.values, times), ~np.isnan(signal.values)
-    if np.count_nonzero(seen) < 3:
-        return lines
-    step = float(times[1] - times[0])
-    with np.errstate(over="ignore", invalid="ignore"):
-        slope = np.gradient(signal.values[seen], signal.seconds[seen], edge_order=2)
-    whole = np.full(seen.size, np.nan)
-    whole[seen] = slope
-    after = np.clip(np.searchsorted(signal.seconds, times), 1, signal.seconds.size - 1)
-    nearer = times - signal.seconds[after - 1] <= signal.seconds[after] - times
-    nearest = np.where(nearer, after - 1, after)
-    away = times - signal.seconds[nearest]
-    # For stamps at multiples of the grid's step, the remainder is rounding.
-    away = np.where(np.abs(away) > 1e-6 * step, away, 0.0)
-    with np.errstate(over="ignore", invalid="ignore"):
-        moved = signal.values[nearest] + whole[nearest] * away
-    return np.where(np.isfinite(moved) & (np.abs(away) <= _NEAR * step), moved, lines)
+    placed = at_nearest(signal, times)
+    return np.where(np.isnan(placed), interpolate(*signal, times), placed)
 
 
 # Fewer samples a second without aliasing.
@@ -367,57 +344,48 @@ def _fitted(at: np.ndarray, values: np.ndarray, line: np.ndarray, ridge: float) 
     """
     from scipy.linalg import solveh_banded
 
-    half = _TAPS // 2
+    half, energy = _TAPS // 2, _penalty()
     # The line continues beyond both ends for the taps that reach there.
     padded = np.pad(line, half, mode="reflect", reflect_type="odd")
-    columns, weights, shared = _equations(np.ascontiguousarray(at).tobytes(), padded.size)
-    missing = values - np.sum(weights * padded[columns], axis=1)
-    right = np.bincount(columns.ravel(), (weights * missing[:, None]).ravel(), padded.size)
-    energy = _penalty()
-    middle = energy.size // 2
-    band = shared.copy()
-    # In a gap a slow signal has neither misfit nor penalty, and the matrix would be singular. The
-    # ridge pulls the difference from the line to zero.
-    band[0] += ridge
-    # The ends have samples on one side only, and their noise would grow outward.
-    band[0, : half + _END] += _END_RIDGE
-    band[0, -half - _END :] += _END_RIDGE
+    sums, shared = _equations(np.ascontiguousarray(at).tobytes(), padded.size)
     # The penalty applies to the signal, not to its difference from the lines. The part of the lines
     # moves to the right-hand side.
-    beyond = np.pad(padded, middle, mode="reflect", reflect_type="odd")
-    right -= np.convolve(beyond, energy, mode="valid")
+    beyond = np.pad(padded, energy.size // 2, mode="reflect", reflect_type="odd")
+    right = sums.T @ (values - sums @ padded) - np.convolve(beyond, energy, mode="valid")
+    # In a gap a slow signal has neither misfit nor penalty, and the matrix would be singular. The
+    # ridge pulls the difference from the line to zero.
+    ridges = np.full(padded.size, ridge)
+    # The ends have samples on one side only, and their noise would grow outward.
+    ridges[: half + _END] += _END_RIDGE
+    ridges[-half - _END :] += _END_RIDGE
     # Cholesky works because the ridge makes the matrix positive definite; the cost is linear in the
     # samples.
-    correction = solveh_banded(band, right, lower=True)
+    correction = solveh_banded(np.vstack([shared[0] + ridges, shared[1:]]), right, lower=True)
     return (padded + correction)[half : half + line.size]
 
 
 # Channels of a topic share a clock, and each tries several ridges. Two entries are enough: the
 # stamps for the choice of the ridge, and all stamps.
 @functools.lru_cache(maxsize=2)
-def _equations(stamps: bytes, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the even samples in each sample's sum and their weights (N, taps), and the band.
+def _equations(stamps: bytes, size: int) -> tuple[Any, np.ndarray]:
+    """Return the sums of even samples that make the samples (N, size), and the band.
 
-    The band (taps, size) has the diagonals of the least-squares equations with the penalty.
+    The band (taps, size) has the lower diagonals of the least-squares equations with the penalty.
     """
+    from scipy.sparse import csr_array, diags_array
+
     at = np.frombuffer(stamps)
     columns = np.floor(at).astype(np.int64)[:, None] + 1 + np.arange(_TAPS)
     weights = _sinc(at[:, None] + _TAPS // 2 - columns)
     weights /= weights.sum(1, keepdims=True)  # a constant stays exact
-    # Lower diagonals: LAPACK takes ten times as long for upper ones. Two samples share a weight
-    # only within the taps, so the matrix is a band.
-    band = np.zeros((_TAPS, size))
-    for lag in range(_TAPS):
-        products = weights[:, : _TAPS - lag] * weights[:, lag:]
-        to = columns[:, : _TAPS - lag].ravel()
-        band[lag] += np.bincount(to, products.ravel(), size)
-    energy = _penalty()
-    middle = energy.size // 2
-    for lag in range(middle + 1):
-        band[lag, : size - lag] += energy[middle + lag]
-    for array in (columns, weights, band):
-        array.setflags(write=False)
-    return columns, weights, band
+    pointers = _TAPS * np.arange(at.size + 1)
+    sums = csr_array((weights.ravel(), columns.ravel(), pointers), shape=(at.size, size))
+    energy, middle = _penalty(), _penalty().size // 2
+    offsets = np.arange(-middle, middle + 1)
+    shared = sums.T @ sums + diags_array(energy, offsets=offsets, shape=(size, size))
+    # Two samples share a weight only within the taps, so the matrix is a band.
+    band = [np.r_[shared.diagonal(-lag), np.zeros(lag)] for lag in range(_TAPS)]
+    return sums, np.array(band)
 
 
 @functools.cache

@@ -1,10 +1,9 @@
-"""Facts of a signal as it was logged: clipped ends, steps, stuck parts.
+"""Facts of a signal as it was logged: clipped ends, stuck parts.
 
-They are computed before any resampling: a low-pass filter rounds a clipped top and fills the steps
-of a coarse log, so the faults would be hidden but remain.
+They are computed before any resampling, because a low-pass filter rounds a clipped top.
 """
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,8 +27,6 @@ _STUCK, STUCK_SECONDS = 20.0, 0.5
 """Length of a stuck part: ratio to the usual number of equal samples, and time [s]."""
 _AT_REST = 1e-3
 """Largest last move before a rest by itself, relative to the usual move."""
-_OFTEN = 3
-"""Fewest times at one value that count by their total time only."""
 _REGULAR = 0.9
 """Smallest share of runs of equal samples with the usual length. A slow motion in coarse steps has
 runs of any length."""
@@ -37,17 +34,15 @@ _TURNS = 0.3
 """Share of a signal's moves that reverse, above which its noise is as large as its steps."""
 _TIMES = 5.0
 """Ratio to such a signal's longest usual run, above which it is stuck."""
-_DROPS, DROP_SHARE = 5, 0.01
-"""Visits of a value, and share of samples at it, from which on they are dropouts."""
 _TRIFLE = 0.2
-"""Smallest motion of another signal while one is stuck, relative to its usual deviation or move."""
+"""Smallest sd of another signal while one is stuck, relative to its usual sd."""
 _RUNS = 20
 """Fewest runs of equal samples from which their usual length is known."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rail:
-    """A value at which a signal is clipped, or to which it drops repeatedly.
+    """A value at which a signal is clipped.
 
     `times` (K,) [s] are those of its samples there; none if an end of the range is no rail.
     """
@@ -73,24 +68,16 @@ class SignalFacts:
         size: number of samples.
         low: lower end of its range.
         high: upper end.
-        step: step of which all differences of values are multiples; 0 if there is none.
-        levels: number of distinct values.
-        moves: share of samples that differ from the previous one.
         usual: usual time between samples [s].
         stretches: times at one value, of an output while other signals move; the longest first.
-        dropouts: value to which an output jumps from anywhere.
         strays: samples that may mean no value, but are kept.
     """
 
     size: int
     low: Rail
     high: Rail
-    step: float
-    levels: int
-    moves: float
     usual: float
     stretches: tuple[Stuck, ...] = ()
-    dropouts: Rail | None = None
     strays: tuple[Strays, ...] = ()
 
     @property
@@ -99,21 +86,13 @@ class SignalFacts:
         return self.stretches[0] if self.stretches else None
 
     @property
-    def dropped(self) -> float:
-        """Share of the samples that are dropouts."""
-        return 0.0 if self.dropouts is None else self.dropouts.times.size / max(self.size, 1)
-
-    @property
     def shares(self) -> tuple[float, float]:
         """Shares of the samples at the lower and at the upper rail."""
         n = max(self.size, 1)
         return self.low.times.size / n, self.high.times.size / n
 
     def within(self, begin: float, end: float) -> "SignalFacts":
-        """Return the facts of the part from `begin` to `end` [s], with times from `begin`.
-
-        Levels and steps stay those of the whole.
-        """
+        """Return the facts of the part from `begin` to `end` [s], with times from `begin`."""
 
         def cut(rail: Rail) -> Rail:
             times = rail.times[(rail.times >= begin) & (rail.times <= end)]
@@ -124,8 +103,7 @@ class SignalFacts:
             for one in self.stretches
             if one.begin < end and one.end > begin
         ]
-        stretches = _significant_parts(inside, end - begin)
-        drops = None if self.dropouts is None else cut(self.dropouts)
+        inside = [one for one in inside if one.end - one.begin >= STUCK_SECONDS]
         size = min(self.size, round((end - begin) / self.usual) + 1) if self.usual > 0 else 0
         strays = (s.within(begin, end) for s in self.strays)
         return replace(
@@ -133,8 +111,7 @@ class SignalFacts:
             size=size,
             low=cut(self.low),
             high=cut(self.high),
-            stretches=stretches,
-            dropouts=drops if drops and drops.times.size else None,
+            stretches=tuple(sorted(inside, key=lambda one: one.begin - one.end)),
             strays=tuple(s for s in strays if s.times.size),
         )
 
@@ -145,8 +122,7 @@ def signal_facts(seconds: np.ndarray, x: np.ndarray) -> SignalFacts:
     s, y = seconds[seen], x[seen]
     if not y.size:
         none = Rail(float("nan"), np.zeros(0))
-        return SignalFacts(0, none, none, 0.0, 0, 0.0, 0.0)
-    # Sorted once for all facts, because sorting takes most of the time in a long log.
+        return SignalFacts(0, none, none, 0.0)
     levels, counts = np.unique(y, return_counts=True)
     none = np.zeros(y.shape, bool)
     few = levels.size < FEW
@@ -155,9 +131,6 @@ def signal_facts(seconds: np.ndarray, x: np.ndarray) -> SignalFacts:
         size=y.size,
         low=Rail(float(y.min()), s[low]),
         high=Rail(float(y.max()), s[high]),
-        step=_lattice(levels),
-        levels=levels.size,
-        moves=float(np.mean(np.diff(y) != 0)) if y.size > 1 else 0.0,
         usual=float(np.median(np.diff(s))) if s.size > 1 else 0.0,
     )
 
@@ -177,14 +150,12 @@ def facts_of_all[K: Hashable](
                 for one in _stretches(*signals[key], facts[key])
                 if any(_goes_on(*other, one.begin, one.end) for other in others)
             ]
-            counted = _significant_parts(found, facts[key].size * facts[key].usual)
-            drops = _dropouts(*signals[key])
-            facts[key] = replace(facts[key], stretches=counted, dropouts=drops)
+            facts[key] = replace(facts[key], stretches=tuple(found))
     return facts
 
 
 def _stretches(seconds: np.ndarray, x: np.ndarray, facts: SignalFacts) -> list[Stuck]:
-    """Return the times at one value that are unusually long."""
+    """Return the times at one value that are unusually long, the longest first."""
     seen = np.isfinite(x)
     s, y = seconds[seen], x[seen]
     moves = np.diff(y)
@@ -195,91 +166,33 @@ def _stretches(seconds: np.ndarray, x: np.ndarray, facts: SignalFacts) -> list[S
     # A rest at a rail is reported as a rail.
     rails = [rail.value for rail in (facts.low, facts.high) if rail.times.size]
     lengths = np.where(np.isin(y[begins], rails), 0, lengths)
-    usual = float(np.median(np.abs(moves[moves != 0])))
-    stuck, noisy = [], _turns(moves) >= _TURNS
-    for i in np.flatnonzero(lengths >= _longest_by_itself(lengths, moves)):
+    usual = float(np.median(lengths))
+    least = _STUCK * usual
+    if np.mean(lengths <= 1.5 * usual) < _REGULAR:
+        ways = np.sign(moves[moves != 0])
+        # A slow motion in coarse steps may stay for any time. Noise as large as the steps reverses
+        # often and ends each run by chance.
+        if np.mean(ways[1:] != ways[:-1]) < _TURNS:
+            return []
+        # Runs that contain 99 % of the time, without those that are stuck.
+        ordered = np.sort(lengths[lengths < least])
+        spent = np.cumsum(ordered) / ordered.sum()
+        least = max(least, _TIMES * float(ordered[int(np.searchsorted(spent, 0.99))]))
+    move, stuck = float(np.median(np.abs(moves[moves != 0]))), []
+    for i in np.flatnonzero(lengths >= least):
         first, last = begins[i], begins[i] + lengths[i] - 1
-        one = Stuck(float(s[first]), float(s[last]), float(y[first]))
         # A simulated signal without noise comes to rest within the last digit.
-        rests = first > 0 and abs(moves[first - 1]) < _AT_REST * usual
-        # A signal without noise may rest for a while without being stuck.
-        if not rests and (noisy or one.end - one.begin >= STUCK_SECONDS):
-            stuck.append(one)
-    return stuck
+        rests = first > 0 and abs(moves[first - 1]) < _AT_REST * move
+        if not rests and s[last] - s[first] >= STUCK_SECONDS:
+            stuck.append(Stuck(float(s[first]), float(s[last]), float(y[first])))
+    return sorted(stuck, key=lambda one: one.begin - one.end)
 
 
 def _goes_on(seconds: np.ndarray, x: np.ndarray, begin: float, end: float) -> bool:
     """True if another signal moves from `begin` to `end` [s] about as it usually does."""
     seen = np.isfinite(x)
     inside = x[(seconds >= begin) & (seconds <= end) & seen]
-    if inside.size < 2:
-        return False
-    if float(np.std(inside)) >= _TRIFLE * float(np.std(x[seen])):
-        return True
-    # In so short a time a signal does not go far, so its moves between samples are compared.
-    moves = np.abs(np.diff(x[seen]))
-    if end - begin >= STUCK_SECONDS or not moves.any():
-        return False
-    return float(np.median(np.abs(np.diff(inside)))) >= _TRIFLE * float(np.median(moves[moves > 0]))
-
-
-def _significant_parts(stuck: Sequence[Stuck], duration: float) -> tuple[Stuck, ...]:
-    """Return the long stuck parts, longest first; all, if short ones fill a share of a record."""
-    total = sum(one.end - one.begin for one in stuck)
-    often = len(stuck) >= _OFTEN and total >= max(STUCK_SECONDS, DROP_SHARE * duration)
-    counted = [one for one in stuck if often or one.end - one.begin >= STUCK_SECONDS]
-    return tuple(sorted(counted, key=lambda one: one.begin - one.end))
-
-
-def _turns(moves: np.ndarray) -> float:
-    """Return the share of a signal's moves that reverse."""
-    ways = np.sign(moves[moves != 0])
-    return float(np.mean(ways[1:] != ways[:-1])) if ways.size > 1 else 0.0
-
-
-def _longest_by_itself(lengths: np.ndarray, moves: np.ndarray) -> float:
-    """Return the number of equal samples in a row above which a signal is stuck.
-
-    It is inf if the signal may stay at one value for any time.
-    """
-    least = _STUCK * float(np.median(lengths))
-    if np.mean(lengths <= 1.5 * float(np.median(lengths))) >= _REGULAR:
-        return least
-    # A slow motion in coarse steps has runs of any length. Noise as large as the steps reverses
-    # often and ends each run by chance.
-    if _turns(moves) < _TURNS:
-        return np.inf
-    # Runs that contain 99 % of the time, without those that are stuck.
-    ordered = np.sort(lengths[lengths < least])
-    spent = np.cumsum(ordered) / ordered.sum()
-    return max(least, _TIMES * float(ordered[int(np.searchsorted(spent, 0.99))]))
-
-
-def _dropouts(seconds: np.ndarray, x: np.ndarray) -> Rail | None:
-    """Return the value to which a signal repeatedly jumps from anywhere."""
-    seen = np.isfinite(x)
-    s, y = seconds[seen], x[seen]
-    levels, counts = np.unique(y, return_counts=True)
-    if levels.size < _RUNS:
-        return None
-    k = int(np.argmax(counts))
-    if k in (0, levels.size - 1):  # a rail
-        return None
-    near = np.r_[counts[max(k - 5, 0) : k], counts[k + 1 : k + 6]]
-    gap = np.min(np.abs(np.diff(levels[max(k - 1, 0) : k + 2])))
-    at = y == levels[k]
-    into = np.flatnonzero(at[1:] & ~at[:-1])
-    # A motion reaches a value by way of its neighbours.
-    jumps = np.abs(y[into] - levels[k])
-    # The longest visit does not count, because a stuck signal does not return.
-    edges = np.flatnonzero(np.diff(np.r_[0, at.astype(int), 0]))
-    many = counts[k] - int(np.max(edges[1::2] - edges[::2]))
-    often = into.size >= _DROPS and many >= max(DROP_SHARE * y.size, 5.0 * near.max())
-    moves = np.abs(np.diff(y))
-    far = max(5.0 * float(gap), 0.3 * float(np.median(moves[moves > 0])))
-    if not often or float(np.median(jumps)) < far:
-        return None
-    return Rail(float(levels[k]), s[at])
+    return inside.size > 1 and float(np.std(inside)) >= _TRIFLE * float(np.std(x[seen]))
 
 
 def _at_top(x: np.ndarray, counts: np.ndarray) -> np.ndarray:
@@ -299,10 +212,7 @@ def _at_top(x: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
 def quantum(x: np.ndarray) -> float:
     """Return the step of which all differences of values (N,) are multiples; 0 if there is none."""
-    return _lattice(np.unique(x[np.isfinite(x)]))
-
-
-def _lattice(levels: np.ndarray) -> float:
+    levels = np.unique(x[np.isfinite(x)])
     if levels.size < 2:
         return 0.0
     steps = np.diff(levels)

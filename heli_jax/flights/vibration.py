@@ -1,4 +1,4 @@
-"""Vibration lines in a record: their frequency, share of the variance and origin."""
+"""Vibration lines in a record, and notches that remove them."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -17,10 +17,6 @@ SMALLEST = 0.01
 _SLOWEST = 4.0
 """Lowest frequency of a line [Hz]. Below are the vehicle's motion and the sticks, whose doublets
 have lines too."""
-_HIGHEST = 12
-"""Highest harmonic of the rotor in the search."""
-_HIGHEST_FOLDED = 4
-"""Highest harmonic in the search for aliases; with more, one would be near any line."""
 
 
 class Line(NamedTuple):
@@ -29,27 +25,14 @@ class Line(NamedTuple):
     hz: float
     share: float
     """Share of the variance."""
-    harmonic: int = 0
-    """Harmonic of the rotor; zero if it is none."""
-    of_hz: float = 0.0
-    """The harmonic's own frequency, which differs if it is aliased."""
-
-    @property
-    def aliased(self) -> bool:
-        """True if the line is above half the rate and was folded down."""
-        return self.harmonic > 0 and abs(self.of_hz - self.hz) > 0.1 * self.of_hz
 
 
-def lines(
-    x: np.ndarray, dt: float, rotor_hz: float | None = None, logged_hz: float | None = None
-) -> tuple[Line, ...]:
+def lines(x: np.ndarray, dt: float) -> tuple[Line, ...]:
     """Return the vibration lines of a record, the strongest first.
 
     Args:
         x: samples (N,); missing ones (NaN) are interpolated.
         dt: time between samples [s].
-        rotor_hz: speed of the rotor [Hz], if known.
-        logged_hz: rate of the log, where frequencies folded; 1/dt by default.
     """
     from scipy.ndimage import median_filter
     from scipy.signal import detrend, welch
@@ -68,39 +51,14 @@ def lines(
     around = median_filter(power, 2 * _SURROUNDINGS + 1, mode="nearest")
     peak = (power[1:-1] >= power[:-2]) & (power[1:-1] > power[2:])
     peaks = np.flatnonzero(peak & (power[1:-1] > _STANDS_OUT * around[1:-1])) + 1
-    rate = 1.0 / dt if logged_hz is None else logged_hz
     result = []
     for i in peaks[hz[peaks] >= _SLOWEST]:
         # Two bins on either side: the width of a line in this window.
         part = slice(max(i - 2, 0), i + 3)
         share = float(np.sum(power[part] - around[part])) / total
         if share >= SMALLEST:
-            name = _harmonic(float(hz[i]), rate, rotor_hz, 1.5 * float(hz[1]))
-            result.append(Line(float(hz[i]), share, *name))
+            result.append(Line(float(hz[i]), share))
     return tuple(sorted(result, key=lambda line: -line.share))
-
-
-def line_words(line: Line, rotor_hz: float | None) -> str:
-    """Describe a line: `24.2 Hz has 12 % of its variance (1/rev of the rotor)`."""
-    share = f"{line.hz:.3g} Hz has {100 * line.share:.2g} % of its variance"
-    if line.aliased:
-        return f"{share} ({line.harmonic}/rev of the rotor, {line.of_hz:.4g} Hz, aliased)"
-    if line.harmonic:
-        return f"{share} ({line.harmonic}/rev of the rotor)"
-    return f"{share} ({'no harmonic of the rotor' if rotor_hz else 'of unknown origin'})"
-
-
-def _harmonic(hz: float, rate: float, rotor_hz: float | None, width: float) -> tuple[int, float]:
-    """Return the rotor's harmonic at a line, and its frequency; zeros for none."""
-    if rotor_hz is None:
-        return 0, 0.0
-    for k in range(1, _HIGHEST + 1):
-        own = k * rotor_hz
-        # A governor keeps the speed to a percent or two.
-        there = own < 0.5 * rate or k <= _HIGHEST_FOLDED
-        if there and abs(folded(own, rate) - hz) <= width + 0.01 * own:
-            return k, own
-    return 0, 0.0
 
 
 def folded(hz: float, rate: float) -> float:

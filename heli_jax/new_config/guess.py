@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax import units
-from heli_jax.flights.channel_names import quantity_of_output
+from heli_jax.new_config.channel_names import quantity_of_output
 from heli_jax.new_config.name_units import FILLERS, without_unit
 
 _UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue"})

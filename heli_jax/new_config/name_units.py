@@ -3,7 +3,7 @@
 import re
 
 from heli_jax import units
-from heli_jax.flights.channel_names import rate_at_end
+from heli_jax.new_config.channel_names import rate_at_end
 
 # Longest first, so that deg/s is not read as deg.
 _UNIT_WORDS = {

@@ -7,9 +7,10 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.dynamics.model import axes_of
-from heli_jax.flights.channel_names import is_stick_name, words_in
+from heli_jax.flights.clock import words_in
 from heli_jax.flights.preset import model_inputs, model_outputs
 from heli_jax.new_config import guess, scales, tables, text
+from heli_jax.new_config.channel_names import is_stick_name
 from heli_jax.new_config.guess import Guess, Series
 from heli_jax.new_config.logs import Log
 from heli_jax.numerics.white_noise import has_coloured_noise, without_noise

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from heli_jax.finding import Finding, as_data
-from heli_jax.flights.write import stacked, write_table
+from heli_jax.flights.write import write_table
 from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.fit import Fit, Signals
 from heli_jax.identification.problem import Problem
@@ -105,7 +105,7 @@ def write_signals(path: Path, signals: tuple[Signals, ...]) -> None:
     columns = [_columns(s) for s in signals]
     # Columns of all flights, in the order of their first appearance.
     names = list(dict.fromkeys(name for of_flight in columns for name in of_flight))
-    write_table(path, stacked(columns, names))
+    write_table(path, _stacked(columns, names))
 
 
 def _columns(s: Signals) -> dict[str, Any]:
@@ -123,3 +123,25 @@ def _columns(s: Signals) -> dict[str, Any]:
         if s.innovations is not None:
             columns[f"{output}_innovation"] = s.innovations[output]
     return columns
+
+
+def _stacked(parts: list[dict[str, Any]], names: list[str]) -> dict[str, Any]:
+    """Stack tables vertically; a column that a part lacks is empty there.
+
+    `names` are the columns of the result, in order.
+    """
+    out: dict[str, Any] = {}
+    for name in names:
+        if all(isinstance(part.get(name), list) for part in parts):
+            out[name] = [cell for part in parts for cell in part[name]]
+            continue
+        if all(name in part for part in parts):
+            out[name] = np.concatenate([np.asarray(part[name]) for part in parts])
+            continue
+        # A list, because no array of numbers holds an empty cell: NaN would be written as a value.
+        cells: list[Any] = []
+        for part in parts:
+            n = len(next(iter(part.values())))
+            cells += list(part[name]) if name in part else [None] * n
+        out[name] = cells
+    return out

@@ -180,8 +180,7 @@ def test_a_second_file_on_the_same_clock_needs_no_alignment(tmp_path):
     np.testing.assert_allclose(flight.outputs["phi"], x(t), atol=1e-3)
     assert flight.t0 == pytest.approx(8.0, abs=0.03)
     assert flight.source is not None
-    [found] = [n for n in flight.source.notes if n.code == "clock.taken-as-one"]
-    assert found.value == pytest.approx(23.98, abs=5e-3)
+    assert "clock.taken-as-one" in {n.code for n in flight.source.notes}
 
 
 def test_a_second_file_on_another_clock_is_refused(tmp_path):

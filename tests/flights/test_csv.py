@@ -111,7 +111,6 @@ READ = {
     "ISO dates": ("a.csv", text(TUP, first=times("%Y-%m-%dT%H:%M:%S.%F"))),
     "ISO dates, UTC": ("a.csv", text(TUP, first=times("%Y/%m/%d %H:%M:%S.%FZ"))),
     "ISO dates, offset": ("a.csv", text(TUP, first=times("%Y-%m-%d %H:%M:%S.%F+01:00", 6))),
-    "German dates": ("a.csv", text("t;u;p", between=";", first=times("%d.%m.%Y %H:%M:%S,%F"))),
     "times of day": ("a.csv", text(TUP, first=times("%H:%M:%S.%F"))),
 }  # fmt: skip
 NOTED = {"units below": "text.units-line",
@@ -211,6 +210,7 @@ REFUSED = {
     "thousands": (with_cell(5, "p", "1'577.25"), "line 7, column 'p'"),
     "both decimal signs": (text("t;u;p", rows=[*COMMA[:-1], "0,78;0.5;0,1"]), "line 41"),
     "two decimal signs": (text("t;u;p", between=";").replace("0.02", "0,02"), "column 't'"),
+    "German dates": (text("t;u;p", between=";", first=times("%d.%m.%Y %H:%M:%S")), "line 2"),
     "month and day": (text(TUP, first=times("%m/%d/%Y %H:%M:%S.%F")), "line 2, column 't'"),
     "half a day": (text(TUP, first=times("%I:%M:%S.%F %p")), "line 2, column 't'"),
     "minutes": (text(TUP, first=times("%M:%S.%F")), "line 2, column 't'"),

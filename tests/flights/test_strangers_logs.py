@@ -34,7 +34,7 @@ def test_a_text_of_dataflash_has_units_instances_and_a_torn_end(tmp_path: Path) 
         lines += [f"GPS, {1000 + 200_000 * i}, {5 + 0.01 * i:.2f}, {100 + i}\n"]
         lines += [f"IMU, {1000 + 20_000 * i}, {k}, {k + 0.1 * i:.3f}\n" for k in (0, 1)]
     path = tmp_path / "flight.log"
-    path.write_text("".join([*lines, "IMU, 430, 0, 0\n"]))
+    path.write_text("".join([*lines, "IMU, 430, 0, 0"]))
     log = open_log(path)
     assert isinstance(log, ChannelLog)
     topics = {t.name: t for t in log.topics}

@@ -104,7 +104,6 @@ class DataSets:
 
     def __init__(self, budget: Budget) -> None:
         self.budget = budget
-        self.notes: list[Finding] = []
         self._stored: dict[str, np.ndarray] = {}
         self._units: dict[str, str] = {}
         self._missing: dict[str, int] = {}
@@ -123,26 +122,22 @@ class DataSets:
     def add(self, name: str, stored: np.ndarray, attributes: Mapping[str, Any]) -> None:
         """Add one data set, unpacked; `attributes` are all or the relevant ones."""
         self.budget.take_numbers(stored.size, stored.nbytes)
-        if stored.dtype.kind == "c":
-            self._left_out[name] = "which is complex"
-            return
-        if stored.ndim > _DEEPEST:
-            self.leave_out(name, stored.dtype, stored.shape)
+        if stored.dtype.kind == "c" or stored.ndim > _DEEPEST:
+            self.leave_out(name, f"{stored.dtype} of {stored.ndim} dimensions")
             return
         try:
             values, missing = unpack(stored, {n: attributes[n] for n in PACKING if n in attributes})
         except Packing as e:
-            self._left_out[name] = str(e)
+            self.leave_out(name, str(e))
             return
         if missing:
             self._missing[name] = missing
         stated = next((attributes[n] for n in UNIT_ATTRIBUTES if n in attributes), "")
         self._stored[name], self._units[name] = values, text_of(stated)
 
-    def leave_out(self, name: str, kind: np.dtype, shape: tuple[int, ...] | None) -> None:
-        """Note numbers that are left out because they have too many dimensions for a log."""
-        if shape and kind.kind in "biuf":
-            self._left_out[name] = f"which has {len(shape)} dimensions"
+    def leave_out(self, name: str, why: str) -> None:
+        """Note content that is no signal."""
+        self._left_out[name] = why
 
     def table(self, path: str, kind: str, data: bytes) -> ArrayTable:
         """Return all data sets as a table."""
@@ -150,14 +145,14 @@ class DataSets:
 
     def vectors(self) -> tuple[dict[str, np.ndarray], dict[str, str], tuple[Finding, ...]]:
         """Return arrays (N,) and units by name, and notes."""
-        notes = list(self.notes)
+        notes = []
         if self._missing:
             each = listed(f"{shown(name)} ({n})" for name, n in self._missing.items())
             words = f"fill values of the file are missing samples: {each}"
             total = sum(self._missing.values())
             notes.append(note("samples.marks", words, *self._missing, value=total))
         if self._left_out:
-            words = listed(f"{shown(n)}, {why}" for n, why in self._left_out.items())
+            words = listed(f"{shown(n)} ({why})" for n, why in self._left_out.items())
             notes.append(note(LEFT_OUT, f"left out: {words}", *self._left_out))
         flat, of_stacks = _unstacked(self._stored)
         arrays, units_of = {}, {}
@@ -182,9 +177,7 @@ def _vectors(name: str, value: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
 
 def holds_numbers(kind: np.dtype, dimensions: int) -> bool:
     """True for an array of numbers, or a table of named fields."""
-    return dimensions <= (1 if kind.names else _DEEPEST) and (
-        bool(kind.names) or kind.kind in "biuf"
-    )
+    return dimensions <= 1 if kind.names else kind.kind in "biuf" and dimensions <= _DEEPEST
 
 
 class Packing(ValueError):

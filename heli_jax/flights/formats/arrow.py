@@ -1,16 +1,17 @@
 """Logs in Apache's column formats: Parquet, and Arrow files and streams (.feather, .arrow)."""
 
+import functools
+import hashlib
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from heli_jax.finding import Finding
 from heli_jax.flights.log import Budget, Survey, column, require_columns, require_few_columns, wrong
-from heli_jax.flights.progress import Digest
-from heli_jax.regular_file import open_regular, read_regular, size_words
+from heli_jax.regular_file import open_regular, read_regular
 
 # Imported inside the functions that need it, as in `csv_text`.
 if TYPE_CHECKING:
@@ -21,7 +22,6 @@ ARROW_MARK = b"ARROW1"
 _STREAM = b"\xff\xff\xff\xff"
 _LARGEST, _LARGEST_ARROW = 16 * 10**9, 10**9
 """Largest files [bytes]: Parquet loads only requested columns, Arrow the whole file."""
-_LONGEST_FOOTER = 64 * 10**6
 _AT_ONCE = 2 * 10**6
 """Cells decoded before their rows are counted: 16 MB of numbers."""
 
@@ -34,8 +34,6 @@ def open_parquet(path: Path) -> "ColumnTable":
     where = str(path)
     with open_regular(path, "a log in Parquet", _LARGEST) as opened:
         size = os.fstat(opened.fileno()).st_size
-        # Before anything reads the whole file: a file with another end is not Parquet.
-        _check_end(where, opened, size)
         try:
             file = pq.ParquetFile(path)
             schema, metadata = file.schema_arrow, file.metadata
@@ -48,9 +46,9 @@ def open_parquet(path: Path) -> "ColumnTable":
         if texts:
             file = pq.ParquetFile(path, read_dictionary=texts)
 
-    def pieces(names: Sequence[str]) -> "Iterator[pa.RecordBatch]":
+    def read(names: Sequence[str]) -> "pa.Table":
         # Counted, because a damaged column can claim and decode to any number of rows.
-        rows = 0
+        pieces, rows = [], 0
         try:
             for piece in file.iter_batches(
                 max(_AT_ONCE // max(len(names), 1), 1), columns=list(names)
@@ -59,32 +57,24 @@ def open_parquet(path: Path) -> "ColumnTable":
                 if rows > metadata.num_rows:
                     break
                 piece.validate(full=True)  # a damaged page can decode to inconsistent lengths
-                yield piece
+                pieces.append(piece)
         except (pa.ArrowException, OSError, MemoryError, UnicodeDecodeError) as e:
             raise wrong(where, "is no whole Parquet file") from e
         if rows != metadata.num_rows:
             raise wrong(where, "is no whole Parquet file")
+        return pa.Table.from_batches(pieces)
 
     # From groups of rows, not single columns: with some damage to a column, pyarrow ends the whole
     # process.
     groups = (metadata.row_group(i) for i in range(metadata.num_row_groups))
     unpacked = sum(group.total_byte_size for group in groups)
-    count, digest = metadata.num_rows, Digest(path)
-    return ColumnTable(where, "parquet", size, digest, schema, count, pieces, unpacked)
 
+    def digest() -> str:
+        with path.open("rb") as opened:
+            return hashlib.file_digest(opened, "sha256").hexdigest()
 
-def _check_end(path: str, file: BinaryIO, size: int) -> None:
-    """Refuse a file whose end is not that of a Parquet file, or states an oversized footer."""
-    # A Parquet file ends with its metadata, their length (4 bytes, little-endian) and its mark:
-    # PAR1, or PARE if the metadata are encrypted. 12 bytes are both marks and the length.
-    file.seek(max(size - 8, 0))
-    end = file.read(8)
-    length = int.from_bytes(end[:4], "little")
-    if end[4:] not in (b"PAR1", b"PARE") or length + 12 > size:
-        raise wrong(path, "is no whole Parquet file")
-    if length > _LONGEST_FOOTER:
-        words = f"{size_words(_LONGEST_FOOTER)}, got {size_words(length)}"
-        raise wrong(path, f"expected a footer of at most {words}")
+    count = metadata.num_rows
+    return ColumnTable(where, "parquet", size, digest, schema, count, read, unpacked)
 
 
 def open_arrow(path: Path) -> "ColumnTable":
@@ -112,20 +102,19 @@ def open_arrow(path: Path) -> "ColumnTable":
         raise wrong(where, f"is no whole file of Arrow ({type(e).__name__})") from e
     require_few_columns(where, len(table.schema))
 
-    def of_columns(names: Sequence[str]) -> "Iterator[pa.RecordBatch]":
+    def read(names: Sequence[str]) -> "pa.Table":
         # By place: `select` fails if two columns have the same name.
         flat = (not pa.types.is_nested(f.type) for f in table.schema)
-        kept = [i for i, f in enumerate(flat) if f and table.column_names[i] in names]
-        yield from table.select(kept).to_batches()
+        return table.select([i for i, f in enumerate(flat) if f and table.column_names[i] in names])
 
-    digest = Digest(data)
-    return ColumnTable(
-        where, "arrow", len(data), digest, table.schema, table.num_rows, of_columns, 0
-    )
+    def digest() -> str:
+        return hashlib.sha256(data).hexdigest()
+
+    return ColumnTable(where, "arrow", len(data), digest, table.schema, table.num_rows, read, 0)
 
 
 class ColumnTable:
-    """`Table` of Arrow columns, which come in pieces."""
+    """`Table` of Arrow columns."""
 
     notes: tuple[Finding, ...] = ()
 
@@ -134,34 +123,35 @@ class ColumnTable:
         path: str,
         kind: str,
         size: int,
-        digest: Digest,
+        digest: Callable[[], str],
         schema: "pa.Schema",
         n_rows: int,
-        pieces: "Callable[[Sequence[str]], Iterator[pa.RecordBatch]]",
+        read: "Callable[[Sequence[str]], pa.Table]",
         unpacked: int,
     ) -> None:
         """Make a table of columns.
 
         Args:
-            pieces: function that yields the pieces of columns by name.
+            digest: function that returns the SHA-256 of the file.
+            read: function that returns columns by name.
             unpacked: bytes of all columns after unpacking, if the file states them, else 0.
         """
         if not len(schema) or not n_rows:
             raise wrong(path, "holds no rows, expected a log")
         self.path, self.format, self.size = path, kind, size
         self._digest, self._schema, self._n_rows = digest, schema, n_rows
-        self._pieces, self._unpacked, self._budget = pieces, unpacked, Budget(path, size)
+        self._columns, self._unpacked, self._budget = read, unpacked, Budget(path, size)
         self.names: tuple[str, ...] = tuple(schema.names)
         stated = {f.name: (f.metadata or {}).get(b"unit", b"") for f in schema}
         self.units: Mapping[str, str] = {
             name: unit.decode("utf-8", "replace") for name, unit in stated.items()
         }
 
-    @property
+    @functools.cached_property
     def sha256(self) -> str:
         """SHA-256 of the whole file; slower than reading a log's columns."""
         try:
-            return self._digest.hex()
+            return self._digest()
         except OSError as e:
             raise wrong(self.path, f"cannot be read ({e.strerror or type(e).__name__})") from e
 
@@ -172,18 +162,9 @@ class ColumnTable:
             kind = self._schema.field(name).type
             if not _is_number(kind):
                 raise wrong(self.path, f"holds {kind}, expected numbers", column(name))
-        needed = sorted(set(names))
-        self._budget.require(8 * self._n_rows * len(needed))
-        # Each decoded piece is copied to its place. All pieces and an array from them would take
-        # three times the memory.
-        numbers = {name: np.empty(self._n_rows) for name in needed}
-        first = 0
-        for piece in self._pieces(needed):
-            for name in needed:
-                numbers[name][first : first + piece.num_rows] = _floats(piece.column(name))
-            first += piece.num_rows
-        self._digest.begin()
-        return {name: numbers[name] for name in names}
+        self._budget.require(8 * self._n_rows * len(set(names)))
+        columns = self._columns(sorted(set(names)))
+        return {name: _floats(columns.column(name)) for name in names}
 
     def survey(self) -> list[Survey]:
         """Survey every column; non-numeric ones count as text.
@@ -226,10 +207,8 @@ class ColumnTable:
 
     def _read(self, names: Sequence[str]) -> "pa.Table":
         """Return the columns, none of them of lists or records."""
-        import pyarrow as pa
-
         self._budget.require(max(8 * self._n_rows * len(names), self._unpacked))
-        return pa.Table.from_batches(list(self._pieces(names)))
+        return self._columns(names)
 
 
 def _is_clock(kind: "pa.DataType") -> bool:
@@ -248,7 +227,7 @@ def _is_number(kind: "pa.DataType") -> bool:
     return any(test(kind) for test in tests)
 
 
-def _floats(values: "pa.Array | pa.ChunkedArray") -> np.ndarray:
+def _floats(values: "pa.ChunkedArray") -> np.ndarray:
     """Return numbers, or ticks of a clock, as float64 (N,), NaN where null."""
     import pyarrow as pa
     import pyarrow.compute as pc
@@ -258,26 +237,4 @@ def _floats(values: "pa.Array | pa.ChunkedArray") -> np.ndarray:
         values = values.cast(pa.int32() if pa.types.is_time32(values.type) else pa.int64())
     # Unsafe, because a safe cast refuses integers above 2^53, as all stamps in ns are. Calendar
     # stamps round to 256 ns.
-    values = pc.cast(values, pa.float64(), safe=False)
-    if isinstance(values, pa.ChunkedArray):
-        return floats(values)
-    if len(values) and not values.null_count:  # without a copy
-        return np.frombuffer(values.buffers()[1], np.float64, len(values), 8 * values.offset)
-    return floats(pa.chunked_array([values]))
-
-
-def floats(numbers: "pa.ChunkedArray") -> np.ndarray:
-    """Return numbers of type float64 (N,), NaN where null."""
-    import pyarrow as pa
-
-    values, at = np.empty(len(numbers), np.float64), 0
-    # As buffers, because to_numpy imports pandas, which takes a second.
-    for chunk in (c for c in numbers.chunks if len(c)):
-        piece = values[at : at + len(chunk)]
-        piece[:] = np.frombuffer(chunk.buffers()[1], np.float64, len(chunk), 8 * chunk.offset)
-        if chunk.null_count:
-            known = chunk.is_valid().cast(pa.uint8())
-            at_known = np.frombuffer(known.buffers()[1], np.uint8, len(known), known.offset)
-            piece[at_known == 0] = np.nan
-        at += len(chunk)
-    return values
+    return pc.cast(values, pa.float64(), safe=False).to_numpy()

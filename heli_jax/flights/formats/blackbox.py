@@ -6,7 +6,6 @@ firmware. The channels keep the firmware's own numbers and names.
 
 import hashlib
 import re
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -61,16 +60,12 @@ def open_blackbox(path: Path) -> tuple[ChannelLog, ...]:
         raise wrong(str(path), f"expected at most {_MOST_FLIGHTS} flights, got {len(starts)}")
     # Hash the whole file, so that it equals the output of sha256sum for the user's file.
     sha256, size = hashlib.sha256(data).hexdigest(), len(data)
-    # Each flight's bytes are released once its frames are found. This keeps the peak memory at
-    # three times the file, not four.
-    rest = deque(data[start:end] for start, end in pairwise([*starts, size]))
-    del data
     flights: list[ChannelLog] = []
     problems: list[InputError] = []
-    for i, start in enumerate(starts):
+    for i, (start, end) in enumerate(pairwise([*starts, size])):
         progress.advance(start)
         try:
-            log = _flight(str(path), rest.popleft(), sha256, size, (i + 1, len(starts)))
+            log = _flight(str(path), data[start:end], sha256, size, (i + 1, len(starts)))
         except InputError as e:
             # An unreadable flight must not affect the others of the file. Its problem is reported
             # only if no flight is readable.
@@ -89,7 +84,6 @@ def _flight(
     """Read one flight from its bytes; None if it has no frame."""
     head = read_header(path, data)
     frames = find_frames(data, head.start, head.layouts)
-    del data
     main = main_frames(frames, head)
     if not main.times.size:
         return None

@@ -8,6 +8,7 @@ import codecs
 import csv
 import functools
 import gzip
+import hashlib
 import io
 import itertools
 import re
@@ -23,7 +24,6 @@ from heli_jax.errors import InputError
 from heli_jax.finding import Finding, note
 from heli_jax.flights import progress
 from heli_jax.flights.clock import is_date, seconds_of_dates, time_unit
-from heli_jax.flights.formats.arrow import floats
 from heli_jax.flights.log import (
     Budget,
     Survey,
@@ -34,7 +34,6 @@ from heli_jax.flights.log import (
     shown,
     wrong,
 )
-from heli_jax.flights.progress import Digest
 from heli_jax.regular_file import read_regular, size_words
 
 # Imported inside the functions that need it: it takes 0.25 s, which flights made in Python would
@@ -57,7 +56,6 @@ _DELIMITERS = ("\t", "|", ";", ",")
 decimal."""
 _MARK = re.compile(r"\s*(?:#+|//+|%+(?=[\s%]|[^,;\t]*$))\s*")
 """Mark of a comment. A name may begin with a percent sign."""
-_SEPARATOR = re.compile(r'"?sep=([,;|:\t ])"?\s*', re.IGNORECASE)
 MISSING = (
     *("NA", "N/A", "n/a", "null", "NULL", "None", "-", "#N/A", "--", "---", "?", "missing"),
     *("1.#QNAN", "-1.#QNAN", "1.#IND", "-1.#IND", "NaT", "<NA>"),
@@ -101,7 +99,6 @@ def open_csv(path: Path) -> "CsvTable":
     """Read a text file, find its delimiter and its header."""
     where = str(path)
     packed = read_regular(path, "a log in CSV", _LARGEST)
-    digest, size = Digest(packed), len(packed)
     data = as_text(where, unpacked(where, packed) if is_gzipped(path) else packed)
     blanks = inner_ending(path) not in (".csv", ".tsv")
     head = _find_head(where, data, (*_DELIMITERS, " ") if blanks else _DELIMITERS)
@@ -124,7 +121,7 @@ def open_csv(path: Path) -> "CsvTable":
         each = listed(f"{n} [{u}]" for n, u in zip(head.names, head.units, strict=True))
         words = f"units are read from the line below {line}: {each}"
         notes = (*notes, note("text.units-line", words, value=head.first_line - 1))
-    return CsvTable(where, size, digest, rows, head, notes, data.find(b'"', head.begin) >= 0)
+    return CsvTable(where, packed, rows, head, notes, data.find(b'"', head.begin) >= 0)
 
 
 def is_gzipped(path: Path) -> bool:
@@ -139,18 +136,15 @@ def inner_ending(path: Path) -> str:
 
 def unpacked(path: str, data: bytes) -> bytes:
     """Unpack bytes packed by gzip (RFC 1952)."""
-    text, budget = bytearray(), Budget(path, len(data))
+    budget = Budget(path, len(data))
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
-            while piece := file.read(1 << 22):
-                # The numbers take memory too: eight bytes for two characters, a digit and its
-                # delimiter.
-                ends = sum(map(piece.count, (b"\n", b",", b";", b"\t")))
-                budget.take(len(piece) + 8 * ends)
-                text += piece
+            text = file.read(budget.most + 1)
     except (OSError, EOFError, zlib.error) as e:
         raise wrong(path, f"is no whole file of gzip ({type(e).__name__})") from e
-    return bytes(text)
+    # The numbers take memory too: eight bytes for two characters, a digit and its delimiter.
+    budget.require(len(text) + 8 * sum(map(text.count, (b"\n", b",", b";", b"\t"))))
+    return text
 
 
 def as_text(path: str, data: bytes) -> bytes:
@@ -188,9 +182,6 @@ def as_text(path: str, data: bytes) -> bytes:
 def _find_head(path: str, data: bytes, delimiters: Sequence[str]) -> _Head:
     """Find the header of the table, below titles, settings and comments."""
     lines = list(_lines(data))
-    if lines and (separator := _SEPARATOR.fullmatch(lines[0].text)):
-        # Excel's own statement of the delimiter.
-        delimiters, lines = (separator[1],), lines[1:]
     plain = [line for line in lines if not line.is_comment]
     if not plain:
         raise wrong(path, "holds no header, expected names of columns and rows of numbers")
@@ -340,16 +331,16 @@ class CsvTable:
     def __init__(
         self,
         path: str,
-        size: int,
-        digest: Digest,
+        packed: bytes,
         rows: memoryview,
         head: _Head,
         notes: tuple[Finding, ...],
         has_quotes: bool,
     ) -> None:
-        self.path, self.size, self.names, self.notes = path, size, head.names, notes
+        self.path, self.size, self.names, self.notes = path, len(packed), head.names, notes
+        self.sha256 = hashlib.sha256(packed).hexdigest()
         self.units: Mapping[str, str] = dict(zip(head.names, head.units, strict=False))
-        self._digest, self._rows, self._head = digest, rows, head
+        self._rows, self._head = rows, head
         self._dates: set[str] = set()
         self._quote = '"' if has_quotes else False
         # The first rows decide the decimal sign of the whole file: otherwise `1.577` beside `0,25`
@@ -359,17 +350,11 @@ class CsvTable:
         cells = (cell.strip() for line in lines for cell in _cells_of(line, head.delimiter))
         self._sign = "," if any(map(_WITH_COMMA.fullmatch, cells)) else "."
 
-    @property
-    def sha256(self) -> str:
-        """SHA-256 of the file."""
-        return self._digest.hex()
-
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
         """Return the columns as float64 (N,), NaN where a cell is empty."""
         require_columns(self.path, self.names, names)
         with progress.reading(self.path, self.size):
             columns = self._columns([self.names.index(name) for name in names])
-        self._digest.begin()
         numbers = {}
         for name, (values, _, _) in zip(names, columns, strict=True):
             if isinstance(values, int):
@@ -420,7 +405,7 @@ class CsvTable:
         table = self._arrow(indices, pa.float64())
         if table is not None:
             columns = [table.column(str(i)) for i in indices]
-            return [(floats(c), len(c) - c.null_count, 0) for c in columns]
+            return [(c.to_numpy(), len(c) - c.null_count, 0) for c in columns]
         if len(self._rows) > _LARGEST_TEXT:
             problem = "has quotes, a row with another number of cells, or a cell that"
             problem += f" is no plain number, expected at most {size_words(_LARGEST_TEXT)} then"
@@ -453,7 +438,7 @@ class CsvTable:
             plain = pc.replace_substring(plain, "\u2212", "-")
             plain = pc.replace_substring_regex(plain, r"^\+", "")
             plain = pc.replace_substring_regex(plain, r"([0-9.])[dD]", r"\1e")
-            return floats(pc.cast(plain, pa.float64())), filled, 0
+            return pc.cast(plain, pa.float64()).to_numpy(), filled, 0
         if is_date(cells.drop_null()[0].as_py()):
             self._dates.add(name)
             seconds = seconds_of_dates(cells.to_pylist())

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -40,8 +40,6 @@ FIELDS: dict[str, tuple[str, float | None]] = {
 }  # fmt: skip
 _APART = 1.0
 """Margin before and after the board's time within which a message's time may lie [s]."""
-_FEWEST_ROWS = 10
-"""Fewest rows of a message in which a time out of order is detected."""
 # New firmware counts microseconds, old firmware milliseconds. In old firmware's GPS message, TimeMS
 # is the time of the week and T the board's time.
 _CLOCKS = {"TimeUS": 1e-6, "TimeMS": 1e-3, "T": 1e-3}
@@ -82,15 +80,15 @@ class Part(NamedTuple):
         form: the description.
         number: number of the message.
         since: position of the description, in the count of `at`.
-        at: positions of the messages in the file (N,), increasing.
-        rows: their fields (N,), structured.
+        at: positions of the messages in the file (N,), increasing; a list while they are collected.
+        rows: their fields (N,), structured; for a text log a list of cells at first.
     """
 
     form: Format
     number: int
     since: int
-    at: np.ndarray
-    rows: np.ndarray
+    at: Any
+    rows: Any
 
 
 class _Messages(NamedTuple):
@@ -128,11 +126,11 @@ def open_dataflash(path: Path) -> ChannelLog:
     described, damaged = _walk(data)
     raw = np.frombuffer(data, np.uint8)
     parts = []
-    for form, number, since, starts, _ in described:
+    for part in described:
         # Messages of one description have the same length, so their bytes are gathered at once into
         # rows.
-        at = np.frombuffer(starts, np.int64)
-        parts.append(Part(form, number, since, at, _gathered(raw, at + 3, form.dtype)))
+        at = np.frombuffer(part.at, np.int64)
+        parts.append(part._replace(at=at, rows=_gathered(raw, at + 3, part.form.dtype)))
     return make_log(str(path), data, parts, damaged)
 
 
@@ -146,25 +144,15 @@ def _gathered(raw: np.ndarray, at: np.ndarray, dtype: np.dtype) -> np.ndarray:
     return rows.view(dtype)[:, 0]
 
 
-class _Described(NamedTuple):
-    """A description, its message number and position, its messages' positions, and their cells."""
-
-    form: Format
-    number: int
-    since: int
-    places: array.array
-    cells: list[list[str]]
-
-
-def _walk(data: bytes) -> tuple[list[_Described], int]:
+def _walk(data: bytes) -> tuple[list[Part], int]:
     """Return the descriptions that have messages, and the number of damaged places."""
     # The format of formats is stated here, because the first message, which describes it, cannot be
     # read without it.
     of_formats = Format("FMT", "BBnNZ", ("Type", "Length", "Name", "Format", "Columns"))
-    described = [_Described(of_formats, _FMT, 0, array.array("q"), [])]
+    described = [Part(of_formats, _FMT, 0, array.array("q"), None)]
     forms = {_FMT: of_formats}
     lengths = {_FMT: _FMT_LENGTH}
-    starts = {_FMT: described[0].places}
+    starts = {_FMT: described[0].at}
     at, damaged, size, report_at = 0, 0, len(data), 0
     while at + 3 <= size:
         if at >= report_at:
@@ -198,12 +186,12 @@ def _walk(data: bytes) -> tuple[list[_Described], int]:
             # Every boot describes its messages again. New firmware may change a description, which
             # then holds for the messages after it.
             if taken is not None and forms.get(taken[0]) != taken[1]:
-                new = _Described(taken[1], taken[0], at, array.array("q"), [])
+                new = Part(taken[1], taken[0], at, array.array("q"), None)
                 described.append(new)
-                forms[new.number], starts[new.number] = new.form, new.places
+                forms[new.number], starts[new.number] = new.form, new.at
                 lengths[new.number] = new.form.dtype.itemsize + 3
         at += length
-    return [d for d in described if d.places], damaged
+    return [part for part in described if part.at], damaged
 
 
 def _format(body: bytes) -> tuple[int, Format] | None:
@@ -250,10 +238,7 @@ def make_log(
     topics = []
     for messages in topics_of:
         clock = _clock(messages, board)
-        for each in _by_instance(messages):
-            kept = _in_order(each, clock)
-            damaged += each.at.size - kept.at.size
-            topics.append(_topic(kept, clock))
+        topics += [_topic(each, clock) for each in _by_instance(messages)]
     require_samples(path, topics)
     notes = []
     if damaged:
@@ -339,25 +324,6 @@ def _by_instance(messages: _Messages) -> list[_Messages]:
         return [messages]
     name = messages.name
     return [messages.rows(numbers == i)._replace(name=f"{name}[{i}]") for i in counts]
-
-
-def _in_order(messages: _Messages, clock: str) -> _Messages:
-    """Remove single messages whose times lie outside those of their neighbours.
-
-    Such times appear where a log was cut off within a message. The messages stay as they are if the
-    faults are many or the other times are not in order.
-    """
-    if not clock or messages.at.size < _FEWEST_ROWS:
-        return messages
-    times = messages.seconds(clock)
-    back = np.flatnonzero(np.diff(times) < 0) + 1
-    if not 0 < back.size <= max(1, times.size // 1000):
-        return messages
-    # If the time goes back, either this row or the previous one is wrong. The one is removed that
-    # leaves the others in order.
-    rows = [r if r + 1 == times.size or times[r + 1] >= times[r - 1] else r - 1 for r in back]
-    kept = np.delete(np.arange(times.size), rows)
-    return messages.rows(kept) if np.all(np.diff(times[kept]) >= 0) else messages
 
 
 def _clocks(form: Format) -> tuple[str, ...]:
@@ -477,11 +443,14 @@ def is_dataflash_text(head: bytes) -> bool:
 def open_dataflash_text(path: Path) -> ChannelLog:
     """Read a DataFlash log in text."""
     data = read_regular(path, "a DataFlash log in text", _LARGEST_TEXT)
-    formats: dict[str, _Described] = {}
-    described: list[_Described] = []
+    formats: dict[str, Part] = {}
+    described: list[Part] = []
     damaged = 0
+    # A last line without its end is cut off, and its numbers may be too.
+    whole = data[: data.rfind(b"\n") + 1]
+    damaged += len(whole) < len(data)
     # Bytes that are not UTF-8 damage only their line, not the log.
-    for at, line in enumerate(io.TextIOWrapper(io.BytesIO(data), "utf-8", "replace")):
+    for at, line in enumerate(io.TextIOWrapper(io.BytesIO(whole), "utf-8", "replace")):
         name, _, rest = line.rstrip("\n").partition(",")
         name = name.strip()
         if name == "FMT":
@@ -491,7 +460,7 @@ def open_dataflash_text(path: Path) -> ChannelLog:
             if taken is not None and (
                 taken[1].name not in formats or formats[taken[1].name].form != taken[1]
             ):
-                described.append(_Described(taken[1], taken[0], at, array.array("q"), []))
+                described.append(Part(taken[1], taken[0], at, [], []))
                 formats[taken[1].name] = described[-1]
         elif name in formats:
             form, _, _, places, rows = formats[name]

@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from heli_jax.finding import LEFT_OUT, note
 from heli_jax.flights.clock import is_date, seconds_of_dates
 from heli_jax.flights.formats.arrays import ArrayTable, DataSets
-from heli_jax.flights.log import Budget, listed, shown, wrong
+from heli_jax.flights.log import Budget, shown, wrong
 from heli_jax.regular_file import read_regular
 
 _LARGEST = 500 * 10**6
@@ -39,12 +38,8 @@ def open_json(path: Path) -> ArrayTable:
         columns = dict(_within(where, content, sets.budget)) if isinstance(content, dict) else {}
     if not 0 < len(columns) <= _MOST_COLUMNS:
         raise wrong(where, f"holds {len(columns)} columns, expected 1 to {_MOST_COLUMNS}")
-    texts: list[str] = []
     for name, values in columns.items():
-        _add(sets, name, values, texts)
-    if texts:
-        words = f"left out, because they hold text: {listed(map(shown, texts))}"
-        sets.notes.append(note(LEFT_OUT, words, *texts))
+        _add(sets, name, values)
     return sets.table(where, "json", data)
 
 
@@ -75,7 +70,7 @@ def _parsed(where: str, data: bytes) -> Any:
 
 
 def _within(where: str, content: Any, budget: Budget) -> Iterator[tuple[str, Any]]:
-    """Yield the lists in nested records by path; also single numbers, such as a rate."""
+    """Yield the lists in nested records by path."""
     for name, value in _cells(content, "", 0):
         if isinstance(value, dict):
             yield name, list(value.values())
@@ -83,8 +78,6 @@ def _within(where: str, content: Any, budget: Budget) -> Iterator[tuple[str, Any
             yield from ((f"{name}.{n}", x) for n, x in _of_rows(where, value, budget).items())
         elif isinstance(value, list):
             yield name, value
-        elif isinstance(value, int | float):
-            yield name, [value]
 
 
 def _of_rows(where: str, rows: list[Any], budget: Budget) -> dict[str, Any]:
@@ -125,7 +118,7 @@ def _cells(record: Mapping[str, Any], path: str, depth: int) -> Iterator[tuple[s
             yield name, value
 
 
-def _add(sets: DataSets, name: str, values: list[Any], texts: list[str]) -> None:
+def _add(sets: DataSets, name: str, values: list[Any]) -> None:
     filled = [x for x in values if x is not None]
     if filled and all(isinstance(x, str) for x in filled):
         if is_date(filled[0]):
@@ -133,7 +126,7 @@ def _add(sets: DataSets, name: str, values: list[Any], texts: list[str]) -> None
             if not isinstance(seconds, int):
                 sets.add(name, seconds, {"units": "s"})
                 return
-        texts.append(name)
+        sets.leave_out(name, "text")
         return
     sets.budget.take(8 * len(values))
     try:
@@ -143,7 +136,7 @@ def _add(sets: DataSets, name: str, values: list[Any], texts: list[str]) -> None
             array = np.array([_number(x) for x in values], np.float64)
     # Rows of different lengths, or cells that are no numbers.
     except (TypeError, ValueError, OverflowError):
-        texts.append(name)
+        sets.leave_out(name, "text")
         return
     if array.size:
         sets.add(name, array, {})

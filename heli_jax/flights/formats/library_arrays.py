@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from heli_jax.finding import LEFT_OUT, note
 from heli_jax.flights.formats.apart import Content, Reader, read_apart
 from heli_jax.flights.formats.arrays import (
     LARGEST,
@@ -22,7 +21,7 @@ from heli_jax.flights.formats.arrays import (
     holds_numbers,
     text_of,
 )
-from heli_jax.flights.log import Budget, listed, shown, wrong
+from heli_jax.flights.log import Budget, shown, wrong
 from heli_jax.regular_file import read_regular
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -96,14 +95,16 @@ def read_matlab(path: Path, budget: Budget) -> Content:
     """Read the arrays of a MATLAB file, also in structures and cells."""
     from scipy.io import loadmat
 
-    sets, objects = DataSets(budget), dict[str, str]()
+    sets, objects = DataSets(budget), list[str]()
 
     def take(name: str, value: Any, depth: int) -> None:
         if not isinstance(value, np.ndarray) or depth > _DEEPEST:
             return  # a sparse matrix, or a header
         kind = value.dtype
         if kind.names and "_Class" in kind.names:
-            objects[name] = str(value.ravel()[0]["_Class"])  # a table, a timetable, ...
+            # A table, a timetable, ...
+            objects.append(name)
+            sets.leave_out(name, f"a MATLAB {value.ravel()[0]['_Class']}")
         elif kind.names or kind.kind == "O":
             # Structures or cells, in MATLAB's column-major order.
             elements = value.ravel("F")[:MOST_ELEMENTS]
@@ -119,13 +120,9 @@ def read_matlab(path: Path, budget: Budget) -> Content:
         if not name.startswith("__"):
             take(name, value, 0)
     if objects and sets.longest < 2:
-        name, kind = next(iter(objects.items()))
-        problem = f"holds {shown(name)}, a MATLAB {kind}, not an array; save its numbers"
-        way = f"writetable or writetimetable({name}, 'flight.csv') writes what is read"
-        raise wrong(str(path), f"{problem} as arrays, or of a table {way}")
-    if objects:
-        each = listed(f"{shown(n)} ({kind})" for n, kind in objects.items())
-        sets.notes.append(note(LEFT_OUT, f"objects of MATLAB are left out: {each}", *objects))
+        problem = f"holds {shown(objects[0])}, a MATLAB object, expected arrays of numbers"
+        way = f"writetable or writetimetable({objects[0]}, 'flight.csv') writes those of a table"
+        raise wrong(str(path), f"{problem}; {way}")
     return _content(sets)
 
 
@@ -170,11 +167,6 @@ def read_hdf5(path: Path, budget: Budget, between: str = "/") -> Content:
 
     with h5py.File(path, "r") as file:
         visit(file, "", 0)
-        for name in list(file.attrs)[:MOST_ELEMENTS]:
-            value = np.asarray(file.attrs[name])
-            # Single numbers, such as a rate.
-            if value.size == 1 and value.dtype.kind in "iuf" and name not in file:
-                sets.add(name, np.float64(value).reshape(1), {})
     return _content(sets)
 
 
@@ -187,7 +179,7 @@ def _data_set(path: Path, sets: DataSets, item: Any, name: str) -> None:
     if text_of(item.attrs.get("MATLAB_class", "")) == "char" or kind.kind in "SO":
         return
     if not holds_numbers(kind, item.ndim):
-        sets.leave_out(name, kind, item.shape)
+        sets.leave_out(name, f"{kind} of {item.ndim} dimensions")
     elif not text_of(item.attrs.get("NAME", "")).startswith(_NO_VARIABLE):
         # A chunked data set is unpacked one whole chunk at a time.
         sets.budget.require(int(np.prod(item.chunks or (0,), dtype=object)) * kind.itemsize)

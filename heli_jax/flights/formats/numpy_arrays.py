@@ -7,15 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from heli_jax.finding import LEFT_OUT, note
 from heli_jax.flights.formats.apart import guarded
 from heli_jax.flights.formats.arrays import (
     LARGEST,
     ArrayTable,
     DataSets,
-    holds_numbers,
 )
-from heli_jax.flights.log import Budget, listed, shown, wrong
+from heli_jax.flights.log import Budget, wrong
 from heli_jax.regular_file import read_regular
 
 MAGIC = b"\x93NUMPY"
@@ -29,7 +27,7 @@ def open_numpy(path: Path) -> ArrayTable:
     """
     where = str(path)
     data = read_regular(path, "a file of NumPy", LARGEST)
-    sets, objects = DataSets(Budget(where, len(data))), []
+    sets = DataSets(Budget(where, len(data)))
 
     def read() -> None:
         for name, content in _arrays(data, sets.budget):
@@ -38,7 +36,7 @@ def open_numpy(path: Path) -> ArrayTable:
             header = np.lib.format.read_array_header_1_0 if version == (1, 0) else None
             shape, _, dtype = (header or np.lib.format.read_array_header_2_0)(file)
             if dtype.hasobject:
-                objects.append(name)
+                sets.leave_out(name, "objects of Python, which may run code")
             # Sizes beyond the actual bytes are refused before they are allocated.
             elif np.prod(shape, dtype=object) * dtype.itemsize > len(content) or not dtype.itemsize:
                 raise ValueError("cut off")
@@ -46,12 +44,8 @@ def open_numpy(path: Path) -> ArrayTable:
                 _add(sets, name, np.load(io.BytesIO(content), allow_pickle=False))
 
     guarded(path, "file of NumPy", read)
-    if objects:
-        words = f"objects of Python, which are not read: {listed(map(shown, objects))}"
-        if not sets.names:
-            problem = f"holds {words}; expected arrays of numbers, numpy.savez(FILE, t=t, p=p)"
-            raise wrong(where, problem)
-        sets.notes.append(note(LEFT_OUT, words, *objects))
+    if not sets.names:
+        raise wrong(where, "holds no arrays of numbers, expected numpy.savez(FILE, t=t, p=p)")
     return sets.table(where, "numpy", data)
 
 
@@ -78,8 +72,6 @@ def _add(sets: DataSets, name: str, array: np.ndarray) -> None:
         if unit in ("s", "ms", "us", "ns") and count == 1:
             ticks = array.astype(np.int64).astype(np.float64)
             sets.add(name, np.where(np.isnat(array), np.nan, ticks), {"units": unit})
-    elif holds_numbers(array.dtype, array.ndim):
+    elif kind in "biufc":
         # In the computer's own byte order.
         sets.add(name, array.astype(array.dtype.newbyteorder("=")), {})
-    else:
-        sets.leave_out(name, array.dtype, array.shape)

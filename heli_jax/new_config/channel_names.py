@@ -3,6 +3,7 @@
 import re
 
 from heli_jax import units
+from heli_jax.flights.clock import words_in
 
 _PLAIN = {
     **dict.fromkeys(("deg", "degree", "degrees", "grad"), "deg"),
@@ -122,13 +123,6 @@ def is_stick_name(name: str) -> bool:
     """True if a word of a name means a stick, a servo or a command."""
     words = set(words_in(name))
     return bool(_STICKS & words) and "gps" not in words
-
-
-def words_in(name: str) -> tuple[str, ...]:
-    """Return the words of a name in lower case, as of rollRate, roll_rate and `Roll Rate`."""
-    apart = re.sub(r"([a-z0-9])([A-Z])|([A-Z])(?=[A-Z][a-z])", r"\1\3 \2", name)
-    # ch1, rc2in: a number is no part of a word.
-    return tuple(w for w in re.split(r"[^a-z]+", apart.lower()) if w)
 
 
 def _is_of(unit: str, si: str) -> bool:
