@@ -381,7 +381,7 @@ def _equations(stamps: bytes, size: int) -> tuple[Any, np.ndarray]:
     pointers = _TAPS * np.arange(at.size + 1)
     sums = csr_array((weights.ravel(), columns.ravel(), pointers), shape=(at.size, size))
     energy, middle = _penalty(), _penalty().size // 2
-    offsets = np.arange(-middle, middle + 1)
+    offsets: Any = np.arange(-middle, middle + 1)  # the stubs take a single one
     shared = sums.T @ sums + diags_array(energy, offsets=offsets, shape=(size, size))
     # Two samples share a weight only within the taps, so the matrix is a band.
     band = [np.r_[shared.diagonal(-lag), np.zeros(lag)] for lag in range(_TAPS)]

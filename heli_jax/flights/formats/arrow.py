@@ -139,7 +139,7 @@ class ColumnTable:
         if not len(schema) or not n_rows:
             raise wrong(path, "holds no rows, expected a log")
         self.path, self.format, self.size = path, kind, size
-        self._digest, self._schema, self._n_rows = digest, schema, n_rows
+        self._digest, self._schema, self._n_rows = functools.cache(digest), schema, n_rows
         self._columns, self._unpacked, self._budget = read, unpacked, Budget(path, size)
         self.names: tuple[str, ...] = tuple(schema.names)
         stated = {f.name: (f.metadata or {}).get(b"unit", b"") for f in schema}
@@ -147,7 +147,7 @@ class ColumnTable:
             name: unit.decode("utf-8", "replace") for name, unit in stated.items()
         }
 
-    @functools.cached_property
+    @property
     def sha256(self) -> str:
         """SHA-256 of the whole file; slower than reading a log's columns."""
         try:

@@ -224,7 +224,8 @@ def step_within(at: Point, sizes: np.ndarray, radius: float, damping: float) -> 
     log_mu = float(np.log(damping))
     if np.linalg.norm(scaled_step(log_mu)) > radius:
         last = float(np.log(np.linalg.norm(s * b) / radius))
-        log_mu = float(scipy.optimize.brentq(too_long, log_mu, last, xtol=_NEAR))
+        root: Any = scipy.optimize.brentq(too_long, log_mu, last, xtol=_NEAR)
+        log_mu = float(root)
     return units * scaled_step(log_mu)
 
 

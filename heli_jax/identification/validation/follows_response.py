@@ -8,8 +8,11 @@ of such a correlation is Bartlett's: the sum over all lags of the product of bot
 (L. D. Haugh, J. Am. Stat. Assoc. 71, 1976).
 
 An output responds to the motion of a stick within the same sample, and the stick then moves on
-from there. That is no feedback. So the innovations are also freed of the inputs up to their sample,
-in parts of a sample. The test misses only feedback within a sample.
+from there. That is no feedback. Two tests exclude it:
+
+- The innovations are also freed of the inputs up to their sample, in parts of a sample. This test
+  misses only feedback within a sample.
+- The input is freed of its own past in parts of a sample. This test sees feedback within a sample.
 
 An input that is logged late follows the response too, and no correlation separates the two. With an
 estimated negative delay the input is shifted earlier; otherwise the report names a late log as the
@@ -209,30 +212,31 @@ def feedback(
     # A record cannot show a delay beyond half of its length.
     most, dt = flight.n_samples // 2, flight.dt
     steps = {n: min(math.ceil(s / dt - 1e-9), most) for n, s in (earlier or {}).items()}
-    views = [view for rate in _rates_of(flight) if (view := _view(flight, steps, rate))]
+    by_rate = [views for rate in _rates_of(flight) if (views := _views(flight, steps, rate))]
     found: dict[str, Feedback] = {}
-    for view in views:
-        N = len(view.innovations)
-        blocks = lag_blocks(max(1, min(round(_LONGEST / view.dt), N // 10)))
-        seconds = [(first * view.dt, last * view.dt) for first, last in blocks]
-        # Bonferroni: one test in a hundred records fails by chance, not one in a hundred lags.
-        count = together * len(views) * view.inputs * len(view.outputs) * len(blocks)
-        for name, free in view.free.items():
-            each = correlations_with_sums(free, view.innovations, blocks)
-            for k, b in np.ndindex(each.p_value.shape):
-                one = Feedback(
-                    flight.name or "flight 1",
-                    name,
-                    view.outputs[k],
-                    float(each.correlation[k, b]),
-                    seconds[b],
-                    min(1.0, count * float(each.p_value[k, b])),
-                    steps.get(name, 0) * dt,
-                )
-                # Several p-values may underflow to zero: then the correlation decides.
-                found[name] = min(
-                    found.get(name, one), one, key=lambda f: (f.p_value, f.correlation)
-                )
+    for views in by_rate:
+        N = len(views[0].innovations)
+        blocks = lag_blocks(max(1, min(round(_LONGEST / views[0].dt), N // 10)))
+        seconds = [(first * views[0].dt, last * views[0].dt) for first, last in blocks]
+        for view in views:
+            # Bonferroni: one test in a hundred records fails by chance, not one in a hundred lags.
+            count = len(views) * view.inputs * len(view.outputs) * len(blocks)
+            for name, free in view.free.items():
+                each = correlations_with_sums(free, view.innovations, blocks)
+                for k, b in np.ndindex(each.p_value.shape):
+                    one = Feedback(
+                        flight.name or "flight 1",
+                        name,
+                        view.outputs[k],
+                        float(each.correlation[k, b]),
+                        seconds[b],
+                        min(1.0, together * len(by_rate) * count * float(each.p_value[k, b])),
+                        steps.get(name, 0) * dt,
+                    )
+                    # Several p-values may underflow to zero: then the correlation decides.
+                    found[name] = min(
+                        found.get(name, one), one, key=lambda f: (f.p_value, f.correlation)
+                    )
     return tuple(found.values())
 
 
@@ -260,38 +264,44 @@ class _View(NamedTuple):
     dt: float
 
 
-def _view(flight: Flight, steps: Mapping[str, int], rate: float) -> _View | None:
-    """Return the signals of the test; arguments as in `_decimated`.
+def _views(flight: Flight, steps: Mapping[str, int], rate: float) -> list[_View]:
+    """Return the signals of both tests; arguments as in `_decimated`.
 
-    None if no output moves and is measured, the record is too short, or no input moves freely.
+    The list is empty if no output moves and is measured, the record is too short, or no input moves
+    freely.
     """
     inputs, outputs, parts, dt = _decimated(flight, steps, rate)
     if not outputs or next(iter(outputs.values())).size < _LEAST:
-        return None
+        return []
     # A lower rate turns steps into slopes: the highest rate shows whether an input moves freely.
     quick, *_ = _decimated(flight, steps, RATE)
     moving = [n for n in inputs if _moves_freely(quick.get(n, inputs[n]))]
-    free = {n: v for n in moving if (v := _unforeseen(inputs[n])) is not None}
+    free = {n: v for n in moving if (v := _unforeseen(inputs[n], inputs[n][:, None])) is not None}
     if not free:
-        return None
+        return []
+    finer = {n: v for n in free if (v := _unforeseen(inputs[n], parts[n])) is not None}
     y = np.stack(list(outputs.values()), axis=1)
+    u = np.stack(list(inputs.values()), axis=1)
     # All signals together predict the outputs: otherwise the response to an input would look like
     # feedback. A sample's own inputs join the outputs before it.
     now = np.concatenate(list(parts.values()), axis=1)
     now = np.concatenate([now[1:], now[-1:]])
-    innovations = arx_residuals(y, np.concatenate([y, now], axis=1))
-    if innovations is None:
-        return None
-    return _View(free, innovations, tuple(outputs), len(inputs), dt)
+    given = arx_residuals(y, np.concatenate([y, now], axis=1))
+    past = arx_residuals(y, np.concatenate([y, u], axis=1))
+    names = tuple(outputs)
+    pairs = ((free, given), (finer, past))
+    return [_View(v, e, names, len(inputs), dt) for v, e in pairs if e is not None and v]
 
 
-def _unforeseen(u: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"] | None:
-    """Return the residual (N,) of an input after its own past, without jumps.
+def _unforeseen(
+    u: Float[np.ndarray, " N"], own: Float[np.ndarray, "N m"]
+) -> Float[np.ndarray, " N"] | None:
+    """Return the residual (N,) of an input after its own past (N, m), without jumps.
 
     None if nothing is left. A pilot's test steps are larger than the corrections of a gust and
     would hide them. The input alone selects the jumps, so that the test stays valid.
     """
-    left = arx_residuals(u[:, None], u[:, None])
+    left = arx_residuals(u[:, None], own)
     for _ in range(_ROUNDS):
         if left is None:
             return None
@@ -300,7 +310,7 @@ def _unforeseen(u: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"] | None:
         # An input that mostly rests has only jumps.
         if size <= 1e-9 * np.std(u):
             break
-        left = arx_residuals(np.where(calm, u, np.nan)[:, None], u[:, None])
+        left = arx_residuals(np.where(calm, u, np.nan)[:, None], own)
     if left is None or not np.nanstd(left) > 1e-9 * np.std(u):
         return None
     return left[:, 0]
