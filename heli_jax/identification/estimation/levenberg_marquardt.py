@@ -1,7 +1,8 @@
 """Levenberg-Marquardt: the least squares of the residual vector, from one start.
 
-A step d minimises |r + J d| within a radius of |D d|, with the norms of J's columns in D: More's
-form of the method (1978), as in MINPACK.
+A step d minimises |r + J d|^2 + mu |D d|^2, with the norms of J's columns in D (Marquardt, 1963).
+The damping mu decreases after a step that did as predicted and increases after a rejected one. A
+rejected step also sets a radius (More, 1978), which limits the next changes of the residuals.
 
 A step uses only the triangle of the QR decomposition of [r J], with one row more than unknowns.
 """
@@ -11,7 +12,6 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-import scipy.optimize
 from jaxtyping import Array, Float
 
 from heli_jax import stages
@@ -37,16 +37,16 @@ _RANK = 1e-10
 """Remainder of a unit column, after projection on the others, below which it depends on them."""
 
 _DAMPING, _LEAST_DAMPING = 1.1e-5, 1.1e-12
-"""Damping of the first step, which sets the radius, and the least one: below it, rounding in a
-direction without effect would cause steps of any length."""
+"""mu of the first step, and its least value: below it, rounding in a direction without effect would
+cause steps of any length."""
 _ACCEPTED, _AS_PREDICTED = 0.1, 0.75
 """Fractions of the predicted gain above which a step is accepted, and above which it did as
 predicted."""
+_LESS, _MORE = 0.3, 10.0
+"""Factors of mu after a step that did as predicted, and after a rejected one."""
 _GROWTH = 3.0
-"""Largest ratio of the radius to the length of a step that did as predicted."""
-
-_NEAR = 0.1
-"""Precision of log mu at the radius."""
+"""Largest ratio of the residuals' change in the next step to that of a step that did as
+predicted."""
 
 _NUISANCE_STEPS = 60
 """Most steps for initial states and biases."""
@@ -83,6 +83,14 @@ class Point(NamedTuple):
         return float(self.r @ self.r)
 
 
+class Region(NamedTuple):
+    """Limits of the next step."""
+
+    damping: float
+    radius: float
+    """Limit on the change of the residuals; inf until a step is rejected."""
+
+
 def without_size(layout: Layout) -> np.ndarray:
     """Return (q,) True for the unknowns that are no logarithms and so have no natural size."""
     linear = [kind == "linear" for kind in layout.kinds] + [True] * len(layout.gains)
@@ -103,7 +111,7 @@ def optimise(
 
     Args:
         held: (q,) True for an unknown fixed at its start; default none.
-        damping: damping of the first step.
+        damping: mu of the first step.
     """
     start, logarithms = np.asarray(z0, np.float64), ~without_size(layout)
     moving = np.ones(layout.size, bool) if held is None else ~held
@@ -121,7 +129,7 @@ def optimise(
         return Point(z, r, J, float(cost) + float(tied @ tied))
 
     with np.errstate(all="ignore"):  # simulations may overflow on the way
-        at, radius = linearise(start), np.inf
+        at, region = linearise(start), Region(damping, np.inf)
         sizes, count = np.zeros(layout.size), measured_count(data)
         short, steps = not np.isfinite(at.cost), 1
         while True:
@@ -137,10 +145,9 @@ def optimise(
             gain = predicted_gain(at.r, at.J, units)
             if short or not CONVERGED <= gain < np.inf or steps >= max_steps:
                 break
-            d = step_within(at, units, radius, damping if steps == 1 else _LEAST_DAMPING)
-            trial = linearise(np.clip(at.z + d, low, high))
-            accepted, radius = assess_step(at, trial, units, radius)
+            trial = linearise(np.clip(at.z + _step(at, units, region), low, high))
             steps += 1
+            accepted, region = assess_step(at, trial, region)
             if accepted:
                 short = _is_short(at, trial, sizes, start)
                 at = trial
@@ -203,48 +210,34 @@ def predicted_gain(
     return float(np.sum(np.square(Q[:, : sizes.size][:, sizes > _RANK].T @ r)))
 
 
-def step_within(at: Point, sizes: np.ndarray, radius: float, damping: float) -> np.ndarray:
-    """Return the step d (q,) of least |r + J d|^2 + mu |D d|^2 with |D d| at most the radius.
-
-    Args:
-        sizes: diagonal of D; 0 for a fixed unknown.
-        damping: least value of mu.
-    """
+def _step(at: Point, sizes: np.ndarray, region: Region) -> np.ndarray:
+    """Return the damped step, within the radius."""
     units = np.where(sizes > 0, 1.0 / np.where(sizes > 0, sizes, 1.0), 0.0)
+    damped = np.vstack([at.J * units, np.sqrt(region.damping) * np.eye(units.size)])
     # J'J would square the condition number.
-    U, s, V = np.linalg.svd(at.J * units, full_matrices=False)
-    b = U.T @ at.r
-
-    def scaled_step(log_mu: float) -> np.ndarray:
-        return -(s * b / (s**2 + np.exp(log_mu))) @ V
-
-    def too_long(log_mu: float) -> float:
-        return float(np.log(np.linalg.norm(scaled_step(log_mu)) / radius))
-
-    log_mu = float(np.log(damping))
-    if np.linalg.norm(scaled_step(log_mu)) > radius:
-        last = float(np.log(np.linalg.norm(s * b) / radius))
-        root: Any = scipy.optimize.brentq(too_long, log_mu, last, xtol=_NEAR)
-        log_mu = float(root)
-    return units * scaled_step(log_mu)
+    Q, R = np.linalg.qr(damped)
+    step = -units * scipy.linalg.solve_triangular(R, Q[: at.r.size].T @ at.r)
+    change = float(np.linalg.norm(at.J @ step))
+    return step * (region.radius / change) if change > region.radius else step
 
 
-def assess_step(at: Point, trial: Point, sizes: np.ndarray, radius: float) -> tuple[bool, float]:
-    """Return True if a step is accepted, and the radius of the next one."""
-    d = trial.z - at.z
-    along, length = at.J @ d, float(np.linalg.norm(sizes * d))
+def assess_step(at: Point, trial: Point, region: Region) -> tuple[bool, Region]:
+    """Return True if a step is accepted, and the region of the next one."""
+    along = at.J @ (trial.z - at.z)
     predicted = 0.5 * float(np.sum(np.square(at.r + along)) - at.squares)
     change, rest = 0.5 * (trial.cost - at.cost), 0.5 * _ROUNDING * at.squares
     # The gain of the last step is rounding, so it would be rejected at random.
     if change <= _ACCEPTED * predicted < 0.0 or (predicted > -rest and change < rest):
-        grown = _GROWTH * length
-        return True, grown if change < _AS_PREDICTED * predicted else min(radius, grown)
+        if not change < _AS_PREDICTED * predicted:
+            return True, region
+        damping = max(_LESS * region.damping, _LEAST_DAMPING)
+        return True, Region(damping, max(region.radius, _GROWTH * float(np.linalg.norm(along))))
     # The radius goes to the minimum of the parabola through slope and cost, within a tenth and a
     # half.
     slope = float(at.r @ along)
     part = -slope / (2.0 * (change - slope))
     part = float(np.clip(part, 0.1, 0.5)) if np.isfinite(part) else 0.1
-    return False, part * length
+    return False, Region(_MORE * region.damping, part * float(np.linalg.norm(along)))
 
 
 def _is_short(at: Point, trial: Point, sizes: np.ndarray, start: np.ndarray) -> bool:
