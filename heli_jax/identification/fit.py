@@ -112,8 +112,10 @@ def context_of(problem: Problem, guess: FirstGuess | None = None) -> Context:
     at = Solution(*guess[:4])
     # The record is the model's own, because any step from start values is an improvement.
     own = own_record(at, guess.e)
-    # Rows that are sums over frequencies change with the record.
-    second = second_solutions(problem, *own) if guess.layout.noise_model == "white" else ()
+    # Rows that are sums over frequencies change with the record, and states at the begin of windows
+    # are no optimum before a fit.
+    at_optimum = guess.layout.noise_model == "white" and guess.layout.continuity is None
+    second = second_solutions(problem, *own) if at_optimum else ()
     around = Around(second=second, valley=Valley(problem, *own))
     verdict = verdict_of(problem, guess.layout, guess.e, around)
     return Context(problem, at, guess.e, verdict)
