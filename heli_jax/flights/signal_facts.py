@@ -34,6 +34,8 @@ _TURNS = 0.3
 """Share of a signal's moves that reverse, above which its noise is as large as its steps."""
 _TIMES = 5.0
 """Ratio to such a signal's longest usual run, above which it is stuck."""
+_DROPS, DROP_SHARE = 5, 0.01
+"""Visits of a value, and share of samples at it, from which on they are dropouts."""
 _TRIFLE = 0.2
 """Smallest sd of another signal while one is stuck, relative to its usual sd."""
 _RUNS = 20
@@ -42,7 +44,7 @@ _RUNS = 20
 
 @dataclass(frozen=True, eq=False)
 class Rail:
-    """A value at which a signal is clipped.
+    """A value at which a signal is clipped, or to which it drops repeatedly.
 
     `times` (K,) [s] are those of its samples there; none if an end of the range is no rail.
     """
@@ -70,6 +72,7 @@ class SignalFacts:
         high: upper end.
         usual: usual time between samples [s].
         stretches: times at one value, of an output while other signals move; the longest first.
+        dropouts: value to which an output jumps from anywhere.
         strays: samples that may mean no value, but are kept.
     """
 
@@ -78,12 +81,18 @@ class SignalFacts:
     high: Rail
     usual: float
     stretches: tuple[Stuck, ...] = ()
+    dropouts: Rail | None = None
     strays: tuple[Strays, ...] = ()
 
     @property
     def stuck(self) -> Stuck | None:
         """The longest time at one value."""
         return self.stretches[0] if self.stretches else None
+
+    @property
+    def dropped(self) -> float:
+        """Share of the samples that are dropouts."""
+        return 0.0 if self.dropouts is None else self.dropouts.times.size / max(self.size, 1)
 
     @property
     def shares(self) -> tuple[float, float]:
@@ -104,6 +113,7 @@ class SignalFacts:
             if one.begin < end and one.end > begin
         ]
         inside = [one for one in inside if one.end - one.begin >= STUCK_SECONDS]
+        drops = None if self.dropouts is None else cut(self.dropouts)
         size = min(self.size, round((end - begin) / self.usual) + 1) if self.usual > 0 else 0
         strays = (s.within(begin, end) for s in self.strays)
         return replace(
@@ -112,6 +122,7 @@ class SignalFacts:
             low=cut(self.low),
             high=cut(self.high),
             stretches=tuple(sorted(inside, key=lambda one: one.begin - one.end)),
+            dropouts=drops if drops and drops.times.size else None,
             strays=tuple(s for s in strays if s.times.size),
         )
 
@@ -150,7 +161,8 @@ def facts_of_all[K: Hashable](
                 for one in _stretches(*signals[key], facts[key])
                 if any(_goes_on(*other, one.begin, one.end) for other in others)
             ]
-            facts[key] = replace(facts[key], stretches=tuple(found))
+            drops = _dropouts(*signals[key])
+            facts[key] = replace(facts[key], stretches=tuple(found), dropouts=drops)
     return facts
 
 
@@ -193,6 +205,33 @@ def _goes_on(seconds: np.ndarray, x: np.ndarray, begin: float, end: float) -> bo
     seen = np.isfinite(x)
     inside = x[(seconds >= begin) & (seconds <= end) & seen]
     return inside.size > 1 and float(np.std(inside)) >= _TRIFLE * float(np.std(x[seen]))
+
+
+def _dropouts(seconds: np.ndarray, x: np.ndarray) -> Rail | None:
+    """Return the value to which a signal repeatedly jumps from anywhere."""
+    seen = np.isfinite(x)
+    s, y = seconds[seen], x[seen]
+    levels, counts = np.unique(y, return_counts=True)
+    if levels.size < _RUNS:
+        return None
+    k = int(np.argmax(counts))
+    if k in (0, levels.size - 1):  # a rail
+        return None
+    near = np.r_[counts[max(k - 5, 0) : k], counts[k + 1 : k + 6]]
+    gap = np.min(np.abs(np.diff(levels[max(k - 1, 0) : k + 2])))
+    at = y == levels[k]
+    into = np.flatnonzero(at[1:] & ~at[:-1])
+    # A motion reaches a value by way of its neighbours.
+    jumps = np.abs(y[into] - levels[k])
+    # The longest visit does not count, because a stuck signal does not return.
+    edges = np.flatnonzero(np.diff(np.r_[0, at.astype(int), 0]))
+    many = counts[k] - int(np.max(edges[1::2] - edges[::2]))
+    often = into.size >= _DROPS and many >= max(DROP_SHARE * y.size, 5.0 * near.max())
+    moves = np.abs(np.diff(y))
+    far = max(5.0 * float(gap), 0.3 * float(np.median(moves[moves > 0])))
+    if not often or float(np.median(jumps)) < far:
+        return None
+    return Rail(float(levels[k]), s[at])
 
 
 def _at_top(x: np.ndarray, counts: np.ndarray) -> np.ndarray:

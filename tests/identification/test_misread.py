@@ -118,9 +118,11 @@ def test_degrees_that_are_read_as_radians_are_doubted(load):
     assert record_doubts(of(load(P))) == []
 
 
-def test_numbers_that_mean_no_value_can_be_stated(load):
+def test_dropouts_are_no_measurements_and_can_be_stated(load):
     p = P.copy()
     p[np.random.default_rng(1).choice(N, 20, replace=False)] = 0.0
+    found = of(load(p))
+    assert denied(found) == [("quality.dropouts", ("p",))]
     [flight] = load(p, missing=0)
     assert np.isnan(flight.outputs["p"]).sum() == 20
     assert record_doubts(of([flight])) == []

@@ -32,6 +32,10 @@ def test_a_stuck_sensor_is_seen_in_steps_as_large_as_its_noise():
     assert len(of(frozen).stretches) == 1
     assert len(of(frozen).within(8.0, 12.0).stretches) == 1
     assert of(frozen).within(10.0, 12.0).stuck is None
+    dropped = np.where(T % 1.0 < 0.3, 0.0, noisy)
+    found = of(dropped).dropouts
+    assert found.value == 0.0
+    assert of(dropped).dropped == pytest.approx(0.3, abs=0.01)
     # A noise-free vehicle that repeatedly comes to rest is not a sensor failure.
     u = np.repeat(np.tile([0.0, 1.0], 10), 300)
     rests = scipy.signal.lfilter([0.05], [1.0, -0.95], u)

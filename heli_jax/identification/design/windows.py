@@ -22,6 +22,7 @@ from heli_jax import naming
 from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import Flight, labels
 from heli_jax.flights.parts import part
+from heli_jax.flights.signal_facts import DROP_SHARE
 from heli_jax.identification.design.accuracy import (
     expected_sd,
     together,
@@ -214,6 +215,8 @@ def why_excluded(flight: Flight, first: int, last: int) -> str:
         facts = whole.within(first * flight.dt, (last - 1) * flight.dt)
         if facts.stuck is not None:
             return f"{name} is stuck"
+        if facts.dropped >= DROP_SHARE and facts.dropouts is not None:
+            return f"{name} has dropouts"
         if sum(facts.shares) >= _RAILS:
             return f"{name} is clipped"
     return ""

@@ -11,7 +11,7 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.finding import Finding, Severity, found
 from heli_jax.flights.flight import labels
-from heli_jax.flights.signal_facts import RAIL_SHARE, STUCK_SECONDS
+from heli_jax.flights.signal_facts import DROP_SHARE, RAIL_SHARE, STUCK_SECONDS
 from heli_jax.identification.design.accuracy import plan_next_flight, unstated_gusts
 from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.problem import Problem
@@ -54,9 +54,25 @@ def saturation(c: Context) -> Iterator[Finding]:
 
 
 def stuck_outputs(c: Context) -> Iterator[Finding]:
-    """Find outputs that stay at one value while others move."""
+    """Find outputs that stay at one value while others move, or often jump to one value."""
     for label, flight in c.flights:
+        signals = flight.source.outputs if flight.source else {}
         for (name, _), facts in flight.facts.items():
+            if facts.dropouts is not None and facts.dropped >= DROP_SHARE:
+                value = facts.dropouts.value
+                logged = signals[name].from_si(np.array(value)) if name in signals else value
+                yield found(
+                    "quality.dropouts",
+                    "doubt",
+                    name,
+                    value=facts.dropped,
+                    denies=True,
+                    flight=label,
+                    at=value,
+                    percent=100.0 * facts.dropped,
+                    logged=float(logged),
+                    limit=DROP_SHARE,
+                )
             if facts.stuck is not None:
                 yield found(
                     "quality.stuck-output",
