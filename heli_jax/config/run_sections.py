@@ -1,6 +1,7 @@
 """Sections of simulated runs: `simulate`, and the design of a sweep."""
 
-from typing import Annotated, Literal
+import warnings
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -54,6 +55,22 @@ class StartConfig(Section):
     """climb rate [m/s]"""
     heading: Finite = 0.0
     """heading psi [rad]"""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _renamed(cls, content: Any) -> Any:
+        """Accept the former names of the speeds, with a warning."""
+        if not isinstance(content, dict):
+            return content
+        content = dict(content)
+        for old, new in (("ahead", "forward_speed"), ("aside", "lateral_speed")):
+            if old not in content:
+                continue
+            if new in content:
+                raise ValueError(f"expected {new} alone, got {old} and {new}, which mean the same")
+            warnings.warn(f"{old} is deprecated, expected {new}", DeprecationWarning, stacklevel=2)
+            content[new] = content.pop(old)
+        return content
 
 
 class SimulateConfig(Section):
