@@ -54,6 +54,10 @@ _STEP = 1e-4
 """Step of finite differences [sd]."""
 _LINE = 60
 """Number of frequencies from w180 to 2 w180 for the line of the phase delay."""
+_RISES = np.radians(10.0)
+"""Least phase rise from the lowest frequency to the crossover that indicates an unstable vehicle
+[rad].
+"""
 _VAGUE = 2.0
 """Largest factor from a frequency to either end of its interval."""
 
@@ -103,7 +107,7 @@ def handling_qualities(curve: Curve, kind: Kind = "rate") -> HandlingQualities:
     response = _Response(x, points.log_gain, phase, points)
     values, by = _values(kind, x, response.gain, phase), _derivatives(kind, response)
     numbers: dict[str, Number] = {}
-    sentences: list[str] = []
+    sentences = [curve.caution] if curve.caution else []
     for name in NUMBERS[kind]:
         if name not in values:
             continue
@@ -113,7 +117,7 @@ def handling_qualities(curve: Curve, kind: Kind = "rate") -> HandlingQualities:
         elif kind == "open-loop" or "w180" in numbers:
             numbers[name] = _linear(values[name], by[name])
     if kind == "open-loop":
-        _explain_loop(values, sentences)
+        _explain_loop(response, values, sentences)
     else:
         _put_bandwidth(kind, numbers, sentences)
         _explain_attitude(curve.band[1], values, numbers, sentences)
@@ -343,9 +347,24 @@ def _put_bandwidth(kind: Kind, numbers: dict[str, Number], sentences: list[str])
         )
 
 
-def _explain_loop(values: dict[str, float], sentences: list[str]) -> None:
-    """State why numbers of a loop are missing."""
+def _explain_loop(response: _Response, values: dict[str, float], sentences: list[str]) -> None:
+    """State why numbers of a loop are missing, and the gain limit of an unstable vehicle."""
     if "crossover" not in values:
         sentences.append(_missing("crossover", "the gain does not fall through 0 dB in the band"))
+    else:
+        _explain_low_gain(response, values["crossover"], sentences)
     if "w180" not in values:
         sentences.append(_missing("gain margin", "the phase does not reach -180 deg in the band"))
+
+
+def _explain_low_gain(response: _Response, crossover: float, sentences: list[str]) -> None:
+    values = response.phase[response.x < crossover] + np.pi
+    upward = np.flatnonzero((values[:-1] <= 0) & (values[1:] > 0))
+    i = upward[-1] if upward.size else 0
+    if upward.size or (values.size and values[0] < values[-1] - _RISES):
+        at, degrees = _hz(float(np.exp(response.x[i]))), np.degrees(response.phase[i])
+        sentences.append(
+            "caution: the phase rises up to the crossover, as with an unstable vehicle in the "
+            f"loop; there may also be a lower gain margin of {-_DB * response.gain[i]:.3g} dB at "
+            f"{at}, where the phase is {degrees:.0f} deg"
+        )

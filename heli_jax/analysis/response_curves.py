@@ -25,6 +25,10 @@ _PRECISE = 0.03
 """Relative random error of bins at which the half-width starts to grow, up to an octave."""
 _LEAST_BINS = 7
 """Least number of bins in a local fit, which widens if there are fewer."""
+_SHARP, _SURELY = 0.2, 4.0
+"""Deviation of two adjacent bins from their local fits that indicates a sharper response [relative
+or rad; sd].
+"""
 _AROUND = 3
 """Number of bins to either side that give the expected phase of a bin."""
 
@@ -64,6 +68,8 @@ class Curve(NamedTuple):
     """Function of frequency [rad/s]."""
     band: tuple[float, float]
     """Band [rad/s]."""
+    caution: str = ""
+    """Frequencies at which the curve may differ from the response, in words."""
 
 
 def integrated(curve: Curve) -> Curve:
@@ -151,7 +157,24 @@ def measured_curve(
             np.concatenate([nothing, gradient], axis=1),
         )
 
-    return Curve(at, (float(w[0]), float(w[-1])))
+    off = y - _local(x, x, relative) @ y
+    return Curve(at, (float(w[0]), float(w[-1])), _too_sharp(w, np.max(np.abs(off), 1), relative))
+
+
+def _too_sharp(w: np.ndarray, off: np.ndarray, relative: np.ndarray) -> str:
+    """Return, in words, where a response (k,) differs from its local fits by more than random
+    error.
+    """
+    far = (off > _SHARP) & (off > _SURELY * relative)
+    both = np.flatnonzero(far[:-1] & far[1:])
+    if not both.size:
+        return ""
+    hz = w[[both[0], both[-1] + 1]] / (2.0 * np.pi)
+    return (
+        f"caution: at {hz[0]:.3g} to {hz[1]:.3g} Hz the response is sharper than the half octave "
+        "over which it is smoothed, as near a lightly damped mode (a slung load, a tail boom); "
+        "values below w180 may be wrong: fit a model or a transfer function"
+    )
 
 
 def _phase_jumps(H: np.ndarray, sd: np.ndarray) -> np.ndarray:

@@ -118,6 +118,7 @@ def test_a_loop_with_an_unstable_machine_has_the_margins_of_its_sign():
     assert found.numbers["crossover"].value == pytest.approx(w, rel=1e-3)
     assert found.numbers["phase_margin"].value == pytest.approx(180 - np.degrees(lag), abs=0.1)
     assert found.numbers["gain_margin"].value == pytest.approx(18.45, abs=0.05)
+    assert any("lower gain margin of -1" in s for s in found.sentences)
 
 
 def test_of_a_model_the_derivatives_are_those_of_finite_differences():
