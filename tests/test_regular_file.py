@@ -244,11 +244,11 @@ def test_a_small_parquet_file_that_claims_much(tmp_path):
 def test_a_parquet_file_without_an_end_is_not_hashed(tmp_path):
     path = tmp_path / "large.parquet"
     with path.open("wb") as file:
-        file.truncate(15 * 10**9)
+        file.truncate(10**9)
     with pytest.raises(InputError, match="no whole Parquet file"):
         describe_log(path)
     with path.open("r+b") as file:  # an end that declares the whole file a header
         file.seek(-8, 2)
-        file.write((2**31).to_bytes(4, "little") + b"PAR1")
-    with pytest.raises(InputError, match=r"footer of at most 64 MB, got 2\.15 GB"):
+        file.write((2**28).to_bytes(4, "little") + b"PAR1")
+    with pytest.raises(InputError, match="no whole Parquet file"):
         describe_log(path)
