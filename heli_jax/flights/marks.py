@@ -236,7 +236,7 @@ _FEWEST_SINGLE = 0.8
 _ONE_COUNT = 0.5
 """Share of jumps by one count of the resolution, from which on a slow motion with coarse resolution
 looks the same."""
-_STALE = 0.02, 0.5
+_STALE = 0.02, 0.8
 """Smallest and largest share of stale samples."""
 _CHANCE = 0.02
 """Largest share of values equal to the last but one: so many would also repeat by chance."""
