@@ -62,7 +62,8 @@ _SURE = 1e-4
 
 def residual_follows_excitation(c: Context) -> Iterator[Finding]:
     """Find residuals in frequency that still follow the excitation."""
-    if not c.fitted or c.unrelated:
+    # Feedback without an instrument correlates inputs and residual also for the right model.
+    if not c.fitted or c.unrelated or (c.follows and not c.instruments):
         return
     level = LEVEL / max(len(c.followed), 1)
     failed = {n: f for n, f in c.followed.items() if f.p_value < level}
