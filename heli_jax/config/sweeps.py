@@ -90,8 +90,8 @@ def sweep_job(
             _design(sweep, model, path, sweep.seed or 0),
             reduce,
             RunOptions(
-                sweep.solver or "",
-                sweep.substeps or 0,
+                sweep.solver,
+                sweep.substeps,
                 sweep.precision,
                 None if kept is None else Trajectories(tuple(kept.signals), kept.every),
                 trimmed,

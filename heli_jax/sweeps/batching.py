@@ -105,7 +105,7 @@ def _guess(job: Job) -> float:
     samples = sum(f.n_samples for f in job.flights) if job.simulated else 1
     # The exact step is one product of matrices; the others are assumed to be Runge-Kutta of order
     # 4.
-    stages = 1 if job.options.solver == "exact" else 4 * job.options.substeps
+    stages = 1 if job.options.solver == "exact" else 4 * (job.options.substeps or 1)
     return 1e-9 * samples * stages * len(naming.names(job.model.State))
 
 

@@ -185,6 +185,7 @@ def _notes(job: Job) -> list[Finding]:
 def _resume(job: Job, out: Path, options: Options) -> xr.Dataset:
     """Compute the missing chunks of a store on disk, and write its summary."""
     where = f"--out {out}"
+    stores.require_files(out, where)
     with stores.only_writer(out, where):
         # A new store is opened like an old one, because it may come from a killed process or from a
         # concurrent one.

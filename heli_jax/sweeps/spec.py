@@ -49,10 +49,10 @@ class Trimmed(NamedTuple):
 class RunOptions(NamedTuple):
     """Options of each run of a sweep; each field is also a keyword of `sweep`."""
 
-    solver: str = ""
+    solver: str | None = None
     """Solver with fixed steps: "exact" (default of linear models), "rk4" (of others), or a diffrax
     solver's name."""
-    substeps: int = 0
+    substeps: int | None = None
     """Steps per sample; by default enough for steps of 5 ms."""
     precision: Precision = "float64"
     """Precision. float32 is faster on some devices; its error is measured on 64 elements and stored
@@ -82,9 +82,13 @@ class Plan(NamedTuple):
 
     def simulation(self, **numbers: Any) -> SimulationOptions:  # fields of several types
         """Return the simulation options of a run; `numbers` are the fields that vary by element."""
+        solver, substeps = self.options.solver, self.options.substeps
+        # `job` states both.
+        assert solver is not None
+        assert substeps is not None
         return SimulationOptions(
-            solver=solver_named(self.options.solver),
-            substeps=self.options.substeps,
+            solver=solver_named(solver),
+            substeps=substeps,
             hold={
                 **dict.fromkeys(naming.names(self.model.Inputs), "zero-order"),
                 **dict(self.moving),
@@ -192,7 +196,7 @@ def job(
         )
     _check_axes(model, design, flights)
     _check_inputs(model, flights)
-    _check_results(model, reduce, flights, options.trajectories)
+    _check_results(model, design, reduce, flights, options.trajectories)
     _check_precision(model, options.precision)
     # The exact step of a linear model leaves no solver error in the results.
     solver = options.solver or ("exact" if model.linear else "rk4")
@@ -209,8 +213,10 @@ def job(
         raise ValueError(
             f"model {model.name!r} cannot be trimmed: it is not the full nonlinear model"
         )
-    # One program serves all flights, so the slowest rate decides the number of steps.
-    substeps = options.substeps or substeps_for(max(f.dt for f in flights), model.fastest)
+    substeps = options.substeps
+    if substeps is None:
+        # One program serves all flights, so the slowest rate decides the number of steps.
+        substeps = substeps_for(max(f.dt for f in flights), model.fastest)
     if substeps < 1:
         raise ValueError(f"substeps must be at least 1, got {substeps}")
     # Plain numbers, not arrays: they are compared with the store's JSON.
@@ -306,6 +312,7 @@ def _check_inputs(model: Model, flights: tuple[Flight, ...]) -> None:
 
 def _check_results(
     model: Model,
+    design: Design,
     reduce: Mapping[str, Reduce],
     flights: tuple[Flight, ...],
     trajectories: Trajectories | None,
@@ -315,6 +322,10 @@ def _check_results(
         raise ValueError("reduce: no result is kept, expected a result or trajectories")
     for name, reducer in reduce.items():
         reducers.check(name, reducer, outputs, inputs)
+        # Reserved names of the store; names that its format cannot have are refused where it is
+        # created.
+        if name in design.names or name in ("status", "element"):
+            raise ValueError(f"reduce.{name}: the name exists already, expected another")
         stream = reducers.streaming(reducer)
         signal = str(reducer.signal)
         for flight in flights if stream is not None and stream.against_flight else ():

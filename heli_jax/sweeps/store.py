@@ -7,6 +7,7 @@ one step, so a killed process leaves each file either old or new.
 import contextlib
 import errno
 import json
+import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from zarr.codecs import ZstdCodec
 from zarr.storage import MemoryStore
 
 from heli_jax.errors import InputError
+from heli_jax.regular_file import require_regular
 from heli_jax.sweeps.description import described, require_same
 from heli_jax.sweeps.design_point import NOT_RUN
 from heli_jax.sweeps.spec import Job
@@ -234,6 +236,47 @@ def reopen(path: Path, job: Job, where: str) -> Store:
             f"{where}: {path} is not a complete store of a sweep: {missing[0]} is missing"
         )
     return store
+
+
+# [bytes] of a file in a store; Zarr reads each as a whole.
+_LARGEST_METADATA = 10**8
+_LARGEST_CHUNK = 4 * 10**9
+
+
+def require_files(directory: Path, where: str) -> None:
+    """Refuse a sweep's directory that contains irregular files.
+
+    Zarr would wait for a pipe, and read a device or a sparse file until the memory is full.
+
+    Raises:
+        InputError: naming the file.
+    """
+    # Before the lock is taken: opening a pipe in its place would block forever.
+    others = (directory / ".lock", directory / "summary.json")
+    for path in others:
+        if os.path.lexists(path):
+            _require_file(path, _LARGEST_METADATA, where)
+    folders = [directory / "sweep.zarr"]
+    while folders:
+        folder = folders.pop()
+        try:
+            entries = list(os.scandir(folder))
+        except OSError as e:
+            raise InputError(f"{where}: {folder} is not a store of a sweep ({e.strerror})") from e
+        for entry in entries:
+            # Links to folders are not followed, because one may lead back here.
+            if entry.is_dir(follow_symlinks=False):
+                folders.append(Path(entry.path))
+                continue
+            metadata = entry.name == "zarr.json"
+            _require_file(entry.path, _LARGEST_METADATA if metadata else _LARGEST_CHUNK, where)
+
+
+def _require_file(path: str | Path, at_most: int, where: str) -> None:
+    try:
+        require_regular(path, "a regular file of a sweep", at_most)
+    except InputError as e:
+        raise InputError(f"{where}: {e}") from e
 
 
 @contextlib.contextmanager

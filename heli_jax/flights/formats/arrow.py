@@ -5,13 +5,13 @@ import hashlib
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
 from heli_jax.finding import Finding
 from heli_jax.flights.log import Budget, Survey, column, require_columns, require_few_columns, wrong
-from heli_jax.regular_file import open_regular, read_regular
+from heli_jax.regular_file import open_regular, read_regular, size_words
 
 # Imported inside the functions that need it, as in `csv_text`.
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ ARROW_MARK = b"ARROW1"
 """First bytes of Arrow and Feather files."""
 _STREAM = b"\xff\xff\xff\xff"
 _LARGEST, _LARGEST_ARROW = 16 * 10**9, 10**9
+_LONGEST_FOOTER = 64 * 10**6
 """Largest files [bytes]: Parquet loads only requested columns, Arrow the whole file."""
 _AT_ONCE = 2 * 10**6
 """Cells decoded before their rows are counted: 16 MB of numbers."""
@@ -34,6 +35,8 @@ def open_parquet(path: Path) -> "ColumnTable":
     where = str(path)
     with open_regular(path, "a log in Parquet", _LARGEST) as opened:
         size = os.fstat(opened.fileno()).st_size
+        # Before anything reads the whole file: a file with another end is not Parquet.
+        _check_end(where, opened, size)
         try:
             file = pq.ParquetFile(path)
             schema, metadata = file.schema_arrow, file.metadata
@@ -75,6 +78,20 @@ def open_parquet(path: Path) -> "ColumnTable":
 
     count = metadata.num_rows
     return ColumnTable(where, "parquet", size, digest, schema, count, read, unpacked)
+
+
+def _check_end(path: str, file: BinaryIO, size: int) -> None:
+    """Refuse a file whose end is not that of a Parquet file, or states an oversized footer."""
+    # A Parquet file ends with its metadata, their length (4 bytes, little-endian) and its mark:
+    # PAR1, or PARE if the metadata are encrypted. 12 bytes are both marks and the length.
+    file.seek(max(size - 8, 0))
+    end = file.read(8)
+    length = int.from_bytes(end[:4], "little")
+    if end[4:] not in (b"PAR1", b"PARE") or length + 12 > size:
+        raise wrong(path, "is no whole Parquet file")
+    if length > _LONGEST_FOOTER:
+        words = f"{size_words(_LONGEST_FOOTER)}, got {size_words(length)}"
+        raise wrong(path, f"expected a footer of at most {words}")
 
 
 def open_arrow(path: Path) -> "ColumnTable":
@@ -237,4 +254,21 @@ def _floats(values: "pa.ChunkedArray") -> np.ndarray:
         values = values.cast(pa.int32() if pa.types.is_time32(values.type) else pa.int64())
     # Unsafe, because a safe cast refuses integers above 2^53, as all stamps in ns are. Calendar
     # stamps round to 256 ns.
-    return pc.cast(values, pa.float64(), safe=False).to_numpy()
+    return floats(pc.cast(values, pa.float64(), safe=False))
+
+
+def floats(numbers: "pa.ChunkedArray") -> np.ndarray:
+    """Return numbers of type float64 (N,), NaN where null."""
+    import pyarrow as pa
+
+    values, at = np.empty(len(numbers), np.float64), 0
+    # As buffers, because to_numpy imports pandas, which takes a second.
+    for chunk in (c for c in numbers.chunks if len(c)):
+        piece = values[at : at + len(chunk)]
+        piece[:] = np.frombuffer(chunk.buffers()[1], np.float64, len(chunk), 8 * chunk.offset)
+        if chunk.null_count:
+            known = chunk.is_valid().cast(pa.uint8())
+            at_known = np.frombuffer(known.buffers()[1], np.uint8, len(known), known.offset)
+            piece[at_known == 0] = np.nan
+        at += len(chunk)
+    return values

@@ -24,6 +24,7 @@ from heli_jax.errors import InputError
 from heli_jax.finding import Finding, note
 from heli_jax.flights import progress
 from heli_jax.flights.clock import is_date, seconds_of_dates, time_unit
+from heli_jax.flights.formats.arrow import floats
 from heli_jax.flights.log import (
     Budget,
     Survey,
@@ -405,7 +406,7 @@ class CsvTable:
         table = self._arrow(indices, pa.float64())
         if table is not None:
             columns = [table.column(str(i)) for i in indices]
-            return [(c.to_numpy(), len(c) - c.null_count, 0) for c in columns]
+            return [(floats(c), len(c) - c.null_count, 0) for c in columns]
         if len(self._rows) > _LARGEST_TEXT:
             problem = "has quotes, a row with another number of cells, or a cell that"
             problem += f" is no plain number, expected at most {size_words(_LARGEST_TEXT)} then"
@@ -438,7 +439,7 @@ class CsvTable:
             plain = pc.replace_substring(plain, "\u2212", "-")
             plain = pc.replace_substring_regex(plain, r"^\+", "")
             plain = pc.replace_substring_regex(plain, r"([0-9.])[dD]", r"\1e")
-            return pc.cast(plain, pa.float64()).to_numpy(), filled, 0
+            return floats(pc.cast(plain, pa.float64())), filled, 0
         if is_date(cells.drop_null()[0].as_py()):
             self._dates.add(name)
             seconds = seconds_of_dates(cells.to_pylist())
