@@ -50,7 +50,7 @@ class Timed(NamedTuple):
 def timed(layout: Layout, arguments: tuple[Any, ...]) -> Timed:
     def likelihood(*arguments: Any) -> Any:
         at = residual_and_jacobian(layout, *arguments)
-        return at.r @ at.r, at.J.T @ at.r, at.J.T @ at.J
+        return at.cost, at.J.T @ at.r, at.J.T @ at.J
 
     cold, program = _seconds(lambda: jax.jit(likelihood).lower(*arguments).compile())
     run = [_seconds(lambda: jax.block_until_ready(program(*arguments))) for _ in range(1 + TURNS)]
@@ -79,7 +79,7 @@ def compared(taus: bool) -> None:
     size = np.sqrt(np.diag(exact.fisher))
     print(
         f"  {exact.warm / frozen.warm:.1f} times as fast; they differ by "
-        f"{abs(frozen.cost / exact.cost - 1):.1e} in the sum of squares, by "
+        f"{abs(frozen.cost / exact.cost - 1):.1e} in the cost, by "
         f"{np.max(np.abs(frozen.gradient - exact.gradient) / size):.1e} sd in the gradient, by "
         f"{np.max(np.abs(frozen.fisher - exact.fisher) / np.outer(size, size)):.1e} in Fisher's "
         "information"

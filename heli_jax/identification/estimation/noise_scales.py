@@ -90,7 +90,7 @@ def corrections_at(
     for name, before in noise.corrections.items():
         i = layout.of_interest.index(name)
         if name in layout.model.input_scales:
-            # The square of this row is the sum of log s and of the corrections, up to a constant.
+            # The square of this row has the derivative of the sum of log s and of the corrections.
             slope = float(before[0]) - 2.0 * e.r[measured] * e.J[measured, i] / e.slopes[i]
         else:
             there = evaluate(layout, data, noise, z.at[i].add(_STEP))

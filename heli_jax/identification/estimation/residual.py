@@ -124,11 +124,14 @@ def weak_rows(layout: Layout, z: Float[Array, " q"]) -> Float[Array, " r"]:
     return z[layout.first_nuisance :]
 
 
-def _all_rows(layout: Layout, data: Data, noise: Noise, z: Array) -> tuple[Array, Residuals]:
-    """Return the rows of the measurements, then the priors'."""
+def _all_rows(
+    layout: Layout, data: Data, noise: Noise, z: Array
+) -> tuple[Array, Float[Array, ""], Residuals]:
+    """Return the rows of the measurements, then the priors', and what the optimiser minimises."""
     residuals = layout.objective.residuals(layout, data, noise, unpack(layout, data, z))
     rows = [residuals.rows, prior_rows(layout, data, z), weak_rows(layout, z)]
-    return jnp.concatenate(rows), residuals
+    r = jnp.concatenate(rows)
+    return r, jnp.sum(r**2) + residuals.added, residuals
 
 
 def rows_of(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Array:
@@ -138,8 +141,7 @@ def rows_of(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> 
 
 def cost_of(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Float[Array, ""]:
     """Return what the optimiser minimises."""
-    rows, residuals = _all_rows(layout, data, noise, z)
-    return jnp.sum(rows**2) + residuals.added
+    return _all_rows(layout, data, noise, z)[1]
 
 
 class ResidualAndJacobian(NamedTuple):
@@ -166,8 +168,7 @@ def residual_and_jacobian(
 
     def rows(z: Array) -> tuple[Array, Any]:
         # Auxiliary values avoid a second simulation.
-        r, residuals = _all_rows(layout, data, noise, z)
-        cost = jnp.sum(r**2) + residuals.added
+        r, cost, residuals = _all_rows(layout, data, noise, z)
         return r, (r, residuals.runs, residuals.innovations, cost)
 
     def along(v: Array) -> Any:

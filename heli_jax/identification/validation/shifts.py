@@ -156,7 +156,8 @@ def _without_level(at: Solution, r: np.ndarray, J: np.ndarray) -> np.ndarray:
     """
     if at.layout.noise_model != "disturbance":
         return J
-    # The row below the innovations is sqrt(N (1 + mean log variance - level)).
+    # The row below the innovations is sqrt(N), with half of the derivative of sqrt(N) times the
+    # mean log variance.
     n, J = signal_numbers(at.layout, at.data).size, J.copy()
     J[:n] += np.outer(r[:n], J[n]) * (r[n] / np.count_nonzero(r[:n]))
     J[n] = 0.0
