@@ -1,4 +1,4 @@
-"""Results of fits to seventy-five records with a known fault and forty without.
+"""Results of fits to eighty-one records with a known fault and forty without.
 
     .venv/bin/python experiments/misfits.py [--quick] [--only WORDS] [--size N]
 
@@ -225,10 +225,13 @@ def degrees(rng: np.random.Generator) -> Case:
     return Case(problem(flight(r._replace(p=np.degrees(r.p)), "p", "phi")), TRUTH)
 
 
-def dropouts(rng: np.random.Generator) -> Case:
-    f = flight(flown(Roll(), rng), "p")
-    y = np.where(rng.uniform(size=f.n_samples) < 0.03, 0.0, f.outputs["p"])
-    return Case(problem(dataclasses.replace(f, outputs={"p": y})), TRUTH)
+def dropouts(share: float) -> Make:
+    def make(rng: np.random.Generator) -> Case:
+        f = flight(flown(Roll(), rng), "p")
+        y = np.where(rng.uniform(size=f.n_samples) < share, 0.0, f.outputs["p"])
+        return Case(problem(dataclasses.replace(f, outputs={"p": y})), TRUTH)
+
+    return make
 
 
 def in_gusts(feedback: float) -> Make:
@@ -280,7 +283,8 @@ UNSOUND: dict[str, Make] = {
     "strong gusts": one(Roll(gust=60.0), "p", "phi"),
     "angle that wanders": wandering,
     "servo of 60 ms in gusts": one(Roll(lag=0.06, gust=5.0), "p"),
-    "samples that drop to zero": dropouts,
+    "samples that drop to zero": dropouts(0.03),
+    "few samples that drop to zero": dropouts(0.009),
     "output p logged 80 ms late": late_output("p", "p"),
     "output phi logged 80 ms late": late_output("phi", "p", "phi"),
     "servo that saturates in rate": one(Roll(slew=2.5), "p"),

@@ -229,7 +229,7 @@ def vehicle_from_mapping(
     stands = [n for n, value in values.items() if value == EDIT]
     if stands:
         requested = ", ".join(f"{n} in {naming.unit(params, n) or '1'}" for n in stands)
-        raise InputError(f"{where}: still {EDIT}, expected numbers for {requested}")
+        raise InputError(f"{where}: fill in {requested}")
     for name, entry in content.items():
         constants[name] = constant(entry, name, naming.unit(params, name), where)
     lacking = [n for n in known if n not in constants and n not in naming.defaults(params)]

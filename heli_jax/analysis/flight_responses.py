@@ -233,7 +233,7 @@ def _notes(flights: Sequence[Flight], inputs: list[str], by: tuple[str, ...]) ->
     if without:
         words = (
             f"{', '.join(without)}: assumed not to follow the outputs. If a pilot or an autopilot "
-            "closes a loop, the response is biased towards minus one over its gain: log the "
+            "closes a loop, the response tends to -1/(gain of the pilot or autopilot): log the "
             "excitation (signals.instruments), or fit by filter error"
         )
         notes.append(note("loop.responses-direct", words, *without))

@@ -343,7 +343,7 @@ def _put_bandwidth(kind: Kind, numbers: dict[str, Number], sentences: list[str])
     else:
         lacking = "gain" if gain is None else "phase"
         sentences.append(
-            _missing("bandwidth", f"the {lacking} bandwidth, which may be less, is not")
+            f"bandwidth unknown: it is the lower of two limits, and the {lacking} limit is unknown"
         )
 
 

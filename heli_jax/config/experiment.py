@@ -232,7 +232,7 @@ def _validated(content: dict[str, Any], where: str) -> Config:
     # If a text is allowed, it would be taken as a channel's name or a unit.
     if places := list(_unedited_places(content)):
         others = ", ".join(map(_place, places[1:]))
-        more = f"; {EDIT} stands also at {others}" if others else ""
+        more = f"; fill in also {others}" if others else ""
         raise InputError(f"{where}: {_edit_words(places[0])}{more}")
     return config
 
@@ -248,7 +248,7 @@ def _unedited_places(at: Any, place: tuple[str | int, ...] = ()) -> Iterator[tup
 
 def _edit_words(place: tuple[str | int, ...]) -> str:
     expected = _MEANT.get(str(place[-1]), "your number")
-    return f"{_place(place)}: is still {EDIT}, expected {expected}"
+    return f"fill in {_place(place)}: {expected}"
 
 
 _KIND = re.compile(r"(str|int|float|bool|[A-Z]\w*Config|(list|dict|tuple|literal|constrained)\W.*)")
@@ -304,7 +304,7 @@ _MEANT = {
     "not move is {constant: 0}",
     "unit": "the unit of the channel's numbers in the log",
     "rate": "samples a second, in Hz",
-    "scale": "the input's full travel in the stated unit over its full travel in the log's numbers",
+    "scale": "the input for one unit of the log (full travel over full travel in the log)",
     "start": "a start value, within a factor of about three",
 }
 """Values that `heli-jax new` cannot know, by the last word of the key."""

@@ -249,7 +249,11 @@ def _asked(table: Table, surveys: Sequence[Survey], time: str | Signal) -> Signa
     signal = Signal(time, "s", "s") if isinstance(time, str) else time
     require_columns(table.path, table.names, [signal.name])
     if all(s.values is None for s in surveys if s.name == signal.name):
-        raise wrong(table.path, "holds text, expected times", column(signal.name))
+        raise wrong(
+            table.path,
+            "holds text, expected seconds or times such as 2024-03-01T23:59:55.01",
+            column(signal.name),
+        )
     if signal.unit not in SECONDS:
         try:
             units.factor(signal.unit, "s")

@@ -1,5 +1,6 @@
 """Result of a fit, as plain data."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -15,6 +16,7 @@ from heli_jax.identification.validation.adequacy import Adequacy
 from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.held_out import HeldOutFrequency
 from heli_jax.identification.validation.metrics import Metrics, Signals, Whiteness
+from heli_jax.numbers import number
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -148,12 +150,21 @@ class Fit:
         """One sentence for each reason to distrust intervals; empty if all are trusted."""
         by_reason: dict[str, list[str]] = {}
         for name, d in self.distrusts.items():
-            size = "" if d.shift is None else f" (off by about {abs(d.shift):.2g})"
-            by_reason.setdefault(d.brief, []).append(name + size)
+            by_reason.setdefault(d.brief, []).append(name)
         return " ".join(
-            f"Not trusted because {reason}: {', '.join(names)}."
+            f"Do not use {' or '.join(names)}: {reason}{self._shifts(names)}."
             for reason, names in by_reason.items()
         )
+
+    def _shifts(self, names: Sequence[str]) -> str:
+        """Return the words on how far a misfit shifts the estimates; empty if unknown."""
+        sizes = {n: self.distrusts[n].shift for n in names}
+        words = [
+            f"{n} by about {number(abs(size), 2)} {self.estimates[n].unit}".removesuffix(" 1")
+            for n, size in sizes.items()
+            if size is not None
+        ]
+        return f", which shifts {' and '.join(words)}" if words else ""
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -136,9 +136,9 @@ def _by_moving_stick(log: Log, path: str) -> str:
         return "roll-flybarless"
     if not moving:
         listed = ", ".join(map(shown, names[:12]))
-        problem = "no column names match a moving stick and a rate or angle of its axis"
-        remedy = "expected --model and then the signals by hand"
-        raise wrong(path, f"{problem} that moves, {remedy}; it holds {listed}")
+        problem = "no column names match a stick and a rate or angle of its axis that both move"
+        remedy = "name a model by --model, then fill in the signals in the file it writes"
+        raise wrong(path, f"{problem} (columns: {listed or 'none with numbers'}); {remedy}")
     most = {model: float(np.nanmax(np.abs(values))) for model, values in moving.items()}
     # Fractions of full travel are compared directly; the full travel of other numbers is unknown.
     alike = max(most.values()) <= _FULL_TRAVEL

@@ -18,8 +18,8 @@ from heli_jax.new_config.rate import two_digits
 from heli_jax.yaml_file import EDIT
 
 _MOST_LISTED = 12
-_UNSET = {"kappa": "a stand without a spring", "zeta": "a stand without damping"}
-"""Meaning of a default that is not zero for every vehicle."""
+_OF_THE_STAND = {"kappa": "0 without a spring", "zeta": "0 without damping"}
+"""Constants with a default of zero, which a model of a stand may not assume."""
 _GUSTS = (
     "  # filter-error models gusts. Without gusts use output-error and remove the section",
     "  # disturbance.",
@@ -191,12 +191,15 @@ def vehicle(model: Any, means: Mapping[str, tuple[str, float]]) -> str:
         if name not in needed and (unset or not reads(model, params, name)):
             continue
         unit, meaning = naming.unit(model.Params, name) or "1", naming.meaning(model.Params, name)
-        value = EDIT if name in needed else f"{float(getattr(params, name)):g}"
+        ask = name in needed or name in _OF_THE_STAND
+        value = EDIT if ask else f"{float(getattr(params, name)):g}"
         if name in means:
             channel, mean = means[name]
             value, meaning = f"{mean:.5g}", f"{meaning}; GUESS: mean of {channel}"
-        elif value != EDIT and name in _UNSET:
-            meaning = f"{meaning}; GUESS: {_UNSET[name]}; measure it, or estimate it"
+        elif name in _OF_THE_STAND:
+            meaning = (
+                f"{meaning}; {_OF_THE_STAND[name]}; measured, or a start value and free under fit"
+            )
         lines.append(f"{name}: {{value: {value}, unit: {_value(unit)}}}   # {_comment(meaning)}")
     return "\n".join(lines) + "\n"
 

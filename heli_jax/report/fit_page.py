@@ -243,9 +243,7 @@ def lines(fit: Fit) -> tuple[Line, Line, Line]:
             for f in fit.findings
             if f.bad and f.brief and f.code.partition(".")[0] in _DOUBTFUL_TOPICS
         ]
-        statements = [
-            f"In the record {doubts[0]}" if doubts else "No finding speaks against the model"
-        ]
+        statements = [f"Doubt: {doubts[0]}" if doubts else "No test contradicts the model"]
         for agreement, how in (
             (fit.metrics, "simulated"),
             (fit.one_step, "one step ahead"),
@@ -254,7 +252,9 @@ def lines(fit: Fit) -> tuple[Line, Line, Line]:
             shares = {n: m.vaf for n, m in agreement.items() if math.isfinite(m.vaf)}
             if shares:
                 worst = min(shares, key=lambda n: shares[n])
-                statements.append(f"VAF of {worst} {vaf_percent(shares[worst])} {how}")
+                words = f"VAF of {worst} {vaf_percent(shares[worst])} {how}"
+                poor = shares[worst] < 0 and not fit.adequacy.ahead
+                statements.append(f"{words}, worse than its mean" if poor else words)
         kind, word = ("warning", "Adequate, with doubts") if doubts else ("good", "Adequate")
         adequate = Line(kind, word, f"{'; '.join(statements)}.")
     return Line("good", "Converged", reached), determined, adequate

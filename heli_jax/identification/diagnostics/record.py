@@ -23,6 +23,7 @@ from heli_jax.identification.validation.logging_rate import (
     power_between_samples,
     rates_against_modes,
 )
+from heli_jax.identification.validation.outliers import outliers
 from heli_jax.identification.validation.shifts import SHIFT, shift_in_time
 
 _CUT_OFF = 0.02
@@ -103,6 +104,23 @@ def strays(c: Context) -> Iterator[Finding]:
                     high=odd.values.max(),
                     first=odd.times[0],
                 )
+
+
+def outlying_residuals(c: Context) -> Iterator[Finding]:
+    """Find single samples far from the fitted response, and the estimates without them."""
+    if not (c.at_optimum and c.explains) or c.at.layout.noise_model == "spectrum":
+        return
+    for one in outliers(c.at, c.e):
+        yield found(
+            "quality.outliers",
+            "doubt",
+            one.output,
+            value=float(one.count),
+            shifts=one.shifts,
+            percent=100.0 * one.share,
+            low=one.values.min(),
+            high=one.values.max(),
+        )
 
 
 # Sampling rates, and signals at another time than in the log.
@@ -287,6 +305,7 @@ DIAGNOSTICS = (
     saturation,
     stuck_outputs,
     strays,
+    outlying_residuals,
     nothing_follows,
     gusts_guessed,
     next_flight,
