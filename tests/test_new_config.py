@@ -88,6 +88,8 @@ def test_what_only_the_user_knows_is_refused_until_it_is_given(tmp_path: Path) -
     vehicle = yaml_file.read_mapping(tmp_path / "mine-vehicle.yaml")
     assert vehicle["Omega"]["value"] == pytest.approx(1450 * np.pi / 30, rel=1e-4)
     assert vehicle["L3"] == {"value": "EDIT", "unit": "m"}
+    # A spring or damper of the stand would be fitted as another inertia.
+    assert {vehicle[n]["value"] for n in ("kappa", "zeta")} == {"EDIT"}
     # The inertias are requested once, in the vehicle file, which also gives the start values.
     assert yaml_file.read_mapping(out)["fit"]["free"] == {"Ixx": {}, "If": {}}
     assert cli.main(["check", str(out)]) == 2

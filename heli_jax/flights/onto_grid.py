@@ -38,6 +38,7 @@ from heli_jax.flights.resample import (
     held_until_jumps,
     hold,
     in_gaps,
+    interpolate,
     is_slower,
     longest_gap,
     own_clock,
@@ -305,7 +306,8 @@ def _missing(request: Request, signals: Mapping[Key, ClockedSignal]) -> list[Fin
         count, seconds = int(missing.sum()), signal.clock.seconds[missing]
         runs = int(missing[0]) + int(np.count_nonzero(missing[1:] & ~missing[:-1]))
         words = f"{count} of {missing.size} samples of {shown(request.signals[key].name)} are"
-        words += f" missing, in {runs} places from {seconds[0]:.6g} s to {seconds[-1]:.6g} s"
+        places = "one place" if runs == 1 else f"{runs} places"
+        words += f" missing, in {places} from {seconds[0]:.6g} s to {seconds[-1]:.6g} s"
         notes.append(note("samples.missing", words, key[0], value=count))
     return notes
 
@@ -437,7 +439,10 @@ def at_times(
             if holds[key].hold == "mixed" and not goes_down(signal.seconds, times):
                 samples[key, kind] = held_until_jumps(*signal, times)
             elif holds[key].hold != "zero-order":
-                samples[key, kind] = resampled(*signal, times)
+                made = resampled(*signal, times)
+                # A filter leaves out a short gap, but an input acts all the time.
+                made = np.where(np.isnan(made), interpolate(*signal, times), made)
+                samples[key, kind] = made
             elif key in alike:
                 samples[key, kind] = low[key]
                 outputs = ", ".join(alike[key])

@@ -21,6 +21,8 @@ from heli_jax.numbers import number
 if TYPE_CHECKING:
     import pandas as pd
 
+_DOUBTFUL_TOPICS = ("adequacy", "dynamics", "units", "timing", "quality")
+"""Topics of findings that raise doubts about an adequate model."""
 Status = Literal["converged", "not-converged", "not-identifiable"]
 
 
@@ -187,11 +189,22 @@ class Fit:
         return not any(f.denies for f in self.findings)
 
     @property
+    def doubts(self) -> tuple[str, ...]:
+        """Doubts about the model that do not deny its adequacy, each in a few words."""
+        return tuple(
+            f.brief
+            for f in self.findings
+            if f.bad and f.brief and f.code.partition(".")[0] in _DOUBTFUL_TOPICS
+        )
+
+    @property
     def adequate_in_words(self) -> str:
-        """`yes`, `not judged` (no optimum), or `no (VAF of p is 20.0 %)`."""
+        """`yes`, `doubtful (...)`, `not judged` (no optimum), or `no (VAF of p is 20.0 %)`."""
         if self.status == "not-converged":
             return "not judged"
-        return f"no ({'; '.join(self.reasons_against)})" if self.reasons_against else "yes"
+        if self.reasons_against:
+            return f"no ({'; '.join(self.reasons_against)})"
+        return f"doubtful ({self.doubts[0]})" if self.doubts else "yes"
 
     @property
     def reasons_against(self) -> tuple[str, ...]:

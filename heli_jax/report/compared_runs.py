@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from heli_jax.errors import InputError
 from heli_jax.finding import Finding, note, sentences
+from heli_jax.identification.methods import objective_of
 from heli_jax.identification.result import Estimate
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
 from heli_jax.numbers import NOTHING, number, vaf_percent, with_sd
@@ -67,7 +68,10 @@ class ComparedRuns(NamedTuple):
 
     @property
     def agreement(self) -> Table:
-        """VAF, NRMSE fit and Theil's coefficient by output and run, also of held-out flights."""
+        """VAF, NRMSE fit and Theil's coefficient by output and run, also of held-out flights.
+
+        Runs of the same samples are also compared by AIC.
+        """
         rows = []
         for held_out in (False, True):
             of = [run.validation if held_out else run.metrics for run in self.runs]
@@ -76,6 +80,12 @@ class ComparedRuns(NamedTuple):
                     where = "held out" if held_out else "fitted"
                     cells = (_agreement(m.get(output), key, text) for m in of)
                     rows.append((output, where, words, *cells))
+        # Likelihoods are comparable only for the same samples in time.
+        same = len({_samples(run) for run in self.runs}) == 1
+        if same and _samples(self.runs[0]) and all(map(_converged, self.runs)):
+            aic = [run.content["aic"] for run in self.runs]
+            above = (number(value - min(aic), 3) for value in aic)
+            rows.append(("all", "fitted", "AIC above the best", *above))
         return Table(("output", "flights", "metric", *self.labels), rows)
 
     @property
@@ -180,6 +190,16 @@ def _labels(directories: Sequence[Path]) -> tuple[str, ...]:
             return tuple(labels)
     # The same directory may occur twice.
     return tuple(f"{p[-1]} ({i})" for i, p in enumerate(paths, 1))
+
+
+def _samples(run: SavedFit) -> tuple[Any, ...]:
+    """Return what identifies the fitted samples; empty if unknown, or if not fitted in time."""
+    flights = [f for f in run.content.get("data") or [] if not f.get("hold_out")]
+    known = "aic" in run.content and flights and all(f.get("sha256") for f in flights)
+    if not known or objective_of(run.method).noise_model == "spectrum":
+        return ()
+    facts = ((f["sha256"], *f.get("window", ()), f.get("dt")) for f in flights)
+    return run.content.get("n_samples"), *facts
 
 
 def _combinations(runs: Sequence[SavedFit]) -> list[dict[str, Estimate]]:

@@ -213,10 +213,6 @@ class Line(NamedTuple):
     """One sentence."""
 
 
-_DOUBTFUL_TOPICS = ("adequacy", "dynamics", "units", "timing", "quality")
-"""Topics of findings that raise doubts about an adequate model."""
-
-
 def lines(fit: Fit) -> tuple[Line, Line, Line]:
     """Return the statements on convergence, identifiability and adequacy."""
     if fit.status == "not-converged":
@@ -238,12 +234,8 @@ def lines(fit: Fit) -> tuple[Line, Line, Line]:
         determined = Line("warning", "Identifiable, not trusted", text)
     adequate = Line("bad", "Not adequate", f"{'; '.join(fit.reasons_against)}.")
     if fit.adequate:
-        doubts = [
-            f.brief
-            for f in fit.findings
-            if f.bad and f.brief and f.code.partition(".")[0] in _DOUBTFUL_TOPICS
-        ]
-        statements = [f"Doubt: {doubts[0]}" if doubts else "No test contradicts the model"]
+        doubts = fit.doubts
+        statements = [doubts[0] if doubts else "No test contradicts the model"]
         for agreement, how in (
             (fit.metrics, "simulated"),
             (fit.one_step, "one step ahead"),

@@ -101,3 +101,19 @@ def test_by_configuration(tmp_path):
     (tmp_path / "flight.yaml").write_text(yaml.safe_dump(content))
     flights = config.read_flights(config.load(tmp_path / "flight.yaml"))
     assert [f.name for f in flights] == ["flight 1, part 1", "flight 1, part 2"]
+
+
+def test_an_input_acts_in_a_short_gap_too(tmp_path):
+    """Test a fast log with a short gap, resampled to a lower rate."""
+    t = np.r_[0.0, 0.16 + np.arange(1600) / 400]
+    np.savez(tmp_path / "a.npz", t=t, u=np.sin(3.0 * t), p=np.cos(3.0 * t))
+    f = read_flight(
+        tmp_path / "a.npz",
+        inputs={"u": Signal("u", "1", "1")},
+        outputs={"p": Signal("p", "1", "1")},
+        time="t",
+        rate=100,
+    )
+    assert np.isfinite(f.inputs["u"]).all()
+    assert np.max(np.abs(f.inputs["u"] - np.sin(3.0 * f.times))) < 0.05
+    assert np.isnan(f.outputs["p"]).any()

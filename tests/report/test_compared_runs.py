@@ -79,6 +79,18 @@ def test_what_did_not_converge_is_not_compared_and_one_log_is_said(tmp_path: Pat
     assert ("compared.not-converged", ("a2",)) in said
 
 
+def test_fits_of_the_same_samples_are_compared_by_aic(tmp_path: Path) -> None:
+    def of(name: str, aic: float, **more: object) -> Path:
+        return write_run(tmp_path / name, {"Ixx": (0.02, 0.001)}, aic=aic, n_samples=20, **more)
+
+    a, b = of("a1", -10.0), of("a2", -12.5, method="filter-error")
+    assert compare_runs([a, b]).agreement.rows[-1][2:] == ("AIC above the best", "2.5", "0")
+    for other in (of("b1", 0.0), of("a3", 0.0, method="frequency-error")):
+        assert all(
+            row[2] != "AIC above the best" for row in compare_runs([a, other]).agreement.rows
+        )
+
+
 def test_what_is_not_to_be_trusted_is_said_of_compared_and_listed_fits(tmp_path, capsys) -> None:
     sentence = "Not trusted: Ixx (closed loop without an instrument)."
     brief = "closed loop without an instrument"
