@@ -35,15 +35,18 @@ def lines(x: np.ndarray, dt: float) -> tuple[Line, ...]:
         dt: time between samples [s].
     """
     from scipy.ndimage import median_filter
-    from scipy.signal import detrend, welch
 
     n = min(x.size, max(64, round(SEGMENT / dt)))
     there = np.isfinite(x)
     if np.count_nonzero(there) < max(64, x.size // 2):
         return ()
     times = np.arange(x.size)
-    x = detrend(np.interp(times, times[there], x[there]))
-    hz, power = welch(x, 1.0 / dt, nperseg=n, detrend="linear")
+    x = _without_line(np.interp(times, times[there], x[there]))
+    # Welch's spectrum. scipy.signal would add half a second to the start of every command.
+    hz, window = np.fft.rfftfreq(n, dt), np.sin(np.pi * np.arange(n) / n) ** 2
+    segments = np.lib.stride_tricks.sliding_window_view(x, n)[:: n - n // 2]
+    spectra = np.abs(np.fft.rfft(_without_line(segments) * window)) ** 2
+    power = 2.0 * dt / np.sum(window**2) * np.mean(spectra, axis=0)
     # Use the whole record, because motion slower than a segment is also part of the variance.
     total = float(np.var(x)) / float(hz[1])
     if not total > 0:
@@ -59,6 +62,13 @@ def lines(x: np.ndarray, dt: float) -> tuple[Line, ...]:
         if share >= SMALLEST:
             result.append(Line(float(hz[i]), share))
     return tuple(sorted(result, key=lambda line: -line.share))
+
+
+def _without_line(x: np.ndarray) -> np.ndarray:
+    """Return signals (*, N) without their straight lines of least squares."""
+    t = np.arange(x.shape[-1]) - 0.5 * (x.shape[-1] - 1)
+    x = x - np.mean(x, axis=-1, keepdims=True)
+    return x - (x @ t)[..., None] * t / (t @ t)
 
 
 def folded(hz: float, rate: float) -> float:

@@ -8,7 +8,7 @@ without these samples follow to first order.
 from typing import NamedTuple
 
 import numpy as np
-import scipy.signal
+from numpy.lib.stride_tricks import sliding_window_view
 
 from heli_jax.identification.estimation.evaluation import Evaluation
 from heli_jax.identification.estimation.simulated_flights import signals
@@ -74,7 +74,8 @@ def _outlying(r: np.ndarray, seen: np.ndarray) -> np.ndarray:
     far, rows = np.zeros(r.shape, bool), r[seen]
     if rows.size < 2 * _NEIGHBOURS:
         return far
-    distance = np.abs(rows - scipy.signal.medfilt(rows, _NEIGHBOURS))
+    around = sliding_window_view(np.pad(rows, _NEIGHBOURS // 2, "edge"), _NEIGHBOURS)
+    distance = np.abs(rows - np.median(around, axis=1))
     least = max(_LARGE, _FAR * float(np.median(distance)) / _MEDIAN)
     if 0 < np.mean(distance > least) <= _MOST:
         far[seen] = distance > least
