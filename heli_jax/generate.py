@@ -83,7 +83,7 @@ def _stick(config: StickConfig, n: int, dt: float, rng: np.random.Generator) -> 
     if config.kind == "random-steps":
         return sticks.random_steps(n, dt, rng, config.hold)
     if config.kind == "3-2-1-1":
-        return sticks.multistep_3211(n, dt, rng, config.step, config.pause)
+        return sticks.multistep(n, dt, rng, config.step, config.pause)
     if config.kind == "sweep":
         # `sweep` now means a parameter sweep.
         warnings.warn("kind: sweep is deprecated, expected chirp", DeprecationWarning, stacklevel=2)

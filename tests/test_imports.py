@@ -127,7 +127,7 @@ ROOMS = (
     "methods", "defaults", "problem", "unknowns",
     "estimation", "identifiability", "design", "validation", "equation_error", "result",
     "uncertainty",
-    "diagnostics", "restarts", "search", "fit", "select",
+    "restarts", "search", "diagnostics", "fit", "select",
 )  # fmt: skip
 
 

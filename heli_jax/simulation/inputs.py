@@ -1,11 +1,37 @@
-"""Stick inputs for excitation; each function returns (N,) samples of unit amplitude."""
+"""Library of excitations: each function returns (N,) samples with a largest deflection of 1.
+
+Sources: Schroeder (1970) and Guillaume and others (1991) for multisines of low crest factor; Klein
+and Morelli (2006) for orthogonal multisines; Tischler and Remple (2012) for frequency sweeps with
+fades; Plaetschke and Schulz (1979) for multistep inputs; Golomb (1967) for shift registers.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
+
+type Samples = Float[np.ndarray, " n"]
 
 
-def random_steps(
-    n: int, dt: float, rng: np.random.Generator, hold: tuple[float, float]
-) -> np.ndarray:
+class Shape(NamedTuple):
+    """Settings of an excitation; each kind uses those that its function names."""
+
+    step: float = 0.3
+    """Shortest step [s]."""
+    pause: float = 2.0
+    """Neutral time between two manoeuvres [s]."""
+    hold: tuple[float, float] = (0.3, 2.0)
+    """Shortest and longest random step [s]."""
+    band: tuple[float, float] = (0.05, 5.0)
+    """Lowest and highest frequency [Hz]."""
+    fade: float = 0.0
+    """Time in which a chirp grows at its begin and fades at its end [s]."""
+    place: tuple[int, int] = (0, 1)
+    """Place of the input among those that are excited together, and their number."""
+
+
+def random_steps(n: int, dt: float, rng: np.random.Generator, hold: tuple[float, float]) -> Samples:
     """Return pilot-like steps: levels uniform in [-1, 1], each held for a uniform time in `hold`
     [s].
 
@@ -23,40 +49,223 @@ def random_steps(
     return u
 
 
-def multistep_3211(
-    n: int, dt: float, rng: np.random.Generator, unit: float, pause: float
-) -> np.ndarray:
-    """Return 3-2-1-1 steps in random directions, with neutral pauses.
+DOUBLET = ((1, 1.0), (1, -1.0))
+STEPS_3211 = ((3, 1.0), (2, -1.0), (1, 1.0), (1, -1.0))
+"""Multistep inputs: lengths [shortest steps] and levels."""
+
+
+def multistep(
+    n: int,
+    dt: float,
+    rng: np.random.Generator,
+    step: float,
+    pause: float,
+    pattern: Sequence[tuple[int, float]] = STEPS_3211,
+) -> Samples:
+    """Return a pattern of steps again and again, in random directions, with neutral pauses.
 
     Args:
         dt: sample time [s].
-        unit: length of the shortest step [s].
-        pause: neutral time between two of them [s].
+        step: length of the shortest step [s].
+        pause: neutral time between two patterns [s].
+        pattern: lengths [shortest steps] and levels.
     """
     # Random directions keep a vehicle without stability from drifting to one side.
     u = np.zeros(n)
-    # At least one sample, since a unit below the sample time would give steps of zero length.
-    step, rest = max(1, round(unit / dt)), max(1, round(pause / dt))
+    # At least one sample, since a step below the sample time would have no length.
+    shortest, rest = max(1, round(step / dt)), max(1, round(pause / dt))
     k = rest
     while k < n:
         sign = rng.choice([-1.0, 1.0])
-        for length, level in ((3, 1.0), (2, -1.0), (1, 1.0), (1, -1.0)):
-            u[k : k + length * step] = sign * level
-            k += length * step
+        for length, level in pattern:
+            u[k : k + length * shortest] = sign * level
+            k += length * shortest
         k += rest
     return u
 
 
-def chirp(n: int, dt: float, low: float, high: float) -> np.ndarray:
+def chirp(n: int, dt: float, low: float, high: float, fade: float = 0.0) -> Samples:
     """Return a sine whose frequency rises exponentially over the record.
 
     Args:
         dt: sample time [s].
         low: first frequency [Hz].
         high: last frequency [Hz].
+        fade: time in which the amplitude grows at the begin and falls at the end [s]. A sweep that
+            begins and ends in trim has the same spectrum as the response it excites.
     """
     # Each octave takes the same time, so the low end has a few long periods. The phase is the
     # integral of the frequency; sin(2 pi f(t) t) would exceed `high`.
     t = np.arange(n) * dt
     growth = np.log(high / low) / max(t[-1], dt)
-    return np.sin(2.0 * np.pi * low * np.expm1(growth * t) / growth)
+    u = np.sin(2.0 * np.pi * low * np.expm1(growth * t) / growth)
+    return u * np.clip(np.minimum(t, t[-1] - t) / fade, 0.0, 1.0) if fade else u
+
+
+_TAPS = {5: 3, 6: 5, 7: 6, 9: 5, 10: 7, 11: 9, 15: 14}
+"""Second tap of shift registers of maximum length, by their number of bits."""
+
+
+def prbs(n: int, dt: float, rng: np.random.Generator, step: float) -> Samples:
+    """Return a pseudo-random binary sequence of maximum length, from a random place in it.
+
+    Its spectrum is flat up to about 0.4 / step.
+
+    Args:
+        dt: sample time [s].
+        step: shortest time at a level [s].
+    """
+    length = max(1, round(step / dt))
+    count = -(-n // length)
+    bits = next((b for b in _TAPS if 2**b > count), max(_TAPS))
+    register = rng.integers(0, 2, bits)
+    register[0] |= not register.any()
+    levels = np.empty(count)
+    for k in range(count):
+        levels[k] = 1.0 - 2.0 * register[-1]
+        register = np.r_[register[-1] ^ register[_TAPS[bits] - 1], register[:-1]]
+    return np.repeat(levels, length)[:n]
+
+
+def multisine(
+    n: int,
+    dt: float,
+    rng: np.random.Generator,
+    band: tuple[float, float],
+    place: tuple[int, int] = (0, 1),
+) -> Samples:
+    """Return sines of equal amplitude at harmonics of the record, with a low crest factor.
+
+    Inputs that are excited together take turns in the harmonics, so they are orthogonal over the
+    record.
+
+    Args:
+        dt: sample time [s].
+        band: lowest and highest frequency [Hz].
+        place: place of this input among those that are excited together, and their number.
+
+    Raises:
+        ValueError: the band has no harmonic for this input.
+    """
+    own, number = place
+    first = max(1, int(np.ceil(band[0] * n * dt)))
+    last = min(int(band[1] * n * dt), (n - 1) // 2)
+    lines = np.arange(first + own, last + 1, number)
+    if not lines.size:
+        raise ValueError(
+            f"band: {band[0]:g} to {band[1]:g} Hz has no line for {number} inputs in "
+            f"{n * dt:g} s, expected a wider band or a longer record"
+        )
+    spectrum = np.zeros(n // 2 + 1, complex)
+    spectrum[lines] = np.exp(1j * least_crest(lines, rng))
+    u = np.fft.irfft(spectrum, n)
+    return u / np.max(np.abs(u))
+
+
+_POWERS = (4, 8, 16, 32, 64, 128, 256)
+_TRIES, _STEPS = 3, 50
+_FINE = 16
+"""Points in a period of the highest line."""
+
+
+def least_crest(lines: np.ndarray, rng: np.random.Generator) -> Float[np.ndarray, " k"]:
+    """Return phases (k,) [rad] of sines of equal amplitude with a low crest factor.
+
+    The norms of growing power approach the largest value. Each begins where the last one ended
+    (Guillaume and others, 1991).
+
+    Args:
+        lines: harmonics (k,) of the sines.
+    """
+    from scipy.optimize import minimize
+
+    size = _FINE * int(lines[-1])
+
+    def wave(phases: np.ndarray) -> np.ndarray:
+        spectrum = np.zeros(size // 2 + 1, complex)
+        spectrum[lines] = 0.5 * size * np.exp(1j * phases)
+        return np.fft.irfft(spectrum, size)
+
+    def norm(phases: np.ndarray, power: int) -> tuple[float, np.ndarray]:
+        """Return the norm of a wave and its derivatives by the phases."""
+        u = wave(phases)
+        top = np.max(np.abs(u))
+        mean = np.mean((u / top) ** power)
+        by_wave = np.fft.rfft((u / top) ** (power - 1))[lines] / size
+        slopes = -np.imag(np.exp(1j * phases) * np.conj(by_wave))
+        return top * mean ** (1.0 / power), mean ** (1.0 / power - 1.0) * slopes
+
+    k = np.arange(lines.size)
+    best, least = np.zeros(lines.size), np.inf
+    for attempt in range(_TRIES):
+        # First Schroeder's phases, which are good for lines beside each other.
+        phases = rng.uniform(0.0, 2.0 * np.pi, k.size) if attempt else -np.pi * k**2 / k.size
+        for power in _POWERS:
+            steps = {"maxiter": _STEPS}
+            phases = minimize(norm, phases, (power,), "L-BFGS-B", jac=True, options=steps).x
+        if (top := float(np.max(np.abs(wave(phases))))) < least:
+            best, least = phases, top
+    return best
+
+
+class Kind(NamedTuple):
+    """One excitation of the library."""
+
+    name: str
+    make: Callable[[int, float, np.random.Generator, Shape], Samples]
+    """Samples of a number, a sample time [s] and the settings."""
+    smooth: bool
+    """True for sines; a limited rate lowers their amplitude, but turns steps into ramps."""
+
+
+KINDS = (
+    Kind("random-steps", lambda n, dt, rng, s: random_steps(n, dt, rng, s.hold), smooth=False),
+    Kind("doublet", lambda n, dt, rng, s: multistep(n, dt, rng, s.step, s.pause, DOUBLET), False),
+    Kind("3-2-1-1", lambda n, dt, rng, s: multistep(n, dt, rng, s.step, s.pause), smooth=False),
+    Kind("prbs", lambda n, dt, rng, s: prbs(n, dt, rng, s.step), smooth=False),
+    Kind("chirp", lambda n, dt, rng, s: chirp(n, dt, *s.band, s.fade), smooth=True),
+    Kind("multisine", lambda n, dt, rng, s: multisine(n, dt, rng, s.band, s.place), smooth=True),
+    Kind("neutral", lambda n, dt, rng, s: np.zeros(n), smooth=False),
+)
+"""All excitations. To add one: a function and its entry."""
+
+
+def excitation(
+    kind: str,
+    n: int,
+    dt: float,
+    rng: np.random.Generator,
+    shape: Shape,
+    *,
+    amplitude: float = 1.0,
+    rate: float = np.inf,
+) -> Samples:
+    """Return an excitation within limits.
+
+    Args:
+        kind: name in `KINDS`.
+        n: number of samples.
+        dt: sample time [s].
+        amplitude: largest deflection.
+        rate: largest rate of change [deflection/s].
+
+    Raises:
+        ValueError: an unknown kind, or a band without a line.
+    """
+    found = next((k for k in KINDS if k.name == kind), None)
+    if found is None:
+        raise ValueError(f"kind: got {kind!r}, expected one of {', '.join(k.name for k in KINDS)}")
+    u = amplitude * found.make(n, dt, rng, shape)
+    fastest = float(np.max(np.abs(np.diff(u)), initial=0.0)) / dt
+    if fastest <= rate:
+        return u
+    return u * (rate / fastest) if found.smooth else _slewed(u, rate * dt)
+
+
+def _slewed(u: Samples, most: float) -> Samples:
+    """Return steps (N,) as ramps of at most `most` in a sample."""
+    at, out = float(u[0]), np.empty(u.size)
+    for k, x in enumerate(u.tolist()):
+        at = min(max(x, at - most), at + most)
+        out[k] = at
+    return out

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from heli_jax.simulation.inputs import chirp, multistep_3211, random_steps
+from heli_jax.simulation.inputs import chirp, multistep, random_steps
 
 
 def lengths(u):
@@ -25,7 +25,7 @@ def test_random_steps(dt):
 
 
 def test_3211():
-    u = multistep_3211(1000, 0.02, np.random.default_rng(0), 0.1, 1.0)
+    u = multistep(1000, 0.02, np.random.default_rng(0), 0.1, 1.0)
     assert set(np.unique(u)) == {-1.0, 0.0, 1.0}
     assert list(lengths(u)[:6]) == [50, 15, 10, 5, 5, 50]
     first = u[50:85]

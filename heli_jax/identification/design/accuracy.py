@@ -33,7 +33,7 @@ from heli_jax.identification.unknowns.layout import (
     layout_of,
 )
 from heli_jax.identification.unknowns.transforms import scale
-from heli_jax.simulation.inputs import chirp, multistep_3211
+from heli_jax.simulation.inputs import chirp, multistep
 
 
 def triangle(s: Sensitivity) -> Float[np.ndarray, "s s"]:
@@ -214,7 +214,7 @@ def _candidates(flight: Flight, m: int) -> list[Candidate]:
                 doublets = amplitude * np.array([1.0, -1.0, 0.0])[phase]
                 candidates.append(Candidate(name, f"doublets, {step:g} s a side", doublets))
             if 8 * step <= m * flight.dt:
-                steps = amplitude * multistep_3211(m, flight.dt, rng, step, step)
+                steps = amplitude * multistep(m, flight.dt, rng, step, step)
                 candidates.append(Candidate(name, f"3-2-1-1 steps of {step:g} s", steps))
         low, high = max(_BAND[0], 1.0 / (m * flight.dt)), min(_BAND[1], 0.1 / flight.dt)
         if high > 2 * low:

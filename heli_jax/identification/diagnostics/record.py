@@ -14,6 +14,7 @@ from heli_jax.flights.flight import labels
 from heli_jax.flights.signal_facts import DROP_SHARE, RAIL_SHARE, STUCK_SECONDS
 from heli_jax.identification.design.accuracy import plan_next_flight, unstated_gusts
 from heli_jax.identification.diagnostics.context import Context
+from heli_jax.identification.diagnostics.outliers import outliers
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import unpack
 from heli_jax.identification.validation.excitation import LEVEL
@@ -23,7 +24,6 @@ from heli_jax.identification.validation.logging_rate import (
     power_between_samples,
     rates_against_modes,
 )
-from heli_jax.identification.validation.outliers import outliers
 from heli_jax.identification.validation.shifts import SHIFT, shift_in_time
 
 _CUT_OFF = 0.02
@@ -110,12 +110,12 @@ def outlying_residuals(c: Context) -> Iterator[Finding]:
     """Find single samples far from the fitted response, and the estimates without them."""
     if not (c.at_optimum and c.explains) or c.at.layout.noise_model == "spectrum":
         return
-    for one in outliers(c.at, c.e):
+    for one in outliers(c.problem, c.at, c.e):
         yield found(
             "quality.outliers",
             "doubt",
             one.output,
-            value=float(one.count),
+            value=float(one.values.size),
             shifts=one.shifts,
             percent=100.0 * one.share,
             low=one.values.min(),

@@ -91,7 +91,7 @@ def shift_in_time(
         there = _moved(there, kind, name, place * dt)
     first = max(places.values(), key=abs)
     names = tuple(n for n, place in places.items() if place * first > 0)
-    gain, moved = found[kind, best][1], change_with(at, e, there)
+    gain, moved = found[kind, best][1], _change(at, e, *_rows(at, there))
     late = "response" if kind == "input" and first > 0 else kind
     return Shift(late, names, abs(first) * dt, gain, moved)
 
@@ -197,9 +197,8 @@ def _correlated(block: int, left: np.ndarray, r: np.ndarray) -> float:
     return max(1.0, float(sums @ sums) / power)
 
 
-def change_with(at: Solution, e: Evaluation, data: Data) -> dict[str, float]:
-    """Return by parameter the change of its estimate with other data, to first order [SI]."""
-    r, J = _rows(at, data)
+def _change(at: Solution, e: Evaluation, r: np.ndarray, J: np.ndarray) -> dict[str, float]:
+    """Return by parameter the change of its estimate for rows r (n,) of slopes J (n, q) [SI]."""
     # One Gauss-Newton step from the optimum, less the step that the optimiser left.
     step = pseudoinverse(e.J) @ e.r - pseudoinverse(J) @ r
     change = step[: len(e.slopes)] * np.asarray(e.slopes)
