@@ -49,11 +49,6 @@ class Simulated(NamedTuple):
     notes: tuple[Finding, ...]
     """Notes on the runs."""
 
-    @property
-    def whole(self) -> bool:
-        """True if the full nonlinear helicopter was simulated."""
-        return is_full_nonlinear(self.model)
-
 
 def _stick_inputs(
     experiment: Experiment, settings: SimulateConfig, n: int, rng: np.random.Generator, where: str

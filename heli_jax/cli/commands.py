@@ -120,7 +120,7 @@ _COMMANDS = {
         *_CONFIG,
         _arg("--out", metavar="FILE", help=".csv or .parquet (default: CSV on stdout)"),
         _arg("--view", nargs="?", const="", metavar="HTML",
-             help="also a page with figures and the flight in 3D (default: beside --out)"),
+             help="also a page with figures (default: beside --out)"),
     )),
     "sweep": ("run a design of many vehicles; results in a Zarr store", (
         *_CONFIG, _OUT, _RESUME, *_WORKERS,
@@ -513,8 +513,7 @@ def _simulate(options: argparse.Namespace) -> int:
         options.say(f"wrote {len(next(iter(simulated.columns.values())))} samples to {out}")
     if view is not None:
         simulations.write_view(view, experiment, simulated, out)
-        whole = "" if simulated.whole else ", figures only: 3D needs the whole helicopter"
-        options.say(f"wrote {view}{whole}")
+        options.say(f"wrote {view}")
     return DONE
 
 

@@ -52,13 +52,13 @@ def write_view(
     from heli_jax.report.origin import origin
     from heli_jax.report.view import write_view as write
 
-    title, params = experiment.path.stem, experiment.vehicle.params
+    title = experiment.path.stem
     # Paths are relative to the page, so that both can be moved together.
     files = (Path(os.path.relpath(p, out.parent)) for p in (experiment.path, table) if p)
     made = origin(as_yaml(configuration.resolved(experiment)), tuple(p.as_posix() for p in files))
     notes = sentences(simulated.notes)
     with run_directory.whole_file(out, f"--view {out}") as temporary:
-        write(temporary, simulated.runs, simulated.model, params, title, notes, made)
+        write(temporary, simulated.runs, simulated.model, title, notes, made)
 
 
 def print_sweep(out: Path) -> None:

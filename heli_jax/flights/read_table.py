@@ -2,8 +2,7 @@
 
 A table usually is a log of one topic. In an outer join, as PlotJuggler, MAVExplorer and pandas
 write it, each row holds the values of one topic and other cells are empty. Columns that are filled
-in the same rows are then a topic, with the clock of these rows. A join that was filled forward is
-recognised by its repeated values (`repeats.carried_on`).
+in the same rows are then a topic, with the clock of these rows.
 """
 
 import itertools

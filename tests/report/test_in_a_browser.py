@@ -10,7 +10,6 @@ import pytest
 from heli_jax.report.fit_page import Analysis, write_report
 from heli_jax.report.origin import origin
 from heli_jax.report.view import write_view
-from heli_jax.vehicle import load_vehicle
 from tests.report.browser import CHROMIUM, browser
 from tests.report.conftest import SCRIPT
 from tests.report.test_view import HELICOPTER, flown
@@ -36,12 +35,11 @@ def report(sound, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def view(tmp_path_factory, vehicles_folder):
+def view(tmp_path_factory):
     t = 0.02 * np.arange(1500)
     run = flown(1500, x=2.0 * t, y=3.0 * np.sin(t), z=1.0 + 0.1 * t, phi=0.3 * np.sin(t))
     path = tmp_path_factory.mktemp("view") / "view.html"
-    xcell = load_vehicle(vehicles_folder / "x-cell-60.yaml")
-    write_view(path, {SCRIPT: run}, HELICOPTER, xcell, f"view {SCRIPT}")
+    write_view(path, {SCRIPT: run}, HELICOPTER, f"view {SCRIPT}")
     return path
 
 
@@ -180,50 +178,6 @@ def test_a_copied_table_is_numbers_to_a_spreadsheet(window, report):
         ["x", "-1.2e-3", "0.1e-3", "6", "5", "7", "1 Hz", "8.7", "deg", "1 of 2"],
         ["y", "not determined", "", "", "", "", "", "2", "m/s", "3"],
     ]
-
-
-def test_a_flight_plays_and_pauses_by_keys_and_shares_its_time(window, view):
-    window.size(1200)
-    window.open(view)
-    window.value("document.querySelector('[data-role=speed]').value = '10'")
-    # Also without focus: the page says that space plays, so it must not scroll.
-    window.value("document.activeElement.blur()")
-    window.press(" ")
-    window.until("heliFlights[0].time > 0 && heliFlights[0].playing")
-    window.press(" ")
-    assert window.value("heliFlights[0].playing") == 0
-    assert window.value("scrollY") == 0
-    window.value("document.querySelector('canvas').focus()")
-    window.press(" ")
-    window.until("heliFlights[0].time > 1 && heliFlights[0].playing")
-    window.press(" ")
-    assert window.value("heliFlights[0].playing") == 0
-    # The button too, by a key, and the slider.
-    window.value("document.querySelector('[data-role=play]').focus()")
-    window.press("Enter")
-    window.value("document.querySelector('[data-role=time]').focus()")
-    window.press("ArrowRight")
-    assert window.value("heliFlights[0].playing") == 0
-    time = window.value("heliFlights[0].time")
-    cursors = window.value(
-        "heliCharts.groups.get('time [s]').map(u => u.posToVal(u.cursor.left, 'x'))"
-    )
-    assert cursors == pytest.approx([time] * len(cursors), abs=0.1)
-    # From the figures to the flight.
-    plot = "heliCharts.groups.get('time [s]')[0]"
-    window.value(f"{plot}.root.scrollIntoView({{block: 'center'}})")
-    x, y = window.value(
-        f"(r => [r.x + r.width / 2, r.y + 20])({plot}.over.getBoundingClientRect())"
-    )
-    window.mouse("Moved", x, y)
-    assert window.value("heliFlights[0].time") == pytest.approx(0.5 * 29.98, abs=0.1)
-    # The vehicle moves on the canvas.
-    shown = [
-        window.value(f"heliFlights[0].show({t}) || document.querySelector('canvas').toDataURL()")
-        for t in (0, 20)
-    ]
-    assert shown[0] != shown[1]
-    assert not window.problems
 
 
 def test_all_of_it_is_printed(window, report):
