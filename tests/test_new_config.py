@@ -11,7 +11,6 @@ from heli_jax.config import read_flights
 from heli_jax.config.problems import problem
 from heli_jax.config.schema import Config
 from heli_jax.errors import InputError
-from heli_jax.flights.log import ChannelLog, Topic
 from heli_jax.new_config import tables, write_config
 from heli_jax.new_config.guess import (
     Series,
@@ -21,7 +20,6 @@ from heli_jax.new_config.guess import (
     without_unit,
     words_of,
 )
-from heli_jax.new_config.model_choice import other_vehicle
 from heli_jax.new_config.rate import channels_of_preset, common_rate
 from heli_jax.new_config.scales import scaled
 from heli_jax.new_config.signals import is_place
@@ -296,41 +294,6 @@ def test_no_stick_tilts_a_blade_by_a_radian(most: float, unit: str, scale: float
     series = Series(np.arange(50.0), np.linspace(-most, most, 50))
     found = scaled("aileron", series, "rad", is_input=True)
     assert (found.unit, found.scale) == (unit, scale)
-
-
-@pytest.mark.parametrize(
-    ("kind", "firmware", "parameters", "is_other"),
-    [
-        ("dataflash", "ArduPlane V4.3", {"Q_ENABLE": 0.0}, True),
-        ("dataflash", "ArduPlane V4.3", {"Q_ENABLE": 1.0}, True),
-        ("dataflash", "ArduCopter V4.5.1", {"FRAME_CLASS": 1.0}, True),
-        ("dataflash", "ArduCopter V4.5.1", {"FRAME_CLASS": 6.0, "H_SW_TYPE": 3.0}, False),
-        ("dataflash", "ArduCopter V3.1 (heli)", {"FRAME": 0.0}, False),
-        ("dataflash", "ArduCopter V3.1", {"FRAME": 1.0, "RATE_RLL_P": 0.1}, True),
-        ("dataflash", "", {}, False),
-        ("ulog", "PX4 A", {"MAV_TYPE": 22}, True),
-        ("ulog", "PX4 A", {"MAV_TYPE": 2, "CA_AIRFRAME": 10}, False),
-        ("ulog", "PX4 A", {"MAV_TYPE": 4}, False),
-        ("ulog", "PX4 A", {"CA_AIRFRAME": 0}, True),
-        ("ulog", "PX4 A", {}, False),
-        ("blackbox", "Betaflight 4.4.0", {}, True),
-        ("blackbox", "Rotorflight 4.3.0", {}, False),
-    ],
-)
-def test_what_vehicle_a_log_is_of(kind: str, firmware: str, parameters, is_other: bool) -> None:
-    motors = {f"motor[{i}]": np.zeros(9) for i in range(4)}
-    topics = (Topic("main", np.arange(9.0), motors, {}, "time"),)
-    log = ChannelLog("a", kind, 1, "0", topics, firmware, parameters)
-    assert bool(other_vehicle(log)) == is_other
-
-
-@pytest.mark.parametrize(("name", "values", "is_other"), [
-    ("vehicle_type", (0, 2), True), ("is_vtol", (1, 1), True), ("vehicle_type", (0, 1), False),
-])  # fmt: skip
-def test_px4_says_what_vehicle_it_is(name: str, values, is_other: bool) -> None:
-    columns = {f"vehicle_status.{name}": np.array(values)}
-    topics = (Topic("vehicle_status", np.arange(2.0), columns, {}, "timestamp"),)
-    assert bool(other_vehicle(ChannelLog("a", "ulog", 1, "0", topics))) == is_other
 
 
 def test_sticks_that_count_to_their_stops() -> None:
