@@ -46,8 +46,6 @@ class Panel(NamedTuple):
     """Height [inch]."""
     levels: tuple[float, ...] = ()
     """Horizontal lines."""
-    shades: tuple[tuple[float, float], ...] = ()
-    """Shaded ranges of x."""
     logarithmic: bool = False
 
 

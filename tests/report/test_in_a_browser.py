@@ -9,10 +9,8 @@ import pytest
 
 from heli_jax.report.fit_page import Analysis, write_report
 from heli_jax.report.origin import origin
-from heli_jax.report.view import write_view
 from tests.report.browser import CHROMIUM, browser
 from tests.report.conftest import SCRIPT
-from tests.report.test_view import HELICOPTER, flown
 
 pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine"),
@@ -32,15 +30,6 @@ def report(sound, tmp_path_factory):
     made = origin(f"a: {SCRIPT} {'long' * 60}", ("config.yaml", "fit.json", "signals.csv"))
     write_report(folder, Analysis(*sound), f"bench {SCRIPT}", {}, made)
     return folder / "report.html"
-
-
-@pytest.fixture(scope="module")
-def view(tmp_path_factory):
-    t = 0.02 * np.arange(1500)
-    run = flown(1500, x=2.0 * t, y=3.0 * np.sin(t), z=1.0 + 0.1 * t, phi=0.3 * np.sin(t))
-    path = tmp_path_factory.mktemp("view") / "view.html"
-    write_view(path, {SCRIPT: run}, HELICOPTER, f"view {SCRIPT}")
-    return path
 
 
 def over_time(window):
@@ -73,20 +62,18 @@ def drag(window, plot, start, end):
 
 @pytest.mark.parametrize("width", [1200, 400])
 @pytest.mark.parametrize("dark", [False, True])
-def test_nothing_overlaps_and_nothing_fails(window, report, view, width, dark):
+def test_nothing_overlaps_and_nothing_fails(window, report, width, dark):
     window.size(width)
     window.dark(dark)
-    for page in (report, view):
-        window.open(page)
-        window.value("new Promise(requestAnimationFrame)")
-        wide, seen = window.value("(d => [d.scrollWidth, d.clientWidth])(document.documentElement)")
-        assert wide <= seen == width
-        assert not window.problems
-        paper = window.value("getComputedStyle(document.body).backgroundColor")
-        assert (sum(map(int, re.findall(r"\d+", paper))) < 200) == dark
-        assert window.value("document.querySelectorAll('figure.drawn canvas').length") >= 2
-    # A table wider than the page scrolls, with a hint until its end.
     window.open(report)
+    window.value("new Promise(requestAnimationFrame)")
+    wide, seen = window.value("(d => [d.scrollWidth, d.clientWidth])(document.documentElement)")
+    assert wide <= seen == width
+    assert not window.problems
+    paper = window.value("getComputedStyle(document.body).backgroundColor")
+    assert (sum(map(int, re.findall(r"\d+", paper))) < 200) == dark
+    assert window.value("document.querySelectorAll('figure.drawn canvas').length") >= 2
+    # A table wider than the page scrolls, with a hint until its end.
     table = "document.querySelector('[aria-label=Estimates]')"
     more = f"{table}.classList.contains('more')"
     window.until(f"{more} === ({table}.scrollWidth > {table}.clientWidth + 2)")

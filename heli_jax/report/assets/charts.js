@@ -110,11 +110,6 @@
     ctx.beginPath();
     ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
     ctx.clip();
-    ctx.fillStyle = "#e69f0038";
-    for (const [a, b] of panel.shades) {
-      const left = u.valToPos(a, "x", true);
-      ctx.fillRect(left, bbox.top, u.valToPos(b, "x", true) - left, bbox.height);
-    }
     ctx.lineWidth = ratio;
     ctx.setLineDash([4 * ratio, 3 * ratio]);
     ctx.strokeStyle = style("--strong");
