@@ -11,6 +11,7 @@ from heli_jax.config import read_flights
 from heli_jax.config.problems import problem
 from heli_jax.config.schema import Config
 from heli_jax.errors import InputError
+from heli_jax.flights.log import ChannelLog, Topic
 from heli_jax.new_config import tables, write_config
 from heli_jax.new_config.guess import (
     Series,
@@ -20,6 +21,7 @@ from heli_jax.new_config.guess import (
     without_unit,
     words_of,
 )
+from heli_jax.new_config.model_choice import other_vehicle
 from heli_jax.new_config.rate import channels_of_preset, common_rate
 from heli_jax.new_config.scales import scaled
 from heli_jax.new_config.signals import is_place
@@ -294,6 +296,27 @@ def test_no_stick_tilts_a_blade_by_a_radian(most: float, unit: str, scale: float
     series = Series(np.arange(50.0), np.linspace(-most, most, 50))
     found = scaled("aileron", series, "rad", is_input=True)
     assert (found.unit, found.scale) == (unit, scale)
+
+
+@pytest.mark.parametrize(
+    ("firmware", "parameters", "is_other"),
+    [
+        ("ArduPlane V4.3", {"Q_ENABLE": 1.0}, True),
+        ("ArduCopter V4.5.1", {"FRAME_CLASS": 1.0}, True),
+        ("ArduCopter V4.5.1", {"FRAME_CLASS": 6.0, "H_SW_TYPE": 3.0}, False),
+        ("ArduCopter V3.1 (heli)", {"FRAME": 0.0}, False),
+        ("", {}, False),
+        ("PX4 A", {"MAV_TYPE": 22}, True),
+        ("PX4 A", {"MAV_TYPE": 2, "CA_AIRFRAME": 10}, False),
+        ("PX4 A", {"MAV_TYPE": 4}, False),
+        ("PX4 A", {"CA_AIRFRAME": 0}, True),
+        ("Rotorflight 4.3.0", {}, False),
+    ],
+)
+def test_what_vehicle_a_log_is_of(firmware: str, parameters, is_other: bool) -> None:
+    topics = (Topic("main", np.arange(9.0), {"x": np.zeros(9)}, {}, "time"),)
+    log = ChannelLog("a", "any", 1, "0", topics, firmware, parameters)
+    assert bool(other_vehicle(log)) == is_other
 
 
 def test_sticks_that_count_to_their_stops() -> None:

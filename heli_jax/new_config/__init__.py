@@ -11,7 +11,7 @@ from heli_jax.flights.preset import fitting_presets
 from heli_jax.linear_models import read as linear_models
 from heli_jax.new_config import tables, text
 from heli_jax.new_config.logs import Log, read_log
-from heli_jax.new_config.model_choice import chosen_model, other_models
+from heli_jax.new_config.model_choice import chosen_model, other_models, other_vehicle
 from heli_jax.new_config.rate import channels_of_preset, common_rate, rate_of_outputs
 from heli_jax.new_config.signals import (
     rate_by_angle,
@@ -109,6 +109,9 @@ def write_config(
             "{signal: EDIT} by {constant: 0} if the stick was not moved"
         )
         notes.append(note("channels.lacking", words, *lacking))
+    if vehicle_of_log := other_vehicle(read.autopilot):
+        words = f"the log is of {vehicle_of_log}: check that the model fits it"
+        notes.append(note("model.other-vehicle", words))
     if others:
         assert isinstance(chosen.name, dict)
         words = (

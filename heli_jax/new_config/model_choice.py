@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from heli_jax import models
-from heli_jax.flights.log import shown, wrong
+from heli_jax.flights.log import ChannelLog, shown, wrong
 from heli_jax.flights.preset import fitting_presets
 from heli_jax.linear_models import read as linear_models
 from heli_jax.new_config import guess, tables
@@ -23,6 +23,10 @@ _AXES = {
 _UNITS = {"roll": "rad", "pitch": "rad", "down_speed": "m/s"} | dict.fromkeys(
     ("roll_rate", "pitch_rate", "yaw_rate"), "rad/s"
 )
+_OTHER_FIRMWARE = ("ArduPlane", "ArduRover", "Rover", "Blimp", "ArduSub", "APM:Plane", "APM:Rover")
+"""Names of ArduPilot firmware for other vehicles."""
+_HELICOPTERS = {"FRAME_CLASS": (0, 6, 11, 13), "CA_AIRFRAME": (10, 11, 12), "MAV_TYPE": (0, 3, 4)}
+"""Values for helicopters, and 0 for none, of settings of ArduPilot and PX4 by their rank."""
 _FULL_TRAVEL = 1.5
 """Largest value of a stick in parts of full travel; radios may exceed 1."""
 
@@ -38,6 +42,11 @@ def chosen_model(
         folder: folder of the configuration.
     """
     if name is None:
+        vehicle = other_vehicle(log.autopilot)
+        if vehicle:
+            problem = f"the log is of {vehicle}, and new chooses only helicopter models"
+            remedy = "expected --model NAME, such as linear:FILE.yaml, a model file of your own"
+            raise wrong(path, f"{problem}; {remedy}")
         name = _by_moving_stick(log, path)
     # For roll and pitch there are the paper's model and a linear one: {linear: roll} is the latter.
     stated = name.strip().removeprefix("{").removesuffix("}")
@@ -47,6 +56,18 @@ def chosen_model(
     if not linear and (not file or stated in ("roll", "pitch")):
         return models.by_name(stated, "--model", folder), stated, False
     return linear_models.linear_model(stated).model, {"linear": stated}, True
+
+
+def other_vehicle(log: ChannelLog | None) -> str:
+    """Return why an autopilot's log is of no helicopter; empty if it may be of one."""
+    if log is None:
+        return ""
+    if log.firmware.startswith(_OTHER_FIRMWARE):
+        return f"no helicopter ({log.firmware})"
+    name = next((n for n in _HELICOPTERS if n in log.parameters), None)
+    if name is None or log.parameters[name] in _HELICOPTERS[name]:
+        return ""
+    return f"no helicopter ({name} {log.parameters[name]})"
 
 
 def _by_moving_stick(log: Log, path: str) -> str:

@@ -1,10 +1,12 @@
 """`heli-jax new` for autopilot logs: filters from their settings, and the grid's rate."""
 
 import numpy as np
+import pytest
 import yaml
 
 from heli_jax import cli
 from heli_jax.config import load, read_flights
+from heli_jax.errors import InputError
 from heli_jax.new_config import write_config
 
 from . import log_writers as writers
@@ -110,3 +112,13 @@ def test_rows_without_times_are_refused_by_new_and_described(tmp_path):
     for model in ([], ["--model", "roll-flybarless"]):
         assert cli.main(["new", str(log), "--out", str(tmp_path / "new.yaml"), *model]) == 2
     assert cli.main(["info", str(log)]) == 0
+
+
+def test_no_rotor_is_written_for_another_vehicle(tmp_path):
+    log = px4_log(tmp_path / "flight.ulg", [("MAV_TYPE", 22)])
+    out = tmp_path / "new.yaml"
+    with pytest.raises(InputError):
+        write_config(log, out)
+    assert not out.exists()
+    write_config(log, out, "linear:roll")
+    assert out.exists()
