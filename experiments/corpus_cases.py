@@ -1,6 +1,7 @@
 """Cases of corpus.py, with names, the right answers, and groups that share compiled programs."""
 
 import contextlib
+import csv
 import functools
 import io
 import json
@@ -117,23 +118,37 @@ SEVERITIES = ("refuse", "doubt", "note")
 
 def frf_config(config: Path, *more: str) -> Result:
     """Run `heli-jax frf`; keep gain, phase and coherence of each response at three frequencies."""
-    import xarray as xr
-
     ended, names = command("frf", config, "--out", "frf", *more), names_of(config)
-    found = sorted(Path("frf").glob("**/responses.nc"))
+    found = sorted(Path("frf").glob("**/responses.csv"))
     if not found:
         return refused(ended, names)
+    pairs: dict[tuple[str, str], list[dict[str, str]]] = {}
+    with found[0].open(newline="") as file:
+        for row in csv.DictReader(file):
+            pairs.setdefault((row["output"], row["input"]), []).append(row)
+
+    def column(rows: list[dict[str, str]], name: str) -> np.ndarray:
+        return np.array([float(row[name] or "nan") for row in rows])
+
+    by_output = {output: rows for (output, _), rows in reversed(pairs.items())}
+    outputs = list(reversed(by_output.values()))
+    gains = [column(rows, "gain") for rows in pairs.values()]
+    angles = [np.radians(column(rows, "phase_deg")) for rows in pairs.values()]
+    errors = [np.radians(column(rows, "phase_sd_deg")) for rows in pairs.values()]
+    variables = {
+        "real": [a * np.cos(b) for a, b in zip(gains, angles, strict=True)],
+        "imaginary": [a * np.sin(b) for a, b in zip(gains, angles, strict=True)],
+        "sd": [a * b for a, b in zip(gains, errors, strict=True)],
+        "coherence": [column(rows, "coherence") for rows in pairs.values()],
+        "multiple_coherence": [column(rows, "multiple_coherence") for rows in outputs],
+        "half95": [np.array([column(rows, "half95_in_sd")[0] for rows in outputs])],
+    }
     numbers: dict[str, Any] = {}
-    with xr.open_dataset(found[0]) as data:
-        for variable in data.data_vars:
-            values = np.asarray(data[variable].values)
-            if values.dtype.kind != "f" or not values.size:
-                continue
-            rows = values.reshape(-1, values.shape[-1]) if values.ndim else values.reshape(1, 1)
-            for i, row in enumerate(rows[:4]):
-                seen = row[np.isfinite(row)]
-                for at in (0.25, 0.5, 0.75) if seen.size else ():
-                    numbers[f"{variable} {i} {at}"] = float(seen[int(at * (seen.size - 1))])
+    for variable, each in variables.items():
+        for i, row in enumerate(each[:4]):
+            seen = row[np.isfinite(row)]
+            for at in (0.25, 0.5, 0.75) if seen.size else ():
+                numbers[f"{variable} {i} {at}"] = float(seen[int(at * (seen.size - 1))])
     notes = [code_of(n, names) for n in ended.notes]
     return {"exit": ended.code, "codes": coded([], [], notes), "numbers": numbers}
 
@@ -339,9 +354,6 @@ def _written(path: Path, x: Mapping[str, np.ndarray]) -> None:
             pyarrow.parquet.write_table(pa.table(dict(x)), path)
         case ".feather":
             pyarrow.feather.write_feather(pa.table(dict(x)), path)
-        case ".jsonl":
-            rows = [json.dumps(dict(zip(x, row, strict=True))) for row in table]
-            path.write_text("\n".join(rows) + "\n")
         case ".mat":
             scipy.io.savemat(path, {n: v[:, None] for n, v in x.items()})
         case ".nc":
@@ -378,7 +390,7 @@ def _format(suffix: str, folder: Path) -> Result:
 
 
 FORMATS = (
-    ".csv", ".parquet", ".feather", ".jsonl", ".mat", ".nc", ".h5", ".npz", ".ulg", ".bin", ".log",
+    ".csv", ".parquet", ".feather", ".mat", ".nc", ".h5", ".npz", ".ulg", ".bin", ".log",
     ".bbl",
 )  # fmt: skip
 _LOGS = (

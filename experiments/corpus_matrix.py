@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from corpus import Result, differences, run_entries
 
-_IDENTIFICATION, _FLIGHTS = "heli_jax.identification", "heli_jax.flights"
+_IDENTIFICATION = "heli_jax.identification"
 _VALIDATION = f"{_IDENTIFICATION}.validation"
 
 
@@ -46,7 +46,6 @@ ABLATIONS: tuple[Ablation, ...] = (
         f"{_IDENTIFICATION}.estimation.noise_scales:first_corrections",
         lambda problem: (),
     ),
-    Ablation("strays", f"{_FLIGHTS}.marks:strays", lambda *_: ()),
     Ablation(
         "swapped_modes",
         f"{_IDENTIFICATION}.identifiability.equivalents:second_solutions",

@@ -42,17 +42,10 @@ class Simulated(NamedTuple):
 
     columns: dict[str, np.ndarray]
     """Commanded inputs. With delays in the model they act later."""
-    model: Model
-    """Simulated model, with wind if there is any, and without the disturbance."""
     runs: dict[str, Trajectory]
     """Noise-free runs by name, in SI, as NumPy arrays."""
     notes: tuple[Finding, ...]
     """Notes on the runs."""
-
-    @property
-    def whole(self) -> bool:
-        """True if the full nonlinear helicopter was simulated."""
-        return is_full_nonlinear(self.model)
 
 
 def _stick_inputs(
@@ -155,7 +148,7 @@ def generate(experiment: Experiment) -> Simulated:
     logged = {k: np.asarray(commanded[k])[: run.times.size] for k in driven}
     columns = _as_logged(experiment, np.asarray(run.times), logged, outputs)
     notes = (*notes, *_held_notes(experiment, logged))
-    return Simulated(columns, flown.model, {experiment.path.stem: run}, notes)
+    return Simulated(columns, {experiment.path.stem: run}, notes)
 
 
 class Made(NamedTuple):
@@ -403,7 +396,7 @@ def follow(experiment: Experiment) -> Simulated:
             reason = reason or f"the run is not finite from {_diverged_at(run):g} s on"
             notes.append(Finding("simulation.diverged", "doubt", f"{flight.name}: {reason}"))
     columns = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
-    return Simulated(columns, model, runs, tuple(notes))
+    return Simulated(columns, runs, tuple(notes))
 
 
 def _as_logged(

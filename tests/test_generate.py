@@ -136,16 +136,3 @@ def test_a_shipped_manoeuvre_from_the_command_line(tmp_path):
     slope = np.gradient(table["phi"], table["t"])
     assert np.corrcoef(slope, table["p"])[0, 1] > 0.9
     assert 5 < np.ptp(table["phi"]) < 60
-
-
-def test_a_page_from_the_command_line(tmp_path, capfd):
-    config = ROOT / "configs" / "bench-roll.yaml"
-    out = tmp_path / "bench.csv"
-    short = ["--set", "simulate.duration=5"]
-    assert main(["simulate", str(config), *short, "--out", str(out), "--view"]) == 0
-    assert {p.name for p in tmp_path.iterdir()} == {"bench.csv", "bench.html"}
-    other = tmp_path / "there" / "page.html"
-    assert main(["simulate", str(config), *short, "--view", str(other)]) == 0
-    assert other.exists()
-    assert capfd.readouterr().out.count("\n") == 501
-    assert main(["simulate", str(config), "--view", str(tmp_path / "page.pdf")]) == 2

@@ -119,8 +119,6 @@ _COMMANDS = {
     "simulate": ("simulate the configuration's run, or its flights", (
         *_CONFIG,
         _arg("--out", metavar="FILE", help=".csv or .parquet (default: CSV on stdout)"),
-        _arg("--view", nargs="?", const="", metavar="HTML",
-             help="also a page with figures and the flight in 3D (default: beside --out)"),
     )),
     "sweep": ("run a design of many vehicles; results in a Zarr store", (
         *_CONFIG, _OUT, _RESUME, *_WORKERS,
@@ -486,16 +484,9 @@ def _simulate(options: argparse.Namespace) -> int:
     out = Path(options.out) if options.out else None
     if out is not None and out.suffix.lower() not in (".csv", ".parquet"):
         raise InputError(f"--out {out}: expected a name ending in .csv or .parquet")
-    view = None
-    if options.view is not None:
-        page = (out or Path(Path(options.config).name)).with_suffix(".html")
-        view = Path(options.view) if options.view else page
-        if view.suffix.lower() not in (".html", ".htm"):
-            raise InputError(f"--view {view}: expected a name ending in .html")
-    # Check both places before the simulation.
-    for option, place in (("--out", out), ("--view", view)):
-        if place is not None:
-            run_directory.require_place(place, f"{option} {place}")
+    # Check the place before the simulation.
+    if out is not None:
+        run_directory.require_place(out, f"--out {out}")
     _prepare_jax()
     from heli_jax import config as configuration
     from heli_jax import generate
@@ -511,10 +502,6 @@ def _simulate(options: argparse.Namespace) -> int:
     simulations.write_table(out, simulated.columns)
     if out is not None:
         options.say(f"wrote {len(next(iter(simulated.columns.values())))} samples to {out}")
-    if view is not None:
-        simulations.write_view(view, experiment, simulated, out)
-        whole = "" if simulated.whole else ", figures only: 3D needs the whole helicopter"
-        options.say(f"wrote {view}{whole}")
     return DONE
 
 

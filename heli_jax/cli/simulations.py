@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 import sys
 from collections import Counter
 from pathlib import Path
@@ -10,18 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from heli_jax import config as configuration
 from heli_jax import run_directory
 from heli_jax.cli.terminal import print_table, print_text
-from heli_jax.finding import sentences
 from heli_jax.flights import write as tables
 from heli_jax.numbers import rounded, terse
-from heli_jax.yaml_file import as_yaml
 
 if TYPE_CHECKING:
     import xarray as xr
-
-    from heli_jax.generate import Simulated
 
 
 def write_table(out: Path | None, columns: dict[str, np.ndarray]) -> None:
@@ -35,30 +29,6 @@ def write_table(out: Path | None, columns: dict[str, np.ndarray]) -> None:
         return
     with run_directory.whole_file(out, f"--out {out}") as temporary:
         tables.write_table(temporary, columns)
-
-
-def write_view(
-    out: Path,
-    experiment: configuration.Experiment,
-    simulated: "Simulated",
-    table: Path | None = None,
-) -> None:
-    """Write the page of simulated runs at `out`, complete or not at all.
-
-    Raises:
-        InputError: the place cannot be written to.
-    """
-    # No other command needs the page.
-    from heli_jax.report.origin import origin
-    from heli_jax.report.view import write_view as write
-
-    title, params = experiment.path.stem, experiment.vehicle.params
-    # Paths are relative to the page, so that both can be moved together.
-    files = (Path(os.path.relpath(p, out.parent)) for p in (experiment.path, table) if p)
-    made = origin(as_yaml(configuration.resolved(experiment)), tuple(p.as_posix() for p in files))
-    notes = sentences(simulated.notes)
-    with run_directory.whole_file(out, f"--view {out}") as temporary:
-        write(temporary, simulated.runs, simulated.model, params, title, notes, made)
 
 
 def print_sweep(out: Path) -> None:

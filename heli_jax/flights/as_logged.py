@@ -5,7 +5,7 @@ the jump of an angle from 180 deg to -180 deg.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,8 +17,6 @@ from heli_jax.flights.marks import (
     at_marks,
     mark_words,
     marks_note,
-    stray_words,
-    strays,
     without_marks,
 )
 from heli_jax.flights.request import FEWEST, Key, Request
@@ -53,7 +51,7 @@ class AsLogged:
 @np.errstate(over="ignore", invalid="ignore")  # differences of huge values
 def as_logged(request: Request, signals: Mapping[Key, Timed]) -> AsLogged:
     """Remove marks and wraps from the signals, and find their facts."""
-    made, odd, notes = {}, {}, []
+    made, notes = {}, []
     for key, (seconds, values) in signals.items():
         signal, name = request.signals[key], shown(request.signals[key].name)
         numbers = signal.from_si(values)
@@ -74,15 +72,9 @@ def as_logged(request: Request, signals: Mapping[Key, Timed]) -> AsLogged:
         if turn is not None and is_wrapped(values, turn):
             values, unwrapping = unwrapped(values, turn, name)
             notes.append(unwrapping)
-        # After unwrapping: a heading of about 180 deg may be -180 deg for a sample.
-        odd[key] = strays(seconds, signal.from_si(values), key[1])
-        for s in odd[key]:
-            words = f"{name} has {stray_words(s)}: kept as measured"
-            notes.append(note("samples.stray-kept", words, key[0], value=s.values.size))
         made[key] = Timed(seconds, values)
     outputs = frozenset(key for key in made if key[1] == "output")
     facts = facts_of_all({key: (t.seconds, t.values) for key, t in made.items()}, outputs)
-    facts = {key: replace(f, strays=odd[key]) for key, f in facts.items()}
     return AsLogged(made, facts, tuple(notes))
 
 

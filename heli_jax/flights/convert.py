@@ -16,6 +16,7 @@ from heli_jax.flights.derived import (
     Swashplate,
     with_derived,
 )
+from heli_jax.flights.describe import describe_table
 from heli_jax.flights.formats.arrays import ArrayTable, by_clocks
 from heli_jax.flights.holds import decide
 from heli_jax.flights.log import ChannelLog, listed, require_few_columns, shown, wrong
@@ -99,7 +100,7 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
     if isinstance(opened, ArrayTable) and stated == (None, None, None):
         opened = by_clocks(opened) or opened
     if not isinstance(opened, ChannelLog):
-        opened = guessed_log(opened, *stated)
+        opened = guessed_log(opened, describe_table(opened, *stated))
         # Without a rate, rows are copied as they are, with their empty cells.
         opened = opened if selection.rate is None else without_joins(opened)
     elif any(stated):

@@ -12,7 +12,6 @@ from heli_jax.flights.formats import (
     blackbox_frames,
     csv_text,
     dataflash,
-    json_records,
     library_arrays,
     numpy_arrays,
     ulog,
@@ -26,7 +25,7 @@ _TEXTS = (".csv", ".txt", ".tsv", ".asc", ".dat", ".log", ".lvm", ".prn", ".tab"
 _ARRAYS = (".mat", ".nc", ".h5", ".hdf5")
 """Endings that decide the format, because MATLAB 7.3, NetCDF 4 and HDF5 files begin alike."""
 EXPECTED = (
-    "expected a table (.csv, .txt, .tsv, .asc, .dat, .lvm, .parquet, .feather, .json), arrays "
+    "expected a table (.csv, .txt, .tsv, .asc, .dat, .lvm, .parquet, .feather), arrays "
     "(.mat, .nc, .h5, .hdf5, .npz, .npy) or an autopilot's log (.ulg, .bin, .log, .bbl, .bfl)"
 )
 
@@ -119,7 +118,6 @@ FORMATS = (
     Format(csv_text.open_csv, _TEXTS),
     Format(arrow.open_parquet, (".parquet",), (b"PAR1",)),
     Format(arrow.open_arrow, (".feather", ".arrow", ".arrows", ".ipc"), (arrow.ARROW_MARK,)),
-    Format(json_records.open_json, (".json", ".jsonl", ".ndjson")),
     Format(numpy_arrays.open_numpy, (".npy", ".npz"), (numpy_arrays.MAGIC,)),
     Format(library_arrays.open_mat, (".mat",), (library_arrays.MATLAB_MAGIC,)),
     Format(library_arrays.open_netcdf, (".nc",), library_arrays.NETCDF_MAGICS),
@@ -131,7 +129,6 @@ def _reader(path: Path) -> _Reader:
     ending = path.suffix.lower()
     with open_regular(path, "a log", sys.maxsize) as file:
         head = file.read(_SNIFFED)
-    _refuse_foreign(path, head)
     if csv_text.is_gzipped(path):
         if csv_text.inner_ending(path) not in _TEXTS:
             problem = (
@@ -164,53 +161,3 @@ def _by_content(head: bytes, is_table: bool) -> _Reader | None:
     # Anywhere in the first bytes: its reader searches for the beginning of each flight and skips
     # what precedes the first.
     return blackbox.open_blackbox if blackbox_frames.MARK in head and not is_table else None
-
-
-# Files that hold flights but are not read: what they are, and what to do.
-
-_SHEET = "is a spreadsheet; save its sheet as CSV, one table with its names above"
-_PICKLE = (
-    "is a Python pickle, which may run any code; save a table, frame.to_parquet(FILE), or "
-    "arrays, numpy.savez(FILE, t=t, p=p)"
-)
-_TOPICS = "export its topics to CSV (PlotJuggler does)"
-_ARCHIVE = "is an archive; unpack it and name a log from it"
-_TELEMETRY = (
-    "is MAVLink telemetry at a reduced rate; use the autopilot's own log (.bin, .ulg), or export "
-    "messages: mavlogdump.py --format csv --types ATTITUDE FILE"
-)
-_BY_ENDING = {
-    **dict.fromkeys((".xlsx", ".xlsm", ".xls", ".xlsb", ".ods", ".numbers"), _SHEET),
-    **dict.fromkeys((".bag", ".mcap", ".db3"), f"is a log of ROS; {_TOPICS}"),
-    **dict.fromkeys((".tlog", ".rlog"), _TELEMETRY),
-    **dict.fromkeys((".pkl", ".pickle", ".joblib"), _PICKLE),
-    **dict.fromkeys((".zip", ".7z", ".rar", ".tar", ".tgz", ".xz", ".bz2", ".zst"), _ARCHIVE),
-    **dict.fromkeys((".mf4", ".mdf", ".tdms", ".c3d"), "is a measurement; export it to CSV"),
-    **dict.fromkeys((".slx", ".fig"), "is no MATLAB data file; save the signals as arrays in .mat"),
-}
-_BY_MARK = (
-    (b"\x89MCAP0\r\n", _BY_ENDING[".mcap"]),
-    (b"#ROSBAG V", _BY_ENDING[".bag"]),
-    (b"SQLite format 3\0", _BY_ENDING[".db3"]),
-    (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", _SHEET),
-    (
-        b"version https://git-lfs.github.com/spec/",
-        "is a pointer of Git LFS; run git lfs pull",
-    ),
-    (b"/annex/objects/", "is a pointer of git-annex; git annex get fetches the log"),
-    (b"FEA1", "is a file of the first version of Feather; write it again, frame.to_feather(FILE)"),
-)
-_ZIP = b"PK\x03\x04"
-
-
-def _refuse_foreign(path: Path, head: bytes) -> None:
-    """Refuse a file that is known to be unreadable, by its first bytes or its ending."""
-    ending = path.suffix.lower()
-    words = next((words for mark, words in _BY_MARK if head.startswith(mark)), None)
-    if words is None and head.startswith(_ZIP) and ending != ".npz":
-        # Spreadsheets are zip archives inside.
-        is_sheet = b"xl/" in head or b"[Content_Types].xml" in head or b"spreadsheet" in head
-        words = _SHEET if is_sheet else _ARCHIVE
-    words = words or _BY_ENDING.get(ending)
-    if words is not None:
-        raise wrong(str(path), words)

@@ -2,8 +2,7 @@
 
 A table usually is a log of one topic. In an outer join, as PlotJuggler, MAVExplorer and pandas
 write it, each row holds the values of one topic and other cells are empty. Columns that are filled
-in the same rows are then a topic, with the clock of these rows. A join that was filled forward is
-recognised by its repeated values (`repeats.carried_on`).
+in the same rows are then a topic, with the clock of these rows.
 """
 
 import itertools
@@ -25,7 +24,7 @@ from heli_jax.flights.clock import (
     with_runs,
 )
 from heli_jax.flights.derived import sources, with_derived
-from heli_jax.flights.describe import describe_table
+from heli_jax.flights.describe import LogInfo
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.formats.arrays import SEGMENT, ArrayTable
 from heli_jax.flights.grid import LATEST, without_overflow
@@ -121,14 +120,12 @@ def _checked(table: Table, time: Signal, stamps: np.ndarray) -> tuple[Finding, .
 # Without a request: the clock is guessed, and all columns are taken.
 
 
-def guessed_log(table: Table, time: str | None, unit: str | None, rate: float | None) -> ChannelLog:
+def guessed_log(table: Table, info: LogInfo) -> ChannelLog:
     """Return all columns of numbers as one topic; the notes list assumptions and omissions.
 
     Args:
-        time: name of the clock; guessed if None.
-        rate: samples a second [Hz] of a table without times.
+        info: description of the table, whose clock is taken.
     """
-    info = describe_table(table, time, unit, rate)
     clock, notes = info.time, []
     if clock is None or clock.problem:
         why = clock.problem if clock else "no column of numbers looks like a clock"
@@ -140,15 +137,16 @@ def guessed_log(table: Table, time: str | None, unit: str | None, rate: float | 
     rows = next((c.count for c in info.columns if c.name == clock.column), info.n_rows)
     # Arrays may have different lengths; rows of a table with empty cells have one length.
     whole = not isinstance(table, ArrayTable)
-    names = [c.name for c in info.columns if c.kind == "number" and (whole or c.count == rows)]
+    # Columns that share a name cannot be selected.
+    names = [
+        c.name
+        for c in info.columns
+        if c.kind == "number" and (whole or c.count == rows) and table.names.count(c.name) == 1
+    ]
     if left := [c for c in info.columns if c.name not in names]:
         each = listed(f"{shown(c.name)}{c.strays and f' ({c.strays})'}" for c in left)
-        words = f"left out, no {rows} numbers: {each}"
+        words = f"left out, no {rows} numbers of one name: {each}"
         notes.append(note(LEFT_OUT, words, *(c.name for c in left)))
-    # The columns are keyed by name from here on, so one of two with the same name would be lost.
-    twice = next((n for n in names if names.count(n) > 1), None)
-    if twice is not None:
-        raise wrong(table.path, f"two columns are named {shown(twice)}, expected different names")
     numbers = columns_of(table, list(dict.fromkeys([*names, clock.column])))
     if clock.runs > 1:
         scale = clock_scale(table, clock.signal)

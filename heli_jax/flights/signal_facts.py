@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from heli_jax.flights.marks import Strays
-
 _PILE = 5.0
 """Ratio of samples at an extreme to samples at the values beside it, for a rail. A sine logged in
 steps has a ratio of 3."""
@@ -73,7 +71,6 @@ class SignalFacts:
         usual: usual time between samples [s].
         stretches: times at one value, of an output while other signals move; the longest first.
         dropouts: value to which an output jumps from anywhere.
-        strays: samples that may mean no value, but are kept.
     """
 
     size: int
@@ -82,7 +79,6 @@ class SignalFacts:
     usual: float
     stretches: tuple[Stuck, ...] = ()
     dropouts: Rail | None = None
-    strays: tuple[Strays, ...] = ()
 
     @property
     def stuck(self) -> Stuck | None:
@@ -115,7 +111,6 @@ class SignalFacts:
         inside = [one for one in inside if one.end - one.begin >= STUCK_SECONDS]
         drops = None if self.dropouts is None else cut(self.dropouts)
         size = min(self.size, round((end - begin) / self.usual) + 1) if self.usual > 0 else 0
-        strays = (s.within(begin, end) for s in self.strays)
         return replace(
             self,
             size=size,
@@ -123,7 +118,6 @@ class SignalFacts:
             high=cut(self.high),
             stretches=tuple(sorted(inside, key=lambda one: one.begin - one.end)),
             dropouts=drops if drops and drops.times.size else None,
-            strays=tuple(s for s in strays if s.times.size),
         )
 
 

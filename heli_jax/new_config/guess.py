@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax import units
-from heli_jax.new_config.channel_names import quantity_of_output
 from heli_jax.new_config.name_units import FILLERS, without_unit
 
 _UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue"})
@@ -32,12 +31,10 @@ _EXCITATIONS = {
     *("sweep", "chirp", "sid", "sysid", "inject", "injected", "injection", "excitation"),
     *("excite", "multisine", "prbs"),
 }
+_PULSES = ("us", "µs", "usec", "microseconds")
+"""Units of pulse widths."""
 _AXES = {"r": "roll", "p": "pitch", "y": "yaw"}
 _SETPOINTS = {letter + word for letter in _AXES for word in ("des", "out", "tar")}
-_LAGS = 0.5
-"""Longest delay of an output after an input [s]."""
-_RELATED = 0.4
-"""Smallest correlation of related signals."""
 
 
 class Series(NamedTuple):
@@ -195,43 +192,13 @@ def may_be(name: str, series: Series, called: Sequence[str], si: str) -> bool:
     return not (_OTHER | _CHANGES) & words - own
 
 
-def may_move(name: str, series: Series, si: str) -> bool:
-    """True if a channel's name and unit allow an input of the model."""
-    return not quantity_of_output(name, series.unit or without_unit(name)[1], si)
-
-
-def by_motion(output: Series, channels: Mapping[str, Series]) -> tuple[str, float] | None:
-    """Return the channel that an output follows, with the correlation; None if there is none."""
-    best: tuple[str, float] | None = None
-    for name, series in channels.items():
-        related = _largest_correlation(series, output)
-        if related > max(_RELATED, best[1] if best else 0.0):
-            best = name, related
-    return best
-
-
-def _largest_correlation(first: Series, second: Series) -> float:
-    """Return the largest correlation over the lags by which the second may follow the first."""
-    begin = max(first.times[0], second.times[0])
-    end = min(first.times[-1], second.times[-1])
-    step = float(np.median(np.diff(second.times)))
-    if not (end > begin and step > 0):
-        return 0.0
-    t = np.arange(begin, end, step)
-    if t.size < 3 or np.ptp(first.values) == 0:
-        return 0.0
-    x, y = np.interp(t, *_finite(first)), np.interp(t, *_finite(second))
-    x, y = x - np.mean(x), y - np.mean(y)
-    most = min(int(_LAGS / step) + 1, t.size // 4)
-    scale = float(np.linalg.norm(x) * np.linalg.norm(y))
-    if not scale:
-        return 0.0
-    return max(abs(float(np.dot(x[: t.size - k], y[k:]))) for k in range(most)) / scale
-
-
-def _finite(series: Series) -> tuple[np.ndarray, np.ndarray]:
-    good = np.isfinite(series.values)
-    return series.times[good], series.values[good]
+def may_be_input(name: str, series: Series, si: str) -> bool:
+    """True if the unit of a channel, as the log or its name states it, allows an input."""
+    unit = series.unit or without_unit(name)[1]
+    if not unit or unit in _PULSES or not units.is_unit(unit):
+        return True
+    # Sticks and the blades that they move have angles, lengths, voltages or no unit.
+    return any(units.fits(unit, other) for other in ("1", "rad", "m", "V", si))
 
 
 def are_whole(values: np.ndarray) -> bool:

@@ -1,13 +1,12 @@
 """Choice of the model for a log: the stated one, or that of the axis that moves."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from heli_jax import models
-from heli_jax.flights.log import ChannelLog, as_floats, shown, wrong
+from heli_jax.flights.log import ChannelLog, shown, wrong
 from heli_jax.flights.preset import fitting_presets
 from heli_jax.linear_models import read as linear_models
 from heli_jax.new_config import guess, tables
@@ -24,21 +23,10 @@ _AXES = {
 _UNITS = {"roll": "rad", "pitch": "rad", "down_speed": "m/s"} | dict.fromkeys(
     ("roll_rate", "pitch_rate", "yaw_rate"), "rad/s"
 )
-_SHIPS = ("ArduPlane", "ArduRover", "Rover", "Blimp", "ArduSub", "APM:Plane", "APM:Rover")
+_OTHER_FIRMWARE = ("ArduPlane", "ArduRover", "Rover", "Blimp", "ArduSub", "APM:Plane", "APM:Rover")
 """Names of ArduPilot firmware for other vehicles."""
-_HELICOPTERS = (6, 11, 13)
-"""ArduPilot's FRAME_CLASS of helicopters: one rotor, two, and four with variable pitch."""
-_MAV_TYPES = {1: "a fixed-wing aircraft", 2: "a quadrotor", 7: "an airship", 10: "a rover"}
-_MAV_TYPES |= {11: "a boat", 13: "a hexarotor", 14: "an octorotor", 15: "a tricopter"}
-_MAV_TYPES |= dict.fromkeys(range(19, 26), "a VTOL aircraft")
-"""MAVLink's MAV_TYPE, without helicopters (3, 4) and unknown types."""
-_AIRFRAMES = ("a multirotor", "a fixed-wing aircraft", *["a VTOL aircraft"] * 3, *["a rover"] * 2)
-_AIRFRAMES += ("a multirotor", "an airship")
-"""PX4's CA_AIRFRAME from 0 to 8; helicopters have 10 to 12."""
-_TYPES = {2: "a fixed-wing aircraft", 3: "a rover", 4: "an airship"}
-"""PX4's vehicle_status.vehicle_type."""
-_OF_ROTORS = ("Betaflight", "Cleanflight", "INAV", "EmuFlight")
-"""Firmware of multirotors, which logs the command of each motor."""
+_HELICOPTERS = {"FRAME_CLASS": (0, 6, 11, 13), "CA_AIRFRAME": (10, 11, 12), "MAV_TYPE": (0, 3, 4)}
+"""Values for helicopters, and 0 for none, of settings of ArduPilot and PX4 by their rank."""
 _FULL_TRAVEL = 1.5
 """Largest value of a stick in parts of full travel; radios may exceed 1."""
 
@@ -71,51 +59,15 @@ def chosen_model(
 
 
 def other_vehicle(log: ChannelLog | None) -> str:
-    """Return the vehicle type that an autopilot's log states, with the setting.
-
-    It is empty for a helicopter or an unknown type.
-
-    Args:
-        log: log of an autopilot; None for a table.
-    """
+    """Return why an autopilot's log is of no helicopter; empty if it may be of one."""
     if log is None:
         return ""
-    has, firmware = log.parameters, log.firmware
-    if log.format == "dataflash":
-        return _of_ardupilot(has, firmware)
-    if log.format == "blackbox":
-        motors = {"motor[2]", "motor[3]"} <= {n.rpartition(".")[2] for n in log.names}
-        return (
-            f"a multirotor ({firmware[:40]})" if firmware.startswith(_OF_ROTORS) and motors else ""
-        )
-    frame, mav = has.get("CA_AIRFRAME"), has.get("MAV_TYPE")
-    if isinstance(frame, int):
-        kind = _AIRFRAMES[frame] if 0 <= frame < len(_AIRFRAMES) else ""
-        return f"{kind} (CA_AIRFRAME {frame})" if kind else ""
-    if isinstance(mav, int) and mav in _MAV_TYPES:
-        return f"{_MAV_TYPES[mav]} (MAV_TYPE {mav})"
-    for field, known in (("is_vtol", {1: "a VTOL aircraft"}), ("vehicle_type", _TYPES)):
-        name = f"vehicle_status.{field}"
-        values = as_floats(log.topic_of(name).columns[name]) if name in log.names else np.zeros(0)
-        if values.size and values[-1] in known:
-            return f"{known[int(values[-1])]} ({name} {values[-1]:g})"
-    return ""
-
-
-def _of_ardupilot(has: Mapping[str, str | int | float], firmware: str) -> str:
-    if has.get("Q_ENABLE") == 1:
-        return f"a VTOL aircraft ({firmware or 'ArduPlane'}, Q_ENABLE 1)"
-    if firmware.startswith(_SHIPS):
-        return f"no helicopter ({firmware})"
-    frame = has.get("FRAME_CLASS")
-    if frame in _HELICOPTERS or "heli" in firmware.casefold():
+    if log.firmware.startswith(_OTHER_FIRMWARE):
+        return f"no helicopter ({log.firmware})"
+    name = next((n for n in _HELICOPTERS if n in log.parameters), None)
+    if name is None or log.parameters[name] in _HELICOPTERS[name]:
         return ""
-    if frame:
-        return f"a multirotor (FRAME_CLASS {frame:g})"
-    # Old versions have no frame class; the frame follows from the available settings.
-    if has and firmware.startswith("Ardu") and not any(n.startswith("H_") for n in has):
-        return f"a multirotor ({firmware}, without parameters of a helicopter's swashplate)"
-    return ""
+    return f"no helicopter ({name} {log.parameters[name]})"
 
 
 def _by_moving_stick(log: Log, path: str) -> str:

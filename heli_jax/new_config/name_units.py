@@ -3,7 +3,6 @@
 import re
 
 from heli_jax import units
-from heli_jax.new_config.channel_names import rate_at_end
 
 # Longest first, so that deg/s is not read as deg.
 _UNIT_WORDS = {
@@ -19,6 +18,23 @@ _UNIT_WORDS = {
     "cdeg/s": "cdeg/s", "mrads": "mrad/s", "mradps": "mrad/s", "mrad/s": "mrad/s", "cms": "cm/s",
     "cm/s": "cm/s", "mms": "mm/s", "mm/s": "mm/s",
 }  # fmt: skip
+_PLAIN = {
+    **dict.fromkeys(("deg", "degree", "degrees", "grad"), "deg"),
+    **dict.fromkeys(("rad", "radian", "radians"), "rad"),
+    "mrad": "mrad",
+    **dict.fromkeys(("cdeg", "centideg", "centidegrees"), "cdeg"),
+    "cm": "cm",
+    "mm": "mm",
+    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), "m"),
+    **dict.fromkeys(("ft", "feet"), "ft"),
+}
+"""Units that names may combine with 'per second', in their spellings."""
+_RATE = re.compile(
+    rf"(.*?)[-_ .,]+({'|'.join(_PLAIN)})(?:[_ .]*per[_ .]*|[_ ]?p[_ .]?|[/_ .])"
+    r"(?:s|sec|second|seconds)(?:\^?-?([12]))?",
+    re.IGNORECASE,
+)
+"""Rates and speeds, such as `roll_rate_deg_s` and `p degrees per second`."""
 # For names without a separator before the unit: rollDeg.
 _JOINED_UNIT = re.compile(
     r"(.*[a-z0-9XYZ])(Deg|Rad|Dps|Degs|Rads|Radps|Rpm|Mps|Pct|Percent)((?:_?[A-Z]?[a-z]+)?)"
@@ -41,8 +57,8 @@ def without_unit(name: str) -> tuple[str, str]:
     # gyroADC[1] is an index, not a unit.
     if match and not match[2].strip().isdigit() and units.is_unit(match[2].strip()):
         return match[1], match[2].strip()
-    if (rate := rate_at_end(name)) is not None:
-        return rate
+    if match := _RATE.fullmatch(name):
+        return match[1], f"{_PLAIN[match[2].lower()]}/s{'^2' if match[3] == '2' else ''}"
     for letter in _LETTERS:
         if name.endswith((f"_{letter}", f" {letter}")):
             return name[:-2], letter

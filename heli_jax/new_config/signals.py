@@ -10,13 +10,9 @@ from heli_jax.dynamics.model import axes_of
 from heli_jax.flights.clock import words_in
 from heli_jax.flights.preset import model_inputs, model_outputs
 from heli_jax.new_config import guess, scales, tables, text
-from heli_jax.new_config.channel_names import is_stick_name
 from heli_jax.new_config.guess import Guess, Series
 from heli_jax.new_config.logs import Log
 from heli_jax.numerics.white_noise import has_coloured_noise, without_noise
-
-_STICKS_TOO = {"roll", "pitch", "yaw"}
-"""Names of motions that sticks have as well."""
 
 
 def signals_of(model: Any, log: Log) -> text.Signals:
@@ -34,7 +30,7 @@ def signals_of(model: Any, log: Log) -> text.Signals:
             known, commands = called["inputs"][stick], called["commands"][stick]
             numbered[name] = guess.by_number(called["numbered"][stick], sticks)
         unit, known = naming.unit(model.Inputs, name) or "1", [words_of(name), *known]
-        allowed = [n for n in sticks if guess.may_move(n, log.series[n], unit)]
+        allowed = [n for n in sticks if guess.may_be_input(n, log.series[n], unit)]
         found = guess.by_name(known, allowed, commands)
         inputs[name] = _found(log, found, unit, taken, is_input=True)
         for channel in moving_channels(log, guess.excitations(known, tuple(log.series)))[:1]:
@@ -46,11 +42,6 @@ def signals_of(model: Any, log: Log) -> text.Signals:
         output = _found(log, outputs_by_name(log, names_of_output(name), unit), unit, taken)
         if output is not None:
             outputs[name] = output
-    # With several inputs, correlation with an output is the better criterion and comes before
-    # numbers.
-    if len(inputs) > 1:
-        _by_number(model, log, inputs, numbered, taken)
-    _by_correlation(model, log, inputs, outputs, taken)
     _by_number(model, log, inputs, numbered, taken)
     speed = guess.by_name(called["rotor_speed"], tuple(log.series))
     known = {}
@@ -149,47 +140,11 @@ def _by_number(
     """Assign inputs to channels with numbers as names, in the usual order."""
     for name, input in inputs.items():
         si = naming.unit(model.Inputs, name) or "1"
-        names = [n for n in numbered.get(name, ()) if guess.may_move(n, log.series[n], si)]
+        names = [n for n in numbered.get(name, ()) if guess.may_be_input(n, log.series[n], si)]
         made = None if input is not None else _found(log, names, si, taken, is_input=True)
         if made is not None:
             why = "GUESS: by its number, in the order roll, pitch, throttle, yaw"
             inputs[name] = made._replace(remarks=(why, *made.remarks))
-
-
-def _by_correlation(
-    model: Any,
-    log: Log,
-    inputs: dict[str, Guess | None],
-    outputs: Mapping[str, Guess | None],
-    taken: list[str],
-) -> None:
-    """Assign inputs without a matching name to the channel that an output follows."""
-    known = [g.channel for g in outputs.values() if g is not None]
-    # A channel named as a motion moves with the stick, and correlates better with the output than
-    # the stick does.
-    motions = {c for names in tables.names()["outputs"].values() for c in names} - _STICKS_TOO
-    moving = guess.by_name(sorted(motions), tuple(log.series))
-    measured = {n for n in moving if not is_stick_name(n)}
-    for name, input in inputs.items():
-        if input is not None or not known:
-            continue
-        si = naming.unit(model.Inputs, name) or "1"
-        left = {
-            n: s
-            for n, s in log.series.items()
-            if n not in {*taken, *measured}
-            and guess.may_move(n, s, si)
-            and not (guess.is_excitation(n) or is_place(n, log.series))
-            and np.nanstd(s.values) > 0
-        }
-        best = guess.by_motion(log.series[known[-1]], left)
-        if best is None:
-            continue
-        channel, related = best
-        made = scales.scaled(channel, log.series[channel], si, is_input=True)
-        why = f"GUESS: no name matches; {known[-1]} follows it with a correlation of {related:.2f}"
-        inputs[name] = made._replace(remarks=(why, *made.remarks))
-        taken.append(channel)
 
 
 _CALLED = {"lat", "lon", "lng", "long", "latitude", "longitude"}

@@ -46,8 +46,6 @@ class Panel(NamedTuple):
     """Height [inch]."""
     levels: tuple[float, ...] = ()
     """Horizontal lines."""
-    shades: tuple[tuple[float, float], ...] = ()
-    """Shaded ranges of x."""
     logarithmic: bool = False
 
 
@@ -176,11 +174,10 @@ _STEPS = 65534
 
 
 class Numbers:
-    """Arrays, charts and scenes of one page."""
+    """Arrays and charts of one page."""
 
     def __init__(self) -> None:
         self.arrays: list[dict[str, Any]] = []
-        self.scenes: list[dict[str, Any]] = []
         self._known: dict[bytes, int] = {}
         self._charts: list[Chart] = []
 
@@ -200,7 +197,7 @@ class Numbers:
         }
         most = _most(list(lines.values()))
         charts = [self._chart(chart, most) for chart in self._charts]
-        return {"arrays": self.arrays, "charts": charts, "scenes": self.scenes}
+        return {"arrays": self.arrays, "charts": charts}
 
     def array(self, values: np.ndarray, *, exact: bool = False) -> int:
         """Store an array (n,) and return its number on the page.

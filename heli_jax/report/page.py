@@ -26,8 +26,8 @@ type Draw = "Callable[[], Chart | Figure | None]"
 MOST_FLIGHTS = 6
 """Most flights with their own figures; signals.csv has all flights."""
 _FOLDER = Path(__file__).parent
-_SCRIPTS = ("uplot/uPlot.iife.min.js", "charts.js", "flight.js", "tables.js")
-_NOTHING: dict[str, Any] = {"arrays": [], "charts": [], "scenes": []}
+_SCRIPTS = ("uplot/uPlot.iife.min.js", "charts.js", "tables.js")
+_NOTHING: dict[str, Any] = {"arrays": [], "charts": []}
 
 
 def filled(template: str, **values: Any) -> str:

@@ -1,7 +1,6 @@
-"""Files of `heli-jax frf`: responses as NetCDF and CSV, transfer functions, figures, a page."""
+"""Files of `heli-jax frf`: responses as CSV, transfer functions, figures, a page."""
 
 import functools
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,6 @@ from heli_jax.analysis.attitude_responses import Handling
 from heli_jax.analysis.flight_responses import FlightResponses, Pair, TransferRequest, decays_within
 from heli_jax.analysis.spectra import COHERENT
 from heli_jax.analysis.transfer_fit import Coefficient, TransferFit
-from heli_jax.finding import as_data
 from heli_jax.flights.write import write_table
 from heli_jax.numbers import NOTHING, number, with_sd
 from heli_jax.report import tables
@@ -26,7 +24,6 @@ from heli_jax.report.tables import Table
 
 _FILES = (
     "responses.csv",
-    "responses.nc",
     "transfer_functions.json",
     "handling_qualities.json",
 )
@@ -51,7 +48,6 @@ def write_responses(
     page.
     """
     write_table(directory / "responses.csv", table(responses))
-    write_netcdf(directory / "responses.nc", responses, units)
     fits = [_content(*fit, responses.window) for fit in responses.fits]
     for name, content in (
         ("transfer_functions.json", fits),
@@ -301,67 +297,3 @@ def useful_band(omega: np.ndarray, pair: Pair) -> tuple[str, str, str]:
     widest = max((omega[band] for band in bands), key=lambda w: w[-1] / w[0])
     low, high = (number(float(w) / (2.0 * np.pi), 3) for w in (widest[0], widest[-1]))
     return mean, low, high
-
-
-def write_netcdf(path: Path, responses: FlightResponses, units: Mapping[str, str]) -> None:
-    """Write responses.nc.
-
-    Args:
-        units: SI units of inputs and outputs by name.
-    """
-    # xarray is slow to import.
-    import xarray as xr
-
-    outputs = responses.outputs
-    inputs = list(next(iter(outputs.values())).pairs)
-    pairs = [[o.pairs[i] for i in inputs] for o in outputs.values()]
-    unit = [[quotient(units[o], units[i]) for i in inputs] for o in outputs]
-    of_pairs, of_outputs = ("output", "input", "frequency"), ("output", "frequency")
-
-    def stacked(name: str) -> np.ndarray:
-        return np.array([[getattr(pair, name) for pair in row] for row in pairs])
-
-    def each(name: str) -> np.ndarray:
-        return np.array([getattr(o, name) for o in outputs.values()])
-
-    H, parts = stacked("H"), "in the coordinate unit, output over input"
-    sd = f"of the real and the imaginary part, {parts}"
-    # The attribute has a unit only if all pairs share it.
-    every = {u for row in unit for u in row}
-    one = every.pop() if len(every) == 1 else None
-    together = "coherence with all inputs together"
-    # NetCDF 3 has no complex numbers.
-    variables = {
-        "real": (of_pairs, np.real(H), f"real part, {parts}", one),
-        "imaginary": (of_pairs, np.imag(H), f"imaginary part, {parts}", one),
-        "sd": (of_pairs, stacked("sd"), sd, one),
-        "coherence": (of_pairs, stacked("coherence"), "partial coherence", "1"),
-        "half95": ("output", stacked("half95")[:, 0], "half of a 95 % interval in sd", "1"),
-        "multiple_coherence": (of_outputs, each("multiple"), together, "1"),
-        "noise": (
-            of_outputs,
-            each("noise"),
-            ("density of the part that the inputs do not explain"),
-            "SI^2/Hz",
-        ),
-    }
-    data = xr.Dataset(
-        {
-            name: (dims, v, {"long_name": words} | ({"units": u} if u else {}))
-            for name, (dims, v, words, u) in variables.items()
-        },
-        {
-            "output": list(outputs),
-            "input": inputs,
-            "unit": (("output", "input"), unit),
-            "frequency": ("frequency", responses.omega / (2.0 * np.pi), {"units": "Hz"}),
-        },
-        {
-            "window_s": responses.window,
-            "instruments": " ".join(responses.instruments),
-            "units_of_outputs": " ".join(units[n] for n in outputs),
-            "units_of_inputs": " ".join(units[n] for n in inputs),
-            "notes": json.dumps([as_data(f) for f in responses.notes]),
-        },
-    )
-    data.to_netcdf(path, engine="scipy", format="NETCDF3_64BIT")

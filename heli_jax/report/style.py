@@ -121,8 +121,6 @@ def figure_of(chart: Chart) -> "Figure":
 def _draw(ax: "Axes", p: Panel, most: int) -> None:
     from matplotlib.ticker import MaxNLocator
 
-    for begin, end in p.shades:
-        ax.axvspan(begin, end, color=ORANGE, alpha=0.22, lw=0, zorder=0)
     for s in p.series:
         look: dict[str, Any] = {"color": s.color, "label": s.label or None}
         if s.kind == "band" and s.low is not None and s.high is not None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from heli_jax.flights import as_logged
+from heli_jax.identification.diagnostics import context
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
@@ -61,8 +61,8 @@ def test_a_key_of_a_sentence_has_no_numbers_and_no_names(corpus):
 
 def test_a_candidate_is_replaced_everywhere(corpus):
     matrix = importlib.import_module("corpus_matrix")
-    original = as_logged.strays
+    original = context.second_solutions
     for one in matrix.ABLATIONS:
         with matrix.replaced(one.entry, lambda _: None):
-            assert (as_logged.strays is None) == (one.name == "strays")
-    assert as_logged.strays is original
+            assert (context.second_solutions is None) == (one.name == "swapped_modes")
+    assert context.second_solutions is original

@@ -4,16 +4,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 from heli_jax.errors import InputError
 from heli_jax.flights.flight import Signal
-from heli_jax.flights.marks import strays as strays_of
 from heli_jax.flights.parts import part
 from heli_jax.flights.read import read_flight
 from heli_jax.identification.diagnostics.record import (
     saturation,
-    strays,
     stuck_outputs,
 )
 
@@ -92,28 +89,6 @@ def test_marks_for_no_value_are_missing_and_not_spread(tmp_path):
     # The same number among values of its size is a value.
     near = read(tmp_path, p=1e4 + 10 * np.round(RATE)).outputs["p"]
     assert np.isfinite(near).all()
-
-
-def test_samples_that_no_motion_leads_to_are_said_and_kept(tmp_path):
-    spikes = RATE.copy()
-    spikes[[100, 101, 800]] = -99.0
-    f = read(tmp_path, p=spikes, q=RATE)
-    np.testing.assert_array_equal(f.outputs["p"], spikes)
-    assert f.source is not None
-    said = [n for n in f.source.notes if n.code == "samples.stray-kept"]
-    assert [(n.subjects, n.value) for n in said] == [(("p",), 3)]
-    assert [(s.severity, s.value) for s in strays(of(f))] == [("doubt", 3.0)]
-    (found,) = strays(of(part(f, 0, 400)))
-    assert found.value == 2.0
-    # Doublets from rest at any rate, in the log's steps or not, and a landing are motions.
-    u = np.where((T > 5) & (T < 5.2), 0.3, 0.0) - np.where((T > 5.2) & (T < 5.4), 0.3, 0.0)
-    motion = lfilter([0.2], [1, -0.8], u) + 1e-3 * RNG.standard_normal(N)
-    shock = np.where(T > 9, np.exp(-(T - 9) / 0.1) * np.cos(60 * T), 0) + motion
-    for step in (1, 10):
-        t = T[::step] * 1.0
-        for y in (motion, np.round(motion, 2), np.cumsum(motion), shock):
-            assert not strays_of(t, y[::step], "output")
-        assert not strays_of(t, u[::step], "input")
 
 
 @pytest.mark.parametrize("rate", [None, 50.0])

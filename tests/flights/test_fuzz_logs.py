@@ -3,7 +3,6 @@
 `experiments/fuzz_logs.py` has more attempts.
 """
 
-import json
 import runpy
 from pathlib import Path
 
@@ -49,7 +48,6 @@ FORMATS = {
     "flight.feather": lambda path: pyarrow.feather.write_feather(pa.table({"t": T, "x": X}), path),
     "flight.npz": lambda path: np.savez_compressed(path, t=T, x=X),
     "flight.npy": lambda path: np.save(path, np.rec.fromarrays([T, X], names="t,x")),
-    "flight.json": lambda path: path.write_text(json.dumps({"t": T.tolist(), "x": X.tolist()})),
     "flight.mat": lambda path: scipy.io.savemat(path, {"log": {"t": T, "x": X}}),
     "flight.nc": lambda path: xarray.Dataset({"t": ("n", T), "x": ("n", X)}).to_netcdf(
         path, engine="scipy"

@@ -5,7 +5,7 @@ import pytest
 
 from heli_jax.errors import InputError
 from heli_jax.flights import Signal, read_flight
-from heli_jax.flights.marks import stale, usual_run, without_repeats
+from heli_jax.flights.marks import written_again
 from heli_jax.flights.resample import Timed, at_nearest
 from heli_jax.numerics.white_noise import noise_guess
 
@@ -119,17 +119,15 @@ def test_repeated_values_are_one_measurement(tmp_path):
     at = np.arange(0, 600, 20)
     assert np.array_equal(np.flatnonzero(np.isfinite(flight.outputs["x"])), at)
     np.testing.assert_array_equal(flight.outputs["x"][at], x[at])
-    assert [n.value for n in flight.source.notes if n.code == "repeats.missing"] == [20]
+    assert [n.value for n in flight.source.notes if n.code == "repeats.missing"] == [570]
     np.testing.assert_array_equal(table(tmp_path, x, repeats="keep").outputs["x"], x)
 
 
 def test_what_is_not_unmistakable_is_kept(tmp_path):
     t = np.arange(2000) / 100
     # A slow ramp in whole counts repeats values regularly, and one in whole degrees irregularly.
-    assert usual_run(np.floor(5.0 * t)) is None
-    assert usual_run(np.round(20.0 * motion(t))) is None
-    assert usual_run(motion(t)) is None
-    assert usual_run(np.zeros(2000)) is None
+    for y in (np.floor(5.0 * t), np.round(20.0 * motion(t)), motion(t), np.zeros(2000)):
+        assert not written_again(y).any()
     # The runs are few, but a user's statement is accepted.
     x = motion(t[:200])[np.arange(200) // 20 * 20]
     assert np.isfinite(table(tmp_path, x).outputs["x"]).all()
@@ -139,13 +137,6 @@ def test_what_is_not_unmistakable_is_kept(tmp_path):
             tmp_path / "log.csv", time="t", inputs={"u": Signal("u", "1", "1", repeats="keep")},
             outputs={},
         )  # fmt: skip
-
-
-def test_a_value_that_stays_was_measured_again():
-    runs = [5, 5, 10, 6, 4, 5]
-    x = np.repeat(np.arange(6.0), runs)
-    seen = np.flatnonzero(np.isfinite(without_repeats(x, 5)))
-    assert seen.tolist() == [0, 5, 10, 15, 20, 26, 30]
 
 
 def test_noise_is_guessed_across_missing_samples():
@@ -162,13 +153,13 @@ def test_noise_is_guessed_across_missing_samples():
 def test_stale_rows_of_a_noisy_output_are_missing():
     rng, t = np.random.default_rng(0), np.arange(1500) / 50.0
     fresh = np.round(np.sin(2.0 * t) + 0.02 * rng.standard_normal(t.size), 5)
-    assert not stale(fresh).any()
+    assert not written_again(fresh).any()
     written, again = fresh.copy(), np.zeros(t.size, bool)
     for first in np.sort(rng.choice(np.arange(10, 1490), 60, replace=False)):
         for k in range(first, first + int(rng.integers(1, 4))):
             written[k], again[k] = written[k - 1], True
-    np.testing.assert_array_equal(stale(written), again)
+    np.testing.assert_array_equal(written_again(written), again)
     # Coarse steps, a smooth signal and a clipped one also repeat values.
-    assert not stale(np.round(fresh, 1)).any()
-    assert not stale(np.sin(2.0 * t)).any()
-    assert not stale(np.clip(fresh, -0.8, 0.8)).any()
+    assert not written_again(np.round(fresh, 1)).any()
+    assert not written_again(np.sin(2.0 * t)).any()
+    assert not written_again(np.clip(fresh, -0.8, 0.8)).any()

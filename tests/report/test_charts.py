@@ -1,5 +1,6 @@
 """Figures as plain data, and the data that a page embeds."""
 
+import base64
 from xml.etree import ElementTree
 
 import numpy as np
@@ -17,7 +18,17 @@ from heli_jax.report.charts import (
     panel,
 )
 from heli_jax.report.page import picture
-from tests.report.test_view import decoded
+
+
+def decoded(content, number):
+    """Return an array of a page, decoded by hand."""
+    a = content["arrays"][number]
+    if "n" in a:
+        return a["from"] + a["step"] * np.arange(a["n"])
+    if "f" in a:
+        return np.frombuffer(base64.b64decode(a["f"]), "<f4").astype(float)
+    parts = np.frombuffer(base64.b64decode(a["q"]), "<u2")
+    return np.where(parts == 65535, np.nan, a["low"] + a["step"] * parts)
 
 
 def record(n, outputs=1, inputs=4):
@@ -49,13 +60,13 @@ def test_a_chart_has_all_points_its_file_fewer_and_words_its_range():
     assert "0 to 50" in words
 
 
-def test_bars_bands_and_shades_are_drawn_where_they_are():
+def test_bars_and_bands_are_drawn_where_they_are():
     x, y = np.arange(1.0, 6.0), np.array([1.0, 3.0, 2.0, 5.0, 4.0])
     series = [
         band(x, y - 0.5, y + 1.5, style.SKY),
         bars("data", x, y, [0.1 * y, 0.2 * y], style.BLUE),
     ]
-    only = panel("y", series, shades=((3.0, 4.0),))
+    only = panel("y", series)
     np.testing.assert_allclose([series[1].low, series[1].high], [0.9 * y, 1.2 * y])
     [ax] = style.styled(lambda: Chart("t", "x", (1.0, 5.0), (only,))).axes
     assert ax.get_ylim() == pytest.approx((0.5 - 0.05 * 6.0, 6.5 + 0.05 * 6.0))
@@ -65,7 +76,6 @@ def test_bars_bands_and_shades_are_drawn_where_they_are():
     points, ends = ax.get_lines()
     np.testing.assert_allclose(points.get_ydata(), y)
     np.testing.assert_allclose(ends.get_ydata()[:2], [0.9, 1.2])
-    assert len(ax.patches) == 1
 
 
 NAMES = ["$a_1^$ <b> & \\frac{", "bell\x07 and\x1b[31m"]

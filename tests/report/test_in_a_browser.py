@@ -9,11 +9,8 @@ import pytest
 
 from heli_jax.report.fit_page import Analysis, write_report
 from heli_jax.report.origin import origin
-from heli_jax.report.view import write_view
-from heli_jax.vehicle import load_vehicle
 from tests.report.browser import CHROMIUM, browser
 from tests.report.conftest import SCRIPT
-from tests.report.test_view import HELICOPTER, flown
 
 pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine"),
@@ -33,16 +30,6 @@ def report(sound, tmp_path_factory):
     made = origin(f"a: {SCRIPT} {'long' * 60}", ("config.yaml", "fit.json", "signals.csv"))
     write_report(folder, Analysis(*sound), f"bench {SCRIPT}", {}, made)
     return folder / "report.html"
-
-
-@pytest.fixture(scope="module")
-def view(tmp_path_factory, vehicles_folder):
-    t = 0.02 * np.arange(1500)
-    run = flown(1500, x=2.0 * t, y=3.0 * np.sin(t), z=1.0 + 0.1 * t, phi=0.3 * np.sin(t))
-    path = tmp_path_factory.mktemp("view") / "view.html"
-    xcell = load_vehicle(vehicles_folder / "x-cell-60.yaml")
-    write_view(path, {SCRIPT: run}, HELICOPTER, xcell, f"view {SCRIPT}")
-    return path
 
 
 def over_time(window):
@@ -75,20 +62,18 @@ def drag(window, plot, start, end):
 
 @pytest.mark.parametrize("width", [1200, 400])
 @pytest.mark.parametrize("dark", [False, True])
-def test_nothing_overlaps_and_nothing_fails(window, report, view, width, dark):
+def test_nothing_overlaps_and_nothing_fails(window, report, width, dark):
     window.size(width)
     window.dark(dark)
-    for page in (report, view):
-        window.open(page)
-        window.value("new Promise(requestAnimationFrame)")
-        wide, seen = window.value("(d => [d.scrollWidth, d.clientWidth])(document.documentElement)")
-        assert wide <= seen == width
-        assert not window.problems
-        paper = window.value("getComputedStyle(document.body).backgroundColor")
-        assert (sum(map(int, re.findall(r"\d+", paper))) < 200) == dark
-        assert window.value("document.querySelectorAll('figure.drawn canvas').length") >= 2
-    # A table wider than the page scrolls, with a hint until its end.
     window.open(report)
+    window.value("new Promise(requestAnimationFrame)")
+    wide, seen = window.value("(d => [d.scrollWidth, d.clientWidth])(document.documentElement)")
+    assert wide <= seen == width
+    assert not window.problems
+    paper = window.value("getComputedStyle(document.body).backgroundColor")
+    assert (sum(map(int, re.findall(r"\d+", paper))) < 200) == dark
+    assert window.value("document.querySelectorAll('figure.drawn canvas').length") >= 2
+    # A table wider than the page scrolls, with a hint until its end.
     table = "document.querySelector('[aria-label=Estimates]')"
     more = f"{table}.classList.contains('more')"
     window.until(f"{more} === ({table}.scrollWidth > {table}.clientWidth + 2)")
@@ -180,50 +165,6 @@ def test_a_copied_table_is_numbers_to_a_spreadsheet(window, report):
         ["x", "-1.2e-3", "0.1e-3", "6", "5", "7", "1 Hz", "8.7", "deg", "1 of 2"],
         ["y", "not determined", "", "", "", "", "", "2", "m/s", "3"],
     ]
-
-
-def test_a_flight_plays_and_pauses_by_keys_and_shares_its_time(window, view):
-    window.size(1200)
-    window.open(view)
-    window.value("document.querySelector('[data-role=speed]').value = '10'")
-    # Also without focus: the page says that space plays, so it must not scroll.
-    window.value("document.activeElement.blur()")
-    window.press(" ")
-    window.until("heliFlights[0].time > 0 && heliFlights[0].playing")
-    window.press(" ")
-    assert window.value("heliFlights[0].playing") == 0
-    assert window.value("scrollY") == 0
-    window.value("document.querySelector('canvas').focus()")
-    window.press(" ")
-    window.until("heliFlights[0].time > 1 && heliFlights[0].playing")
-    window.press(" ")
-    assert window.value("heliFlights[0].playing") == 0
-    # The button too, by a key, and the slider.
-    window.value("document.querySelector('[data-role=play]').focus()")
-    window.press("Enter")
-    window.value("document.querySelector('[data-role=time]').focus()")
-    window.press("ArrowRight")
-    assert window.value("heliFlights[0].playing") == 0
-    time = window.value("heliFlights[0].time")
-    cursors = window.value(
-        "heliCharts.groups.get('time [s]').map(u => u.posToVal(u.cursor.left, 'x'))"
-    )
-    assert cursors == pytest.approx([time] * len(cursors), abs=0.1)
-    # From the figures to the flight.
-    plot = "heliCharts.groups.get('time [s]')[0]"
-    window.value(f"{plot}.root.scrollIntoView({{block: 'center'}})")
-    x, y = window.value(
-        f"(r => [r.x + r.width / 2, r.y + 20])({plot}.over.getBoundingClientRect())"
-    )
-    window.mouse("Moved", x, y)
-    assert window.value("heliFlights[0].time") == pytest.approx(0.5 * 29.98, abs=0.1)
-    # The vehicle moves on the canvas.
-    shown = [
-        window.value(f"heliFlights[0].show({t}) || document.querySelector('canvas').toDataURL()")
-        for t in (0, 20)
-    ]
-    assert shown[0] != shown[1]
-    assert not window.problems
 
 
 def test_all_of_it_is_printed(window, report):

@@ -1,6 +1,6 @@
 """Named arrays as a table: packed numbers, stacked runs, separate clocks.
 
-The readers of MATLAB, NetCDF, HDF5, NumPy and JSON files collect `DataSets`. An array's name is its
+The readers of MATLAB, NetCDF, HDF5 and NumPy files collect `DataSets`. An array's name is its
 path: `log.roll.data` in MATLAB's structures, `log/roll` in HDF5.
 
 Sources of the packing: the CF conventions 1.11, sections 2.5.1 and 8.1, and the attribute

@@ -89,23 +89,6 @@ def stuck_outputs(c: Context) -> Iterator[Finding]:
                 )
 
 
-def strays(c: Context) -> Iterator[Finding]:
-    """Find stray samples that may be placeholders for missing values; the fit uses them."""
-    for label, flight in c.flights:
-        for (name, _), facts in flight.facts.items():
-            for odd in facts.strays:
-                yield found(
-                    "quality.stray-samples",
-                    "doubt",
-                    name,
-                    value=float(odd.times.size),
-                    flight=label,
-                    low=odd.values.min(),
-                    high=odd.values.max(),
-                    first=odd.times[0],
-                )
-
-
 def outlying_residuals(c: Context) -> Iterator[Finding]:
     """Find single samples far from the fitted response, and the estimates without them."""
     if not (c.at_optimum and c.explains) or c.at.layout.noise_model == "spectrum":
@@ -304,7 +287,6 @@ DIAGNOSTICS = (
     rates_enough,
     saturation,
     stuck_outputs,
-    strays,
     outlying_residuals,
     nothing_follows,
     gusts_guessed,

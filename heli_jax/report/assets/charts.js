@@ -55,8 +55,6 @@
   }
 
   const groups = new Map();
-  const listeners = [];
-  let speaking = false;
   // uPlot draws what is missing at one series' x but not at another's as a line through.
   const near = (u, i, k) => {
     const y = u.data[i];
@@ -112,11 +110,6 @@
     ctx.beginPath();
     ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
     ctx.clip();
-    ctx.fillStyle = "#e69f0038";
-    for (const [a, b] of panel.shades) {
-      const left = u.valToPos(a, "x", true);
-      ctx.fillRect(left, bbox.top, u.valToPos(b, "x", true) - left, bbox.height);
-    }
     ctx.lineWidth = ratio;
     ctx.setLineDash([4 * ratio, 3 * ratio]);
     ctx.strokeStyle = style("--strong");
@@ -175,14 +168,7 @@
         values: last ? chart.logarithmic ? (u, s) => s.map(v => `${+v.toPrecision(2)}`) : undefined : () => [] }, { ...axis, size: (u, values) => Math.max(62, 16 + 6.8 * Math.max(0, ...(values ?? []).map(v => v?.length ?? 0))), space: 20, values: (u, splits) => panel.logarithmic ? splits.map(v => v == null ? null : `${+v.toPrecision(2)}`) : ticks(splits) }],
       legend: { markers: { width: 2, stroke: (u, i) => i ? u.series[i].stroke() : "transparent", fill: null } },
       cursor: { sync: { key: chart.group, scales: ["x", null], setSeries: false }, drag: { x: true, y: false }, dataIdx: near, focus: { prox: -1 }, points: { size: 6 } },
-      hooks: {
-        drawClear: [u => decorate(u, chart, panel, bars)],
-        setCursor: [u => {
-          if (u.cursor.event && !speaking && u.cursor.idx != null && u.cursor.left >= 0) {
-            for (const f of listeners) f(chart, u.posToVal(u.cursor.left, "x"));
-          }
-        }],
-      },
+      hooks: { drawClear: [u => decorate(u, chart, panel, bars)] },
     }, data, place);
     u.chart = chart;
     return u;
@@ -212,11 +198,9 @@
 
   // The cursor of every figure of a group at one place.
   function point(group, value) {
-    speaking = true;
     for (const u of groups.get(group) ?? []) {
       u.setCursor({ left: u.valToPos(value, "x"), top: 5 }, true, false);
     }
-    speaking = false;
   }
 
   function keys(chart, box, spoken) {
@@ -230,7 +214,6 @@
         const k = u.valToPos(at ?? u.posToVal(u.over.clientWidth / 2, "x"), "x") + step * 4;
         at = Math.min(max, Math.max(min, u.posToVal(k, "x")));
         point(chart.group, at);
-        for (const f of listeners) f(chart, at);
         const legends = [...box.querySelectorAll(".u-series:not(.unlisted)")];
         spoken.textContent = legends.map(l => l.textContent.trim()).join("; ");
       } else if (event.key === "+" || event.key === "=") closer(chart, 0.5, at);
@@ -316,5 +299,5 @@
   };
   addEventListener("beforeprint", () => print(true));
   addEventListener("afterprint", () => print(false));
-  window.heliCharts = { numbers, array, point, groups, text, listen: f => listeners.push(f) };
+  window.heliCharts = { groups };
 })();

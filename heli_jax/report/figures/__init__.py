@@ -9,12 +9,10 @@ from heli_jax.report.figures.estimates import (
     posterior_pairs,
 )
 from heli_jax.report.figures.signals import (
-    motion,
     overview,
     residual_correlation,
     response,
     rls_history,
-    sticks,
     time_label,
 )
 
@@ -22,13 +20,11 @@ __all__ = [
     "bootstrap_pairs",
     "draw_response",
     "match",
-    "motion",
     "overview",
     "posterior_pairs",
     "quotient",
     "residual_correlation",
     "response",
     "rls_history",
-    "sticks",
     "time_label",
 ]

@@ -1,9 +1,6 @@
-"""Figures over time and by lag: signals, residuals, RLS coefficients, whiteness, manoeuvre."""
-
-from collections.abc import Mapping, Sequence
+"""Figures over time and by lag: signals, residuals, RLS coefficients, whiteness."""
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from heli_jax import naming
 from heli_jax.dynamics.model import Model
@@ -33,7 +30,6 @@ from heli_jax.report.charts import (
     time_limits,
 )
 from heli_jax.report.style import label
-from heli_jax.simulation.trajectory import Trajectory
 
 
 def response(signals: Signals, output: str, model: Model) -> Chart:
@@ -184,85 +180,3 @@ def _stems(words: str, x: np.ndarray, y: np.ndarray, limit: np.ndarray) -> Panel
     least = 2.0 * float(limit.max()) * np.array([-1.0, 1.0])
     limits = limits_of([*series, Series("", least, least, "")])
     return panel(words, series, 1.1, limits=limits, levels=(0.0,))
-
-
-_APART = "rotor_speed"
-"""Output with a panel of its own."""
-_STILL = 0.05
-"""Smallest span of an axis relative to its largest value."""
-_LEAST = {"m": 0.01, "m/s": 0.02, "rad": 0.005, "rad/s": 0.01, "m/s^2": 0.05, "1": 0.02}
-"""Smallest span of an axis by unit."""
-# States and signals are Any, because they are user classes with arrays (N,).
-
-
-def motion(run: Trajectory, model: Model) -> Chart:
-    """Draw the outputs over time, one panel for each unit, shaded outside the model's range."""
-    shown = [n for n in naming.names(model.Outputs) if n != _APART]
-    groups = [
-        (unit, {n: getattr(run.outputs, n) for n in names})
-        for unit, names in _by_unit(model.Outputs, shown)
-    ]
-    return _over_time(run, f"Motion of {model.name}", groups)
-
-
-def sticks(run: Trajectory, model: Model) -> Chart:
-    """Draw the inputs as they acted, and the rotor speed if the model has it."""
-    groups = []
-    for unit, names in _by_unit(model.Inputs, list(naming.names(model.Inputs))):
-        values = {n: np.asarray(getattr(run.inputs, n)) for n in names}
-        if unit == "m":
-            # Sticks move by millimetres.
-            unit, values = "mm", {n: 1e3 * v for n, v in values.items()}
-        groups.append((unit, values))
-    if _APART in naming.names(model.Outputs):
-        speed = {_APART: getattr(run.outputs, _APART)}
-        groups.append((naming.unit(model.Outputs, _APART), speed))
-    return _over_time(run, f"Sticks of {model.name}", groups)
-
-
-def _by_unit(record: type, names: list[str]) -> list[tuple[str | None, list[str]]]:
-    """Return the names by unit, in the record's order; a field without a unit is alone."""
-    groups: dict[str, list[str]] = {}
-    for name in names:
-        # Signals without a unit need not share a scale.
-        groups.setdefault(naming.unit(record, name) or f"no unit: {name}", []).append(name)
-    return [(naming.unit(record, group[0]), group) for group in groups.values()]
-
-
-# Unit and signals of a panel.
-type _Shown = tuple[str | None, Mapping[str, ArrayLike]]
-
-
-def _over_time(run: Trajectory, title: str, groups: Sequence[_Shown]) -> Chart:
-    t, note, shades = np.asarray(run.times), "", []
-    left = [name for name, out in run.outside.items() if np.any(out)]
-    if left:
-        note = f"shaded: outside of the model's range: {', '.join(left)}"
-        outside = np.any([np.asarray(run.outside[name]) for name in left], axis=0)
-        shades = [
-            (float(t[stretch.start]), float(t[min(stretch.stop, t.size - 1)]))
-            for stretch in np.ma.clump_masked(np.ma.array(t, mask=outside))
-        ]
-    panels = []
-    for unit, values in groups:
-        series = [
-            Series(name, t, np.asarray(y), style.CYCLE[k % len(style.CYCLE)])
-            for k, (name, y) in enumerate(values.items())
-        ]
-        if set(values) <= set(naming.names(type(run.inputs))):
-            series = [s._replace(kind="step") for s in series]
-        limits = _not_magnified(series, unit)
-        words = label(", ".join(values), unit)
-        panels.append(panel(words, series, 1.1, limits=limits, shades=tuple(shades)))
-    return Chart(title, "time [s]", time_limits(t), tuple(panels), note)
-
-
-def _not_magnified(series: Sequence[Series], unit: str | None) -> tuple[float, float]:
-    """Return limits that do not magnify a nearly constant signal."""
-    seen = np.concatenate([s.y[np.isfinite(s.y)] for s in series])
-    low, high = (float(seen.min()), float(seen.max())) if seen.size else (0.0, 0.0)
-    least = max(_STILL * max(abs(low), abs(high)), _LEAST.get(unit or "", 0.0))
-    if high - low < least:
-        middle = 0.5 * (low + high)
-        return middle - 0.55 * least, middle + 0.55 * least
-    return limits_of(series)
