@@ -354,6 +354,9 @@ def _written(path: Path, x: Mapping[str, np.ndarray]) -> None:
             pyarrow.parquet.write_table(pa.table(dict(x)), path)
         case ".feather":
             pyarrow.feather.write_feather(pa.table(dict(x)), path)
+        case ".jsonl":
+            rows = [json.dumps(dict(zip(x, row, strict=True))) for row in table]
+            path.write_text("\n".join(rows) + "\n")
         case ".mat":
             scipy.io.savemat(path, {n: v[:, None] for n, v in x.items()})
         case ".nc":
@@ -390,7 +393,7 @@ def _format(suffix: str, folder: Path) -> Result:
 
 
 FORMATS = (
-    ".csv", ".parquet", ".feather", ".mat", ".nc", ".h5", ".npz", ".ulg", ".bin", ".log",
+    ".csv", ".parquet", ".feather", ".jsonl", ".mat", ".nc", ".h5", ".npz", ".ulg", ".bin", ".log",
     ".bbl",
 )  # fmt: skip
 _LOGS = (

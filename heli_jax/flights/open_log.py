@@ -25,7 +25,7 @@ _TEXTS = (".csv", ".txt", ".tsv", ".asc", ".dat", ".log", ".lvm", ".prn", ".tab"
 _ARRAYS = (".mat", ".nc", ".h5", ".hdf5")
 """Endings that decide the format, because MATLAB 7.3, NetCDF 4 and HDF5 files begin alike."""
 EXPECTED = (
-    "expected a table (.csv, .txt, .tsv, .asc, .dat, .lvm, .parquet, .feather), arrays "
+    "expected a table (.csv, .txt, .tsv, .asc, .dat, .lvm, .parquet, .feather, .jsonl), arrays "
     "(.mat, .nc, .h5, .hdf5, .npz, .npy) or an autopilot's log (.ulg, .bin, .log, .bbl, .bfl)"
 )
 
@@ -118,6 +118,7 @@ FORMATS = (
     Format(csv_text.open_csv, _TEXTS),
     Format(arrow.open_parquet, (".parquet",), (b"PAR1",)),
     Format(arrow.open_arrow, (".feather", ".arrow", ".arrows", ".ipc"), (arrow.ARROW_MARK,)),
+    Format(library_arrays.open_json_lines, (".jsonl", ".ndjson")),
     Format(numpy_arrays.open_numpy, (".npy", ".npz"), (numpy_arrays.MAGIC,)),
     Format(library_arrays.open_mat, (".mat",), (library_arrays.MATLAB_MAGIC,)),
     Format(library_arrays.open_netcdf, (".nc",), library_arrays.NETCDF_MAGICS),

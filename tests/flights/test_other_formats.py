@@ -1,6 +1,7 @@
 """Logs of Python users and web tools, and files that are refused."""
 
 import io
+import json
 import time
 import zipfile
 from pathlib import Path
@@ -36,6 +37,7 @@ WRITERS = {
     "a.feather": lambda path: pyarrow.feather.write_feather(pa.table({"t": T, "p": P}), path),
     "a.arrow": lambda path: arrow(path, pa.ipc.new_file),
     "a.arrows": lambda path: arrow(path, pa.ipc.new_stream),
+    "a.jsonl": lambda path: FRAME.to_json(path, orient="records", lines=True, double_precision=15),
 }
 
 
@@ -53,6 +55,23 @@ def test_columns_are_what_was_stored(tmp_path: Path, name) -> None:
 def test_matrices(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.stack([T, P]))
     assert open_table(tmp_path / "a.npy").names == ("data[0]", "data[1]")
+
+
+def test_records_within_records_gaps_in_them_and_dates(tmp_path: Path) -> None:
+    stamps = np.datetime64("2024-03-01T12:00:00", "ms") + (1000 * T).astype("m8[ms]")
+    rows = [
+        {"time": str(s), "imu": {"gyro": [p, 2 * p]}, "mode": "hover"}
+        for s, p in zip(stamps, P.tolist(), strict=True)
+    ]
+    rows[7] = {"time": rows[7]["time"], "baro": 1.0}
+    path = tmp_path / "a.jsonl"
+    path.write_text("\n".join(map(json.dumps, rows)) + '\n{"time": "2024')
+    read = open_table(path).numbers(["imu.gyro[1]", "baro"])
+    np.testing.assert_allclose(read["imu.gyro[1]"], np.where(np.arange(N) == 7, np.nan, 2 * P))
+    assert np.flatnonzero(np.isfinite(read["baro"])).tolist() == [7]
+    info = describe_log(path)
+    assert info.time is not None
+    assert (info.time.column, info.time.duration) == ("time", pytest.approx(T[-1]))
 
 
 def test_two_columns_of_one_name_are_listed_and_one_is_not_chosen(tmp_path: Path) -> None:

@@ -177,11 +177,11 @@ class ColumnTable:
         require_columns(self.path, self.names, names)
         for name in names:
             kind = self._schema.field(name).type
-            if not _is_number(kind):
+            if not is_number(kind):
                 raise wrong(self.path, f"holds {kind}, expected numbers", column(name))
         self._budget.require(8 * self._n_rows * len(set(names)))
         columns = self._columns(sorted(set(names)))
-        return {name: _floats(columns.column(name)) for name in names}
+        return {name: column_floats(columns.column(name)) for name in names}
 
     def survey(self) -> list[Survey]:
         """Survey every column; non-numeric ones count as text.
@@ -203,7 +203,7 @@ class ColumnTable:
                 surveys.append(Survey(name, None, self._n_rows))
                 continue
             x = columns[name].pop(0)
-            values = _floats(x) if _is_number(x.type) else None
+            values = column_floats(x) if is_number(x.type) else None
             surveys.append(Survey(name, values, len(x) - x.null_count))
         return surveys
 
@@ -220,7 +220,7 @@ class ColumnTable:
         """Return `s`, `ms`, `us` or `ns` for a column of time stamps or durations."""
         # By place: `field` refuses a name that two columns share.
         kind = self._schema.field(self.names.index(name)).type
-        return str(kind.unit) if _is_clock(kind) else None
+        return str(kind.unit) if is_clock(kind) else None
 
     def _read(self, names: Sequence[str]) -> "pa.Table":
         """Return the columns, none of them of lists or records."""
@@ -228,29 +228,29 @@ class ColumnTable:
         return self._columns(names)
 
 
-def _is_clock(kind: "pa.DataType") -> bool:
+def is_clock(kind: "pa.DataType") -> bool:
     import pyarrow as pa
 
     types = pa.types
     return any(test(kind) for test in (types.is_timestamp, types.is_duration, types.is_time))
 
 
-def _is_number(kind: "pa.DataType") -> bool:
+def is_number(kind: "pa.DataType") -> bool:
     import pyarrow as pa
 
     types = pa.types
     # A clock's ticks count as numbers, so that a column of time stamps can be the time.
-    tests = (types.is_integer, types.is_floating, types.is_decimal, types.is_boolean, _is_clock)
+    tests = (types.is_integer, types.is_floating, types.is_decimal, types.is_boolean, is_clock)
     return any(test(kind) for test in tests)
 
 
-def _floats(values: "pa.ChunkedArray") -> np.ndarray:
+def column_floats(values: "pa.ChunkedArray") -> np.ndarray:
     """Return numbers, or ticks of a clock, as float64 (N,), NaN where null."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
     # Ticks become integers first, because no cast goes from stamps to floats.
-    if _is_clock(values.type):
+    if is_clock(values.type):
         values = values.cast(pa.int32() if pa.types.is_time32(values.type) else pa.int64())
     # Unsafe, because a safe cast refuses integers above 2^53, as all stamps in ns are. Calendar
     # stamps round to 256 ns.

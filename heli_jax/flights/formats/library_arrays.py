@@ -1,6 +1,6 @@
-"""Readers of MATLAB (.mat), NetCDF (.nc) and HDF5 (.h5, .hdf5) files.
+"""Readers of MATLAB (.mat), NetCDF (.nc), HDF5 (.h5, .hdf5) and JSON lines (.jsonl, .ndjson).
 
-SciPy and h5py read them in a separate process.
+SciPy, h5py and pyarrow read them in a separate process.
 """
 
 import importlib.util
@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from heli_jax.flights.clock import is_date, seconds_of_dates
 from heli_jax.flights.formats.apart import Content, Reader, read_apart
 from heli_jax.flights.formats.arrays import (
     LARGEST,
@@ -21,6 +22,7 @@ from heli_jax.flights.formats.arrays import (
     holds_numbers,
     text_of,
 )
+from heli_jax.flights.formats.arrow import column_floats, is_clock, is_number
 from heli_jax.flights.log import Budget, shown, wrong
 from heli_jax.regular_file import read_regular
 
@@ -29,6 +31,8 @@ NETCDF_MAGICS = (b"CDF\x01", b"CDF\x02")
 MATLAB_MAGIC = b"MATLAB "
 _DEEPEST = 10
 """Deepest nesting of groups and structures."""
+_LONGEST_LIST = 16
+"""Most numbers of a list within a record."""
 _NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
 """Name that NetCDF 4 gives to a dimension without values, which the file stores as zeros."""
 
@@ -59,6 +63,12 @@ def open_hdf5(path: Path) -> ArrayTable:
     if not data.startswith(HDF5_MAGIC):
         raise wrong(str(path), "is no HDF5 file, expected one that begins with its mark")
     return _read(path, "hdf5", read_hdf5, "HDF5 file", data)
+
+
+def open_json_lines(path: Path) -> ArrayTable:
+    """Read records in JSON, one a line."""
+    data = read_regular(path, "a log of JSON lines", LARGEST)
+    return _read(path, "json", read_json_lines, "file of JSON lines", data)
 
 
 def _read(path: Path, kind: str, reader: Reader, what: str, data: bytes) -> ArrayTable:
@@ -168,6 +178,49 @@ def read_hdf5(path: Path, budget: Budget, between: str = "/") -> Content:
     with h5py.File(path, "r") as file:
         visit(file, "", 0)
     return _content(sets)
+
+
+def read_json_lines(path: Path, budget: Budget) -> Content:
+    """Read the numbers of records, with nested ones by path: `imu.gyro[0]`."""
+    import pyarrow as pa
+    import pyarrow.compute as functions
+    import pyarrow.json as reader
+
+    sets = DataSets(budget)
+    pc: Any = functions  # its functions are made at import
+
+    def take(name: str, values: pa.ChunkedArray, depth: int) -> None:
+        kind = values.type
+        if pa.types.is_struct(kind) and depth < _DEEPEST:
+            for i in range(kind.num_fields):
+                take(f"{name}.{kind.field(i).name}", pc.struct_field(values, [i]), depth + 1)
+        elif pa.types.is_list(kind) and depth < _DEEPEST:
+            # A shorter list has no last numbers.
+            for i in range(min(pc.max(pc.list_value_length(values)).as_py() or 0, _LONGEST_LIST)):
+                cut = pc.list_slice(values, i, i + 1, return_fixed_size_list=True)
+                take(f"{name}[{i}]", pc.list_element(cut, 0), depth + 1)
+        elif is_number(kind):
+            sets.add(name, column_floats(values), {"units": kind.unit} if is_clock(kind) else {})
+        elif isinstance(seconds := _dates(values.to_pylist()), np.ndarray):
+            sets.add(name, seconds, {"units": "s"})
+        else:
+            sets.leave_out(name, "text")
+
+    data = path.read_bytes()
+    try:
+        table = reader.read_json(pa.BufferReader(data))
+    except pa.ArrowInvalid:
+        # The last record may be cut off, if the logger lost its power.
+        table = reader.read_json(pa.BufferReader(data[: data.rstrip().rfind(b"\n") + 1]))
+    for name, values in zip(table.column_names, table.columns, strict=True):
+        take(name, values, 0)
+    return _content(sets)
+
+
+def _dates(texts: list[Any]) -> np.ndarray | int | None:
+    """Return the seconds of dates (N,), or what is no date."""
+    first = next((x for x in texts if x is not None), None)
+    return seconds_of_dates(texts) if isinstance(first, str) and is_date(first) else None
 
 
 def _data_set(path: Path, sets: DataSets, item: Any, name: str) -> None:
