@@ -401,8 +401,6 @@ def resolved(experiment: Experiment) -> dict[str, Any]:
         # Links are resolved too, because the run's config.yaml is read from its own directory.
         for log in (flight, *flight["also"]):
             log["log"] = str((path.parent / log["log"]).resolve())
-        if "corrections" in flight:
-            flight["corrections"] = str((path.parent / flight["corrections"]).resolve())
     for design in _designs(content.get("sweep")):
         if "file" in design:
             design["file"] = str((path.parent / design["file"]).resolve())

@@ -1,14 +1,13 @@
 """The flights of a configuration."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from heli_jax import naming, units
-from heli_jax.config.corrections import read_corrections, with_corrections, with_notes
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.feedthrough import follows
 from heli_jax.config.kinematics import between_samples, prepared
@@ -25,7 +24,6 @@ from heli_jax.config.schema import (
     SignalsConfig,
     TimeConfig,
 )
-from heli_jax.config.vibration import vibration_notes, with_notches
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, located, require_known
 from heli_jax.finding import LEFT_OUT, Finding, note
@@ -36,11 +34,14 @@ from heli_jax.flights.flight import Source
 from heli_jax.flights.log import ChannelLog, Table
 from heli_jax.flights.preset import Named, NamedBy
 from heli_jax.flights.request import unit_note
+from heli_jax.flights.vibration import lines
 from heli_jax.identification.methods import objective_of
 
 _PULSE = (800.0, 2200.0)
 """Pulse widths of receivers and servos [us]."""
 _OFFSET_AND_SCALE = "such as offset: 1500, scale: 0.002"
+_MOST_LINES = 3
+"""Most vibration lines in the note of an output."""
 
 
 def require_flights(experiment: Experiment) -> None:
@@ -129,12 +130,15 @@ def _read_flight(experiment: Experiment, i: int, f: FlightConfig, gain: bool) ->
     flights = (flights,) if isinstance(flights, Flight) else flights
     notes = (*_unstated_units(model, everything, flights[0].source), *named.notes)
     flights = tuple(_with_instruments(flight, instruments) for flight in flights)
-    first, *others = _treated(experiment, flights, f, where)
+    first, *others = (
+        dataclasses.replace(prepared(model, flight, where), choose_windows=f.window == "auto")
+        for flight in flights
+    )
     cautions = (
         *filter_cautions(first.source, everything.outputs),
         *(coloured_noise_cautions(first, experiment.model) if _noise_given(experiment) else ()),
         *_pulse_width_doubts(first),
-        *vibration_notes(first),
+        *_vibration_notes(first),
     )
     return (_with_notes(first, notes, cautions), *others)
 
@@ -157,25 +161,6 @@ def _check(model: Model, f: FlightConfig, where: str) -> None:
         raise InputError(
             f"{where}.window: auto chooses data to fit, expected two numbers with hold_out"
         )
-
-
-def _treated(
-    experiment: Experiment, flights: Sequence[Flight], f: FlightConfig, where: str
-) -> tuple[Flight, ...]:
-    """Return the flights for the fit, with the configured corrections applied."""
-    model, corrections = experiment.model, None
-    if f.corrections is not None:
-        place = experiment.path.parent / f.corrections
-        corrections = read_corrections(place, f"{where}.corrections")
-    treated = []
-    for flight in flights:
-        # Angles are unwrapped before the notch, which would ring at the jumps. Delays come after
-        # it, because they leave samples without a value.
-        flight = with_notches(prepared(model, flight, where), f.notch or (), f"{where}.notch")
-        if corrections is not None:
-            flight = with_corrections(model, flight, corrections, where)
-        treated.append(dataclasses.replace(flight, choose_windows=f.window == "auto"))
-    return tuple(treated)
 
 
 def _with_also(named: Resolved, f: FlightConfig, where: str) -> Resolved:
@@ -354,10 +339,26 @@ def _unstated_units(
 def _with_notes(
     flight: Flight, notes: tuple[Finding, ...], cautions: tuple[Finding, ...]
 ) -> Flight:
-    flight = with_notes(flight, notes)
-    if not cautions or flight.source is None:
+    source = flight.source
+    if source is None:
         return flight
-    return dataclasses.replace(flight, source=dataclasses.replace(flight.source, cautions=cautions))
+    cautions = cautions or source.cautions
+    source = dataclasses.replace(source, notes=(*source.notes, *notes), cautions=cautions)
+    return dataclasses.replace(flight, source=source)
+
+
+def _vibration_notes(flight: Flight) -> tuple[Finding, ...]:
+    """Return a note for each output with strong lines in its spectrum."""
+    notes = []
+    for name, y in flight.outputs.items():
+        if vibration := lines(y, flight.dt):
+            each = "; ".join(
+                f"{line.hz:.3g} Hz has {100 * line.share:.2g} % of its variance"
+                for line in vibration[:_MOST_LINES]
+            )
+            words = f"{name} vibrates: {each}"
+            notes.append(note("vibration.lines", words, name, value=vibration[0].share))
+    return tuple(notes)
 
 
 def signals(
