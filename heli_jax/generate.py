@@ -1,6 +1,5 @@
 """Simulated runs of a configuration."""
 
-import warnings
 from typing import Any, NamedTuple
 
 import jax
@@ -25,7 +24,6 @@ from heli_jax.dynamics.model import Model, require_constants, require_linear, ze
 from heli_jax.errors import InputError, located, require_known
 from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
-from heli_jax.flights.holds import decide
 from heli_jax.naming import Record
 from heli_jax.simulation import events
 from heli_jax.simulation import inputs as sticks
@@ -84,10 +82,7 @@ def _stick(config: StickConfig, n: int, dt: float, rng: np.random.Generator) -> 
         return sticks.random_steps(n, dt, rng, config.hold)
     if config.kind == "3-2-1-1":
         return sticks.multistep_3211(n, dt, rng, config.step, config.pause)
-    if config.kind == "sweep":
-        # `sweep` now means a parameter sweep.
-        warnings.warn("kind: sweep is deprecated, expected chirp", DeprecationWarning, stacklevel=2)
-    if config.kind in ("chirp", "sweep"):
+    if config.kind == "chirp":
         return sticks.chirp(n, dt, *config.band)
     return np.zeros(n)
 
@@ -154,7 +149,6 @@ def generate(experiment: Experiment) -> Simulated:
     # an input of `flown`, but logs do not contain it.
     logged = {k: np.asarray(commanded[k])[: run.times.size] for k in driven}
     columns = _as_logged(experiment, np.asarray(run.times), logged, outputs)
-    notes = (*notes, *_held_notes(experiment, logged))
     return Simulated(columns, flown.model, {experiment.path.stem: run}, notes)
 
 
@@ -353,26 +347,6 @@ def _stick_notes(experiment: Experiment, run: Trajectory, flown: np.ndarray) -> 
             words = f"{name} is beyond its limits of {low:g} and {high:g}, first at {first:g} s"
             notes.append(note("simulation.stick-beyond-ends", words, name, value=float(first)))
     return notes
-
-
-def _held_notes(experiment: Experiment, logged: dict[str, np.ndarray]) -> list[Finding]:
-    """Return a note if a log's reader would not recognise inputs as held, as they are here.
-
-    Chirps and the pilot's feedback move at every sample, as sampled sticks do.
-    """
-    if not experiment.config.flights:
-        return []
-    signals = first_signals(experiment).inputs
-    auto = [n for n, signal in signals.items() if signal.hold == "auto" and n in logged]
-    moving = [n for n in auto if decide(logged[n]).hold != "zero-order"]
-    if not moving:
-        return []
-    words = (
-        f"{', '.join(moving)}: this simulation holds it between samples, but it changes at nearly "
-        "every sample; to fit this log state hold: zero-order in flights[].signals.inputs "
-        "(docs/inputs.md)"
-    )
-    return [note("hold.moving-held", words, *moving)]
 
 
 def follow(experiment: Experiment) -> Simulated:

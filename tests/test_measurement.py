@@ -110,36 +110,6 @@ def test_a_filter_that_is_not_modelled_is_a_caution(load, tmp_path):
     assert [c.code for c in moving.source.cautions] == ["filters.unknown"]
 
 
-@pytest.mark.parametrize(
-    ("method", "hz", "behind", "fixed", "said"),
-    [
-        ("filter-error", 20, False, ["sigma_y"], True),
-        ("filter-error", 20, False, [], False),  # the delay is estimated
-        ("filter-error", 20, True, ["sigma_y"], False),  # noise added by the logger is white
-        ("filter-error", 90, False, ["sigma_y"], False),
-        (
-            "output-error",
-            20,
-            False,
-            ["sigma_y"],
-            False,
-        ),  # its intervals allow for it
-    ],
-)
-def test_given_noise_that_a_low_pass_coloured_is_a_caution(
-    load, tmp_path, method, hz, behind, fixed, said
-):
-    noise = np.random.default_rng(3).normal(size=TIMES.size)
-    passed = noise if behind else scipy.signal.lfilter(*scipy.signal.butter(2, hz * 2 * DT), noise)
-    write_log(tmp_path / "flight.log", np.sin(TIMES) + 0.05 * passed, ())
-    fit = {"method": method, "free": {"Blat": {"start": 0.1}}}
-    disturbance = {"on": ["p"], "fixed": fixed}
-    noisy = load(flight(filter={"kind": "biquad", "hz": hz}), fit=fit, disturbance=disturbance)
-    (read,) = read_flights(noisy)
-    coloured = [c.value for c in read.source.cautions if c.code == "filters.noise-coloured"]
-    assert coloured == said * [pytest.approx(20, rel=1e-3)]
-
-
 ROTORFLIGHT = {
     "gyro_lpf1_type": "1", "gyro_lpf1_static_hz": "150", "gyro_lpf1_dyn_hz": "0,200",
     "gyro_lpf2_type": "2", "gyro_lpf2_static_hz": "100", "gyro_decimation_hz": "250",

@@ -1,7 +1,6 @@
 """Sections of simulated runs: `simulate`, and the design of a sweep."""
 
-import warnings
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
@@ -14,8 +13,7 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 class StickConfig(Section):
     """Movement of one input in a simulation."""
 
-    # "sweep" is the older name of "chirp".
-    kind: Literal["random-steps", "3-2-1-1", "chirp", "sweep", "neutral"] = "random-steps"
+    kind: Literal["random-steps", "3-2-1-1", "chirp", "neutral"] = "random-steps"
     """kind of motion"""
     amplitude: Positive
     """largest deflection, in `unit`"""
@@ -55,22 +53,6 @@ class StartConfig(Section):
     """climb rate [m/s]"""
     heading: Finite = 0.0
     """heading psi [rad]"""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _renamed(cls, content: Any) -> Any:
-        """Accept the former names of the speeds, with a warning."""
-        if not isinstance(content, dict):
-            return content
-        content = dict(content)
-        for old, new in (("ahead", "forward_speed"), ("aside", "lateral_speed")):
-            if old not in content:
-                continue
-            if new in content:
-                raise ValueError(f"expected {new} alone, got {old} and {new}, which mean the same")
-            warnings.warn(f"{old} is deprecated, expected {new}", DeprecationWarning, stacklevel=2)
-            content[new] = content.pop(old)
-        return content
 
 
 class SimulateConfig(Section):

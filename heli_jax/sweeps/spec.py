@@ -55,8 +55,7 @@ class RunOptions(NamedTuple):
     substeps: int | None = None
     """Steps per sample; by default enough for steps of 5 ms."""
     precision: Precision = "float64"
-    """Precision. float32 is faster on some devices; its error is measured on 64 elements and stored
-    in the attributes."""
+    """Precision. float32 is faster on some devices."""
     trajectories: Trajectories | None = None
     """Outputs to keep, thinned."""
     trimmed: Trimmed | None = None
@@ -197,7 +196,7 @@ def job(
     _check_axes(model, design, flights)
     _check_inputs(model, flights)
     _check_results(model, design, reduce, flights, options.trajectories)
-    _check_precision(model, options.precision)
+    _check_precision(options.precision)
     # The exact step of a linear model leaves no solver error in the results.
     solver = options.solver or ("exact" if model.linear else "rk4")
     if solver == "exact" and not model.linear:
@@ -225,7 +224,7 @@ def job(
     return Job(model, numbers, flights, design, dict(reduce), checked)
 
 
-def _check_precision(model: Model, precision: str) -> None:
+def _check_precision(precision: str) -> None:
     if precision not in ("float64", "float32"):
         raise ValueError(f"precision: expected float64 or float32, got {precision!r}")
     # Otherwise JAX would silently compute in float32.
@@ -234,32 +233,6 @@ def _check_precision(model: Model, precision: str) -> None:
             "precision: float64 is switched off in JAX, expected "
             "jax.config.update('jax_enable_x64', True), or precision='float32'"
         )
-    if precision == "float32":
-        _check_single(model)
-
-
-def _check_single(model: Model) -> None:
-    """Refuse a model that converts float32 to float64, for example by a NumPy table.
-
-    The type of the carried state would change from one sample to the next.
-    """
-
-    def computed(p: Any, s: Any, u: Any) -> tuple[dict[str, Any], dict[str, Any]]:
-        arguments = model.Params(**p), model.State(**s), model.Inputs(**u)
-        results = model.vector_field(*arguments), model.output(*arguments)
-        return naming.asdict(results[0]), naming.asdict(results[1])
-
-    single = jax.ShapeDtypeStruct((), np.float32)
-    classes = (model.Params, model.State, model.Inputs)
-    results = jax.eval_shape(computed, *(dict.fromkeys(naming.names(c), single) for c in classes))
-    for function, values in zip(("vector_field", "output"), results, strict=True):
-        for name, value in values.items():
-            if value.dtype == np.float64:
-                raise ValueError(
-                    f"precision: the {function} of model {model.name!r} returns {name} in float64 "
-                    "although all its arguments are float32; expected float64, or its arrays "
-                    "made as jnp.asarray(table, x.dtype), x a state"
-                )
 
 
 def _check_axes(model: Model, design: Design, flights: tuple[Flight, ...]) -> None:

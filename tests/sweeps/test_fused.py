@@ -97,19 +97,6 @@ def test_an_operation_without_a_translation_is_said(bench30, record, capsys):
     assert re.search(r"the operation erf_inv \(at test_fused.py:\d+\)", said)
 
 
-def test_a_model_that_leaves_single_precision(bench30, record):
-    def vector_field(p, s, u):
-        d = STAND.vector_field(p, s, u)
-        return naming.replace(d, dphi=d.dphi.astype(np.float64))
-
-    model = dataclasses.replace(STAND, vector_field=vector_field, linear=False)
-    design, reduce = paired({"Ixx": [0.03, 0.04]}), {"rms": Reduce("rms", "roll")}
-    with pytest.raises(
-        ValueError, match=r"precision: the vector_field of model .* dphi in float64"
-    ):
-        sweep(model, bench30, record, design, reduce, precision="float32")
-
-
 def test_a_translation_that_fails_is_no_sweep_that_fails(bench30, record, monkeypatch):
     from heli_jax.fused.operations import OPERATIONS
     from heli_jax.sweeps.run import Options, run_sweep
