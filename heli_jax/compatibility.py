@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from heli_jax import naming, run_directory, units, workflow
-from heli_jax.config.corrections import Conversion, conversion_of, logged_signals
+from heli_jax import naming, run_directory, workflow
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.kinematics import NOISES, SIZES
 from heli_jax.dynamics.kinematics import FORCES, RATES, is_kinematic
@@ -314,39 +313,36 @@ def _doubts(run: FitRun, errors: Sequence[SensorError]) -> tuple[Finding, ...]:
 def _corrections(
     run: FitRun, values: dict[str, float], errors: Sequence[SensorError]
 ) -> dict[str, Any]:
-    """Return the content of a file of corrections: the determined errors, by the log's names."""
+    """Return the content of a file of corrections: `signals` and `known` of another configuration.
+
+    A sensor shows (1 + lambda) truth + b, so its number is converted with another scale and offset.
+    """
     experiment = run.config
-    model = experiment.model
     # The earliest sensor needs no correction. Delays are relative to it.
     by_sensor = {"delay_gyro": RATES, "delay_accel": FORCES}
     early = {n: values.get(p, 0.0) for p, names in by_sensor.items() for n in names}
     latest = max(0.0, *early.values())
-    lines = dict(model.delay_lines)
+    lines = dict(experiment.model.delay_lines)
     signals: dict[str, Any] = {}
-    for each in (each for flight in run.problem.flights for each in logged_signals(flight)):
-        n, signal = each.name, each.signal
-        if signals.get(signal.name, {"of": n})["of"] != n:
-            # A file of corrections identifies a signal by its name alone.
-            raise InputError(
-                f"{experiment.path}: {signal.name} is {signals[signal.name]['of']} in one log and "
-                f"{n} in another, expected one name for one sensor"
-            )
+    sources = [f.source for f in reversed(run.problem.flights) if f.source is not None]
+    read = {n: s for source in sources for n, s in {**source.inputs, **source.outputs}.items()}
+    for n, signal in read.items():
         late = latest - early[n] if n in early else latest + values.get(lines.get(n, ""), 0.0)
-        correction = {
-            "scale": _short(values.get(f"lambda_{n}", 0.0)),
-            "bias": _short(values.get(f"b_{n}", 0.0) / units.factor(signal.unit, signal.si)),
-            "delay": _short(late),
-        }
-        if any(correction.values()):
-            conversion = conversion_of(signal)
-            # Left out if the numbers need no conversion.
-            read = {} if conversion == Conversion() else {"conversion": conversion.model_dump()}
-            signals[signal.name] = {"of": n, "unit": signal.unit, **correction, **read}
-    arm = {n: _short(values[n]) for n in ("x_imu", "y_imu", "z_imu") if n in values}
+        scale, bias = values.get(f"lambda_{n}", 0.0), values.get(f"b_{n}", 0.0)
+        # A constant is stated, not measured.
+        if signal.constant is None and (scale or bias or _short(late)):
+            # The bias in the log's own numbers is independent of scale and sign.
+            conversion = {
+                "scale": _short(signal.scale / (1.0 + scale)),
+                "offset": _short(float(signal.from_si(np.asarray(bias)))),
+                **({"invert": True} if signal.invert else {}),
+                **({"delay": _short(late)} if _short(late) else {}),
+            }
+            signals[n] = {"signal": signal.name, "unit": signal.unit, **conversion}
     return {
         "found_by": f"heli-jax compatibility {experiment.path.name}",
         "signals": signals,
-        "lever_arm": arm,
+        "known": {n: _short(values[n]) for n in ("x_imu", "y_imu", "z_imu") if n in values},
         "not_determined": [e.name for e in errors if not e.determined],
     }
 

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from heli_jax import naming
-from heli_jax.summaries import precision_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -55,7 +54,7 @@ def trajectory_dataset(run: Any) -> "xr.Dataset":
     The role is state, output or input. An output that shares its name with a state or input becomes
     `NAME_output`; an input becomes `NAME_input`. In a batch, each signal has the dimensions
     `run_0`, `run_1` ... before time. The attribute `precision` is the floating-point type of the
-    run; below float64, `precision_note` states the loss.
+    run.
 
     Raises:
         ValueError: the runs of a batch differ in their times.
@@ -79,6 +78,8 @@ def trajectory_dataset(run: Any) -> "xr.Dataset":
     status = (batch, np.asarray(run.status), {"meaning": "index into trajectory.STATUS"})
     coordinates = {"time": ("time", first, {"units": "s"}), "status": status}
     # The types in a file do not show the precision of the run, since float32 may have been widened.
-    precision, cost = precision_of(run)
-    attributes = {"precision": precision} | ({"precision_note": cost} if cost else {})
-    return xr.Dataset(variables, coordinates, attributes)
+    records = (run.states, run.outputs)
+    types = {np.dtype(v.dtype) for r in records for v in naming.asdict(r).values()}
+    floats = [t for t in types if t.kind == "f"]
+    precision = min(floats, key=lambda t: t.itemsize, default=np.dtype(float)).name
+    return xr.Dataset(variables, coordinates, {"precision": precision})

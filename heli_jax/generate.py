@@ -1,6 +1,5 @@
 """Simulated runs of a configuration."""
 
-import warnings
 from typing import Any, NamedTuple
 
 import jax
@@ -13,7 +12,6 @@ from heli_jax.analysis.trim import STICKS, Condition, Trim, is_full_nonlinear, t
 from heli_jax.config import (
     Experiment,
     SimulateConfig,
-    StickConfig,
     disturbed,
     first_signals,
     in_wind,
@@ -25,10 +23,9 @@ from heli_jax.dynamics.model import Model, require_constants, require_linear, ze
 from heli_jax.errors import InputError, located, require_known
 from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
-from heli_jax.flights.holds import decide
 from heli_jax.naming import Record
 from heli_jax.simulation import events
-from heli_jax.simulation import inputs as sticks
+from heli_jax.simulation.inputs import Shape, excitation
 from heli_jax.simulation.simulate import simulate, substeps_for
 from heli_jax.simulation.trajectory import Trajectory
 from heli_jax.sweeps.spec import Trimmed
@@ -59,7 +56,8 @@ def _stick_inputs(
     record = experiment.model.Inputs
     words = f"model {experiment.model.name} has no input"
     require_known(settings.inputs, naming.names(record), f"{where}.inputs", words)
-    out = {}
+    out, dt = {}, 1.0 / settings.rate
+    together = [n for n, stick in settings.inputs.items() if stick.kind == "multisine"]
     # Draws follow the model's order, so that they do not depend on the order in the configuration.
     for name in naming.names(record):
         stick = settings.inputs.get(name)
@@ -68,21 +66,12 @@ def _stick_inputs(
             continue
         si = naming.unit(record, name) or "1"
         scale = _factor_to_si(stick.unit or si, si, f"{where}.inputs.{name}.unit")
-        out[name] = stick.amplitude * scale * _stick(stick, n, 1.0 / settings.rate, rng)
+        place = (together.index(name), len(together)) if name in together else (0, 1)
+        shape = Shape(stick.step, stick.pause, stick.hold, stick.band, stick.fade, place)
+        limits = {"amplitude": scale * stick.amplitude, "rate": scale * (stick.rate or np.inf)}
+        with located(f"{where}.inputs.{name}"):
+            out[name] = excitation(stick.kind, n, dt, rng, shape, **limits)
     return out
-
-
-def _stick(config: StickConfig, n: int, dt: float, rng: np.random.Generator) -> np.ndarray:
-    if config.kind == "random-steps":
-        return sticks.random_steps(n, dt, rng, config.hold)
-    if config.kind == "3-2-1-1":
-        return sticks.multistep(n, dt, rng, config.step, config.pause)
-    if config.kind == "sweep":
-        # `sweep` now means a parameter sweep.
-        warnings.warn("kind: sweep is deprecated, expected chirp", DeprecationWarning, stacklevel=2)
-    if config.kind in ("chirp", "sweep"):
-        return sticks.chirp(n, dt, *config.band)
-    return np.zeros(n)
 
 
 def _factor_to_si(unit: str, si: str, where: str) -> float:
@@ -147,7 +136,6 @@ def generate(experiment: Experiment) -> Simulated:
     # an input of `flown`, but logs do not contain it.
     logged = {k: np.asarray(commanded[k])[: run.times.size] for k in driven}
     columns = _as_logged(experiment, np.asarray(run.times), logged, outputs)
-    notes = (*notes, *_held_notes(experiment, logged))
     return Simulated(columns, {experiment.path.stem: run}, notes)
 
 
@@ -346,26 +334,6 @@ def _stick_notes(experiment: Experiment, run: Trajectory, flown: np.ndarray) -> 
             words = f"{name} is beyond its limits of {low:g} and {high:g}, first at {first:g} s"
             notes.append(note("simulation.stick-beyond-ends", words, name, value=float(first)))
     return notes
-
-
-def _held_notes(experiment: Experiment, logged: dict[str, np.ndarray]) -> list[Finding]:
-    """Return a note if a log's reader would not recognise inputs as held, as they are here.
-
-    Chirps and the pilot's feedback move at every sample, as sampled sticks do.
-    """
-    if not experiment.config.flights:
-        return []
-    signals = first_signals(experiment).inputs
-    auto = [n for n, signal in signals.items() if signal.hold == "auto" and n in logged]
-    moving = [n for n in auto if decide(logged[n]).hold != "zero-order"]
-    if not moving:
-        return []
-    words = (
-        f"{', '.join(moving)}: this simulation holds it between samples, but it changes at nearly "
-        "every sample; to fit this log state hold: zero-order in flights[].signals.inputs "
-        "(docs/inputs.md)"
-    )
-    return [note("hold.moving-held", words, *moving)]
 
 
 def follow(experiment: Experiment) -> Simulated:

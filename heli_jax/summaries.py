@@ -148,27 +148,6 @@ def of_fit(fit: Any) -> Summary:
     )
 
 
-def precision_of(run: Any) -> tuple[str, str]:
-    """Return the floating-point type of a run, and the loss of precision below float64 (else
-    empty).
-
-    Args:
-        run: a Trajectory, concrete or traced.
-    """
-    records = (run.states, run.outputs)
-    types = {np.dtype(v.dtype) for r in records for v in naming.asdict(r).values()}
-    least = min((t for t in types if t.kind == "f"), key=lambda t: t.itemsize, default=None)
-    if least is None or least.itemsize >= 8:
-        return "float64", ""
-    # Measured for the roll model on the bench, against the same run in float64.
-    digits = np.finfo(least).precision + 1
-    return least.name, (
-        f"computed in {least.name}, with {digits} instead of 16 digits, which changes a roll run "
-        "of 100,000 samples by 5e-5 of a signal's largest value (for float64 call "
-        "jax.config.update('jax_enable_x64', True) first)"
-    )
-
-
 def of_trajectory(run: Any, statuses: Sequence[str]) -> Summary:
     """Summarise the signals with ranges in SI and the end of a run.
 
@@ -180,13 +159,12 @@ def of_trajectory(run: Any, statuses: Sequence[str]) -> Summary:
         for role, record in (("state", run.states), ("output", run.outputs), ("input", run.inputs))
         for name, values in naming.asdict(record).items()
     ]
-    remark = tuple(filter(None, (precision_of(run)[1],)))
     # A repr must never fail. Within jit only shapes are known.
     if np.ndim(run.times) != 1 or not _concrete([run.times, run.finite, *(v for *_, v in signals)]):
         shape = tuple(np.shape(run.times))
         rows = tuple((role, name, str(tuple(np.shape(v)))) for role, name, v in signals)
         head = ("", "signal", "shape")
-        return Summary(f"Trajectory, times of shape {shape}", head, rows, remark)
+        return Summary(f"Trajectory, times of shape {shape}", head, rows)
     times = np.asarray(run.times)
     # The key includes the role, since an output and a state of the same name may differ in unit.
     units = {
@@ -199,10 +177,7 @@ def of_trajectory(run: Any, statuses: Sequence[str]) -> Summary:
         f"{statuses[int(np.asarray(run.status))]}",
         ("", "signal", "lowest", "highest", "unit"),
         tuple((role, n, *_range(np.asarray(v)), units[role, n]) for role, n, v in signals),
-        (
-            *(f"outside: {n}" for n, where in run.outside.items() if np.any(np.asarray(where))),
-            *remark,
-        ),
+        tuple(f"outside: {n}" for n, where in run.outside.items() if np.any(np.asarray(where))),
     )
 
 

@@ -17,6 +17,7 @@ from heli_jax.analysis.flight_responses import Settings
 from heli_jax.config import Experiment
 from heli_jax.config.frequency import missing_handling, requested_handling
 from heli_jax.config.frequency_section import FrequencyConfig
+from heli_jax.config.logs import log_notes
 from heli_jax.errors import InputError, located, require_kind
 from heli_jax.finding import Finding, note, without_repeats
 from heli_jax.identification.equation_error.rls import Baseline, baseline
@@ -243,28 +244,7 @@ def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Ch
 def reading_notes(problem: Problem) -> list[Finding]:
     """Return the notes of the logs' readers, and notes on the origin of estimated start values."""
     guess = problem.first_guess
-    return without_repeats((*log_notes(problem), *(guess.findings if guess else ())))
-
-
-def log_notes(problem: Problem) -> list[Finding]:
-    """Return the notes of the logs' readers; each sentence begins with its log."""
-    notes = []
-    for flight in problem.flights:
-        where = flight.source.path if flight.source else flight.name
-        notes += [n.of(where) for n in (flight.source.notes if flight.source else ())]
-        notes += [
-            note(
-                "hold.guessed",
-                f"{where}: {name} is taken as {flight.hold[name]} between samples, because it "
-                f"{reason}; if a computer commanded it, state hold: zero-order",
-                name,
-            )
-            for name, reason in flight.hold_reason.items()
-            # Readers expect held sticks, so these need no note.
-            if flight.hold[name] != "zero-order"
-        ]
-    # Flights may be windows of one log, so repeated notes are removed.
-    return without_repeats(notes)
+    return without_repeats((*log_notes(problem.flights), *(guess.findings if guess else ())))
 
 
 def _baseline(config: Experiment, problem: Problem, fitted: Fit, progress: Say) -> Baseline | None:

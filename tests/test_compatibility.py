@@ -11,7 +11,6 @@ import yaml
 
 from heli_jax import Prior, compatibility, config
 from heli_jax.cli import main
-from heli_jax.errors import InputError
 from heli_jax.finding import note
 from heli_jax.identification.result import Estimate
 from heli_jax.identification.validation.adequacy import OutputAdequacy
@@ -68,29 +67,6 @@ def configured(folder, name="sensors.yaml", **more):
     return path
 
 
-def notes_of(flight):
-    """Return by code the signals and errors that the notes name."""
-    assert flight.source is not None
-    return [(n.code, n.subjects) for n in flight.source.notes]
-
-
-def test_errors_are_taken_off(folder, true):
-    late = {"unit": "deg", "delay": LATE}
-    roll = {"of": "p", "unit": "deg/s", "scale": SCALE, "bias": BIAS}
-    content = {"signals": {"gx": roll, "roll": late, "pitch": late, "yaw": late}}
-    (folder / "found.yaml").write_text(yaml.safe_dump(content))
-    applied = configured(folder, "next.yaml", flight={"corrections": "found.yaml"})
-    [flight] = config.read_flights(config.load(applied))
-    t, omega, angles = true
-    np.testing.assert_allclose(flight.inputs["p"], omega[:, 0], atol=0.02)
-    # The angles are at their own times again; the last sample is missing.
-    n = round(LATE * RATE)
-    error = flight.outputs["phi"][:-2] - angles[n : n + t.size - 2, 0]
-    assert np.std(error) < 0.008
-    assert np.isnan(flight.outputs["phi"][-1])
-    assert ("corrections.applied", ("p",)) in notes_of(flight)
-
-
 def test_a_model_of_the_machine_is_refused(folder, capsys):
     path = configured(folder, model={"linear": "roll-flybarless"})
     assert main(["compatibility", str(path), "--out", str(folder / "out")]) == 2
@@ -138,7 +114,10 @@ def test_what_a_fit_says_of_the_sensors(folder):
     assert sound.compatible
     assert [(d.code, d.value) for d in sound.doubts[:1]] == [("sensors.scale-too-large", 0.23)]
     assert [d.code for d in sound.doubts[1:]] == ["of.fit"]
-    assert sound.corrections["signals"]["roll"]["delay"] == 0.04
+    signals = sound.corrections["signals"]
+    assert signals["phi"] == {
+        "signal": "roll", "unit": "deg", "scale": 1.0, "offset": 0.0, "delay": 0.04
+    }  # fmt: skip
     assert sound.corrections["not_determined"] == ["b_r"]
     assert compatibility._agreement(sound).doubts == sound.doubts[:1]  # also on the fit's page
     bad = judged({"phi": 0.99, "psi": 0.2})
@@ -153,39 +132,25 @@ def test_what_a_fit_says_of_the_sensors(folder):
     assert not lost.corrections["signals"]
 
 
-CORRECTION = {"unit": "deg/s", "bias": 1.5}
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        {"signals": {"gx": {**CORRECTION, "bais": 1}}},
-        {"signals": {"gx": {"bias": 1.5}}},
-        {"signals": {"gx": {**CORRECTION, "unit": "rad/s"}}},
-        {"signals": {"gx": {**CORRECTION, "unit": "m"}}},
-        {"signals": {"gx": {**CORRECTION, "scale": -1}}},
-        {"signals": {"gx": {**CORRECTION, "conversion": {"invert": True}}}},
-        {"signals": {"other": CORRECTION}},
-        {},
-    ],
-)
-def test_wrong_corrections_are_refused_in_a_sentence(folder, content):
-    (folder / "c.yaml").write_text(yaml.safe_dump(content))
-    experiment = config.load(configured(folder, flight={"corrections": "c.yaml"}))
-    with pytest.raises(InputError):
-        config.read_flights(experiment)
-
-
-def test_a_lever_arm_goes_to_a_model_that_has_one(folder):
-    content = {
-        "signals": {"gx": CORRECTION},
-        "lever_arm": {"x_imu": 0.2},
-        "not_determined": ["b_r"],
-    }
-    (folder / "c.yaml").write_text(yaml.safe_dump(content))
-    experiment = config.load(configured(folder, flight={"corrections": "c.yaml"}))
-    [flight] = config.read_flights(experiment)
-    assert flight.known == {}
-    said = notes_of(flight)
-    assert ("corrections.left-out", ("x_imu",)) in said
-    assert ("corrections.left-out", ("b_r",)) in said
+@pytest.mark.parametrize("how", [{}, {"scale": 2.0, "offset": 3.0, "invert": True}])
+def test_the_written_conversion_removes_the_errors(folder, true, how):
+    errors = {"lambda_p": (SCALE, 0.001), "b_p": (np.radians(BIAS), 1e-4), "x_imu": (0.2, 0.01)}
+    run = fitted(folder, errors, {"phi": 0.99})
+    path = configured(folder)
+    content = yaml.safe_load(path.read_text())
+    signals = content["flights"][0]["signals"]
+    if how:
+        # The log of another gyro, whose numbers need a conversion.
+        log = np.genfromtxt(folder / "log.csv", delimiter=",", names=True)
+        log["gx"] = log["gx"] / -2.0 + 3.0
+        np.savetxt(folder / "log.csv", log, delimiter=",", comments="",
+                   header=",".join(log.dtype.names))  # fmt: skip
+        signals["inputs"]["p"] |= how
+        path.write_text(yaml.safe_dump(content))
+    run.problem.flights = config.read_flights(config.load(path))
+    written = compatibility.judged(run).corrections
+    assert written["known"] == {"x_imu": 0.2}
+    signals["inputs"]["p"] = written["signals"]["p"]
+    path.write_text(yaml.safe_dump(content))
+    [flight] = config.read_flights(config.load(path))
+    np.testing.assert_allclose(flight.inputs["p"], true[1][:, 0], atol=0.02)

@@ -1,7 +1,6 @@
 """Filters, delays and vibration between motion and log in a configuration."""
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,11 +10,9 @@ import yaml
 from heli_jax import config as configuration
 from heli_jax.config.firmware_filters import logged_filters
 from heli_jax.config.logs import read_flights
-from heli_jax.config.vibration import with_notches
 from heli_jax.dynamics.onboard.filters import Filter
 from heli_jax.errors import InputError
-from heli_jax.flights import Flight, Source
-from heli_jax.flights.vibration import folded, lines, notched
+from heli_jax.flights.vibration import lines
 from heli_jax.linear_models.read import linear_model
 from heli_jax.models import with_filters
 
@@ -113,36 +110,6 @@ def test_a_filter_that_is_not_modelled_is_a_caution(load, tmp_path):
     assert [c.code for c in moving.source.cautions] == ["filters.unknown"]
 
 
-@pytest.mark.parametrize(
-    ("method", "hz", "behind", "fixed", "said"),
-    [
-        ("filter-error", 20, False, ["sigma_y"], True),
-        ("filter-error", 20, False, [], False),  # the delay is estimated
-        ("filter-error", 20, True, ["sigma_y"], False),  # noise added by the logger is white
-        ("filter-error", 90, False, ["sigma_y"], False),
-        (
-            "output-error",
-            20,
-            False,
-            ["sigma_y"],
-            False,
-        ),  # its intervals allow for it
-    ],
-)
-def test_given_noise_that_a_low_pass_coloured_is_a_caution(
-    load, tmp_path, method, hz, behind, fixed, said
-):
-    noise = np.random.default_rng(3).normal(size=TIMES.size)
-    passed = noise if behind else scipy.signal.lfilter(*scipy.signal.butter(2, hz * 2 * DT), noise)
-    write_log(tmp_path / "flight.log", np.sin(TIMES) + 0.05 * passed, ())
-    fit = {"method": method, "free": {"Blat": {"start": 0.1}}}
-    disturbance = {"on": ["p"], "fixed": fixed}
-    noisy = load(flight(filter={"kind": "biquad", "hz": hz}), fit=fit, disturbance=disturbance)
-    (read,) = read_flights(noisy)
-    coloured = [c.value for c in read.source.cautions if c.code == "filters.noise-coloured"]
-    assert coloured == said * [pytest.approx(20, rel=1e-3)]
-
-
 ROTORFLIGHT = {
     "gyro_lpf1_type": "1", "gyro_lpf1_static_hz": "150", "gyro_lpf1_dyn_hz": "0,200",
     "gyro_lpf2_type": "2", "gyro_lpf2_static_hz": "100", "gyro_decimation_hz": "250",
@@ -187,74 +154,15 @@ def test_lines_are_found():
     first, second = lines(shaken, DT)
     np.testing.assert_allclose([first.hz, second.hz], [24.2, 55.0], atol=0.13)
     np.testing.assert_allclose(first.share, 0.045 / np.var(shaken), rtol=0.2)
-    # 80 Hz sampled at 100 Hz appears at 20 Hz.
-    assert folded(80.0, 100.0) == 20.0
     assert lines(slow, DT) == ()
     assert lines(np.full(300, np.nan), DT) == ()
 
 
-def test_notches_on_both_sides_bias_nothing(load, tmp_path):
-    # p follows the stick by 1/(0.05 s + 1), sampled with the stick held.
-    decay = np.exp(-DT / 0.05)
-    p = scipy.signal.lfilter([0, 1 - decay], [1, -decay], stick(TIMES))
-    write_log(tmp_path / "flight.log", p + 0.05 * np.sin(2 * np.pi * 24.2 * TIMES))
-    shaken = flight()
-    (noisy,) = read_flights(load(shaken))
+def test_lines_are_a_caution(load, tmp_path):
+    p = 0.1 * stick(TIMES) + 0.05 * np.sin(2 * np.pi * 24.2 * TIMES)
+    write_log(tmp_path / "flight.log", p)
+    (noisy,) = read_flights(load(flight()))
     assert noisy.source.cautions[-1].code == "vibration.lines"
-    (clean,) = read_flights(load(shaken | {"notch": [24.2]}))
-    assert "vibration.lines" not in {c.code for c in clean.source.cautions}
-    # The notched stick drives the same vehicle to the notched motion, after the notch's transient.
-    again = scipy.signal.lfilter([0, 1 - decay], [1, -decay], clean.inputs["lat"])
-    settled = TIMES > 2.0
-    np.testing.assert_allclose(clean.outputs["p"][settled], again[settled], atol=2e-4)
-    # With a notch on one side alone it would not.
-    assert np.max(np.abs(notched(p, DT, [24.2], 10.0) - p)[settled]) > 3e-3
-    with pytest.raises(InputError, match="notch: expected less than half the rate of 200 Hz"):
-        read_flights(load(shaken | {"notch": [150.0]}))
-    with pytest.raises(InputError, match=r"notch: "):
-        load(shaken | {"notch": 24.2})
-
-
-def test_a_notch_begins_anew_behind_missing_samples():
-    x = np.sin(2 * np.pi * 0.4 * TIMES) + 0.3 * np.sin(2 * np.pi * 24.2 * TIMES)
-    b, a = scipy.signal.iirnotch(24.2, 10.0, 1 / DT)
-    whole = scipy.signal.lfilter(b, a, x, zi=scipy.signal.lfilter_zi(b, a) * x[0])[0]
-    y = np.where((TIMES > 4.0) & (TIMES < 4.2), np.nan, x)
-    gap = Flight(DT, {"lat": x}, {"p": y}, source=Source("flight.log", "0"))
-    clean = with_notches(gap, [24.2], "notch")
-    np.testing.assert_array_equal(clean.inputs["lat"], whole)
-    got = clean.outputs["p"]
-    # The notch's free motion decays to a twentieth after three time constants, Q/(pi f).
-    settled = 30.0 / (np.pi * 24.2) < TIMES - 4.2
-    assert np.array_equal(np.isfinite(got), (TIMES <= 4.0) | settled)
-    np.testing.assert_array_equal(got[TIMES <= 4.0], whole[TIMES <= 4.0])
-    np.testing.assert_allclose(got[settled], whole[settled], atol=0.05 * 0.4)
-    np.testing.assert_allclose(got[TIMES > 6.0], whole[TIMES > 6.0], atol=1e-3)
-    assert (clean.source.notes[-1].code, clean.source.notes[-1].value) == (
-        "notches.samples-lost",
-        79,
-    )
-    often = replace(gap, outputs={"p": np.where(np.arange(2000) % 30, x, np.nan)})
-    with pytest.raises(InputError, match="which leaves 0 of its 1933 samples; expected a window"):
-        with_notches(often, [24.2], "notch")
-
-
-def test_a_notch_leaves_a_slow_sensor_what_it_cannot_have():
-    x = np.sin(2 * np.pi * 0.4 * TIMES) + 0.3 * np.sin(2 * np.pi * 24.2 * TIMES)
-    slow = np.where(np.arange(2000) % 10, np.nan, x)  # 20 Hz
-    third = np.where(np.arange(2000) % 3 == 1, x, np.nan)  # 67 Hz
-    flight = Flight(DT, {"lat": x}, {"h": slow, "p": x, "v": third}, source=Source("a", "0"))
-    clean = with_notches(flight, [24.2, 48.4], "notch")
-    np.testing.assert_array_equal(clean.outputs["h"], slow)
-    np.testing.assert_array_equal(clean.outputs["p"], clean.inputs["lat"])
-    # The slow output is notched at its own samples, and only at the line that they contain.
-    own = clean.outputs["v"][1::3]
-    np.testing.assert_array_equal(own, notched(x[1::3], 3 * DT, [24.2], 10.0))
-    assert np.isnan(np.delete(clean.outputs["v"], np.s_[1::3])).all()
-    assert [(n.code, n.subjects, n.value) for n in clean.source.notes[1:]] == [
-        ("notches.too-slow", ("h",), pytest.approx(20.0)),
-        ("notches.too-slow", ("v",), pytest.approx(200 / 3)),
-    ]
 
 
 def test_raw_pulse_widths_are_doubted(load, tmp_path):

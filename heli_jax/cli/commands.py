@@ -99,7 +99,7 @@ _COMMANDS = {
         *_CONFIG, _OUT, _JSON, _VERBOSE, _RESUME, *_WORKERS,
         _arg("--over", action="append", default=[], metavar="KEY=VALUE,VALUE",
              help="a study (docs/studies.md): fit with each value, with several keys each "
-             "combination; as --set repeated with one KEY, or study in CONFIG"),
+             "combination; or study in CONFIG"),
         _arg("--reports", help="also write the page of each fit of a study"),
     )),
     "compatibility": ((
@@ -138,9 +138,6 @@ _COMMANDS = {
         _arg("--preset", metavar="NAME", help=(
             "the configuration's signals, by its names and in SI"
         )),
-        _arg("--config", metavar="CONFIG",
-             help="the signals of its first flight, by the model's names and in SI; or its "
-             "swashplate, for --signals ccpm.roll"),
         _arg("--rate", type=float, metavar="HZ", help="resample to this rate"),
         _arg("--window", nargs=2, type=float, metavar=("FROM", "TO"),
              help="[s] from the log's beginning"),
@@ -558,12 +555,6 @@ def _convert(options: argparse.Namespace) -> int:
     convert.require_output(out, options.log)
     run_directory.require_place(out, f"{out}")
     selection = _selection(options)
-    if options.config is not None:
-        _prepare_jax()
-        from heli_jax import workflow
-        from heli_jax.config.logs import as_configured
-
-        selection = as_configured(workflow.load_config(options.config), selection)
     converted = convert.convert_log(options.log, selection)
     with run_directory.whole_file(out, f"{out}") as temporary:
         convert.write_converted(temporary, converted)
@@ -580,9 +571,8 @@ def _selection(options: argparse.Namespace) -> "Selection":
     from heli_jax.flights import convert
     from heli_jax.flights.preset import by_preset as named_by
 
-    if options.preset is not None and (options.signals or options.config is not None):
-        other = "--signals" if options.signals else "--config"
-        raise InputError(f"--preset: already names the columns, expected it without {other}")
+    if options.preset is not None and options.signals:
+        raise InputError("--preset: already names the columns, expected it without --signals")
     by_preset = None
     if options.preset is not None:
         with located("--preset"):

@@ -11,8 +11,7 @@ from heli_jax.config.frequency import missing_handling
 from heli_jax.finding import Finding
 from heli_jax.identification.design.accuracy import GUESSED
 from heli_jax.identification.equation_error.rls import Baseline
-from heli_jax.identification.equation_error.start import EquationErrorStart
-from heli_jax.identification.fit import Check, Estimate, FrequencyErrorStart
+from heli_jax.identification.fit import Check, Estimate
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.numbers import (
     percent,
@@ -71,7 +70,8 @@ def _print_details(run: FitRun) -> None:
     if (responses := report_tables.responses(fit.responses)) is not None:
         print_page_table(responses)
     if problem.first_guess is not None:
-        _print_first_guess(problem.first_guess)
+        print_text("Start values by equation error (not results):")
+        print_page_table(report_tables.first_guess(problem.first_guess))
     gates = card(fit, supplementary.responses)
     print_text(plain_words(f"acceptance card: {summary(gates, _GATES)}"))
     if supplementary.choice is not None:
@@ -129,11 +129,6 @@ def print_compatibility(result: Compatibility) -> None:
     assert result.run.directory is not None
     print_text(f"corrections: {result.run.directory / compatibility.FILE}")
     print_text(f"report: {result.run.directory / 'report.html'}")
-
-
-def _print_first_guess(guess: EquationErrorStart | FrequencyErrorStart) -> None:
-    print_text(f"Start values, by {report_tables.start_method(guess)} (no result):")
-    print_page_table(report_tables.first_guess(guess))
 
 
 _MOST_OFFSETS = 4

@@ -1,6 +1,6 @@
 """`heli-jax frf`: frequency responses of a configuration's logs, before any model is fitted."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,26 +21,18 @@ from heli_jax.cli.terminal import print_page_table, print_table, print_text
 from heli_jax.config.experiment import Experiment, resolved
 from heli_jax.config.frequency import check_pairs, missing_handling, requested_handling, units_of
 from heli_jax.config.frequency_section import FrequencyConfig
-from heli_jax.config.logs import read_flights, with_log
+from heli_jax.config.logs import log_notes, read_flights, with_log
 from heli_jax.errors import InputError, located
 from heli_jax.finding import Finding, note, sentences
 from heli_jax.flights.flight import Flight
-from heli_jax.flights.holds import is_low_passed
 from heli_jax.numbers import plain_words
 from heli_jax.stages import Note
 from heli_jax.yaml_file import as_yaml
-
-_HOLDS = {
-    "linear": "taken as linear",
-    "zero-order": "held",
-    "mixed": "held until they jump",
-}
 
 
 def responses_of_log(
     experiment: Experiment,
     log: str | None = None,
-    progress: Callable[[str], None] = lambda _: None,
 ) -> FlightResponses:
     """Return the frequency responses of all flights of a configuration together.
 
@@ -59,8 +51,6 @@ def responses_of_log(
     check_pairs(experiment, "transfer_functions", config.transfer_functions)
     requested_handling(experiment)  # before the logs are read
     flights = read_flights(experiment)
-    for found in (n for f in flights for n in (f.source.notes if f.source else ())):
-        progress(Note(found.sentence))
     _require_samples(flights, experiment.path)
     with located(f"{experiment.path}: frequency"):
         estimate = flight_responses(flights, settings)
@@ -74,9 +64,9 @@ def responses_of_log(
             f"got {longest:.3g} s"
         )
     notes = (
+        *log_notes(flights),
         *_held_out(flights),
         *_read_in_degrees(experiment, flights),
-        *between_samples(flights, estimate.holds),
     )
     return estimate._replace(notes=(*estimate.notes, *notes))
 
@@ -96,45 +86,6 @@ def _held_out(flights: Sequence[Flight]) -> tuple[Finding, ...]:
         "(hold_out: true) and from the responses in its report"
     )
     return (note("responses.held-out-used", words, *names),)
-
-
-def between_samples(flights: Sequence[Flight], inputs: Collection[str]) -> list[Finding]:
-    """Return notes on holds of inputs that the reader decided, with their effect."""
-    mixed: dict[tuple[str, str], list[str]] = {}
-    guessed: dict[str, str] = {}
-    for name in inputs:
-        holds = [f.hold[name] for f in flights]
-        if len(set(holds)) > 1:
-            other = next(h for h in holds if h != holds[0])
-            mixed.setdefault((holds[0], other), []).append(name)
-        elif holds[0] == "linear" and (reason := flights[0].hold_reason.get(name)):
-            # The opposite error does not occur: inputs that jump are recognised as held. Low-passed
-            # inputs are always linear.
-            if is_low_passed(flights[0], name):
-                continue
-            guessed[name] = reason
-    notes = [
-        note(
-            "hold.differs",
-            f"{', '.join(names)}: {_HOLDS[first]} between samples in the first flight, "
-            f"{_HOLDS[other]} in others; all are treated like the first: state "
-            "signals.inputs.*.hold, or take responses of like flights together",
-            *names,
-        )
-        for (first, other), names in mixed.items()
-    ]
-    if guessed:
-        # Half of the longest step between samples [ms].
-        half = 500.0 * max(flights[0].logged_step(name, "input") for name in guessed)
-        reasons = "; ".join(dict.fromkeys(guessed.values()))
-        words = (
-            f"{', '.join(guessed)}: {_HOLDS['linear']} between samples (it {reasons}), which is a "
-            "guess. If the command is held between samples, delays and phase delays are up to "
-            f"half a sample, {half:.3g} ms, shorter, and bandwidths higher: state "
-            "signals.inputs.NAME.hold"
-        )
-        notes.append(note("hold.guessed", words, *guessed, value=1e-3 * half))
-    return notes
 
 
 def _read_in_degrees(experiment: Experiment, flights: Sequence[Flight]) -> tuple[Finding, ...]:
@@ -169,7 +120,7 @@ def run_responses(
     from heli_jax.report.tables import handling as handling_table
     from heli_jax.report.tables import handling_sentences
 
-    responses = responses_of_log(experiment, log, say)
+    responses = responses_of_log(experiment, log)
     # Axes that did not move need no message unless they were requested by name.
     requested = requested_handling(experiment, responses.outputs)
     named = (experiment.config.frequency or FrequencyConfig()).handling is not None

@@ -37,22 +37,15 @@ def print_sweep(out: Path) -> None:
     totals = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     counts = {k: v for k, v in totals["status"].items() if v}
     words = ", ".join(f"{v} {k.replace('_', ' ')}" for k, v in counts.items())
-    # Stores of earlier versions have no backend entry; it was always xla.
-    backend = totals["split"].get("backend", "xla")
+    backend = totals["split"]["backend"]
     print_text(f"{totals['elements']} elements of {totals['model']}: {words}; backend {backend}")
     rows = []
     for name, result in totals["results"].items():
         numbers = [
             terse(result[k]) if k in result else "" for k in ("min", "q05", "median", "q95", "max")
         ]
-        error = totals.get("float32_error", {}).get(name)
-        rows.append(
-            (name, *numbers, result.get("unit", ""), "" if error is None else terse(error, 1))
-        )
-    # The last column only where the sweep compared single with double precision.
-    head = ("result", "min", "5 %", "median", "95 %", "max", "unit", "float32 error")
-    width = len(head) if "float32_error" in totals else len(head) - 1
-    print_table(head[:width], [row[:width] for row in rows])
+        rows.append((name, *numbers, result.get("unit", "")))
+    print_table(("result", "min", "5 %", "median", "95 %", "max", "unit"), rows)
     for words in ("worst", "best"):
         for name, [element, *_] in totals[words].items():
             at = ", ".join(f"{n} = {terse(v)}" for n, v in element["axes"].items())

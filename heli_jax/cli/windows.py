@@ -7,7 +7,7 @@ import numpy as np
 from heli_jax import config as configuration
 from heli_jax.cli.terminal import print_table, print_text
 from heli_jax.config import Experiment
-from heli_jax.config.logs import require_flights, with_log
+from heli_jax.config.logs import log_notes, require_flights, with_log
 from heli_jax.errors import located
 from heli_jax.identification.design.accuracy import DETERMINES, GUESSED
 from heli_jax.identification.design.windows import (
@@ -49,9 +49,8 @@ def rank_log(
         flights = list({(f.log, f.flight): f for f in reversed(kept)}.values())[::-1]
     experiment = experiment._replace(config=config.model_copy(update={"flights": flights}))
     problem = configuration.problem(experiment)
-    for flight in problem.flights:
-        for found in flight.source.notes if flight.source else ():
-            progress(Note(found.sentence))
+    for found in log_notes(problem.flights):
+        progress(Note(found.sentence))
     with located(f"{path}"):
         # Report before the comparison, which may take long.
         seconds = window_samples(problem, length) * problem.training[0].dt

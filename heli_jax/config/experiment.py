@@ -17,7 +17,6 @@ from heli_jax.config.measurement import OpenedLogs, with_measurement
 from heli_jax.config.onboard import with_onboard
 from heli_jax.config.schema import Config, LinearConfig
 from heli_jax.dynamics.check_model import starting_at
-from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, VehicleError, located, nearest, require_kind, require_known
 from heli_jax.linear_models.read import LinearModel, is_shipped, linear_model
@@ -86,8 +85,7 @@ def read_overridden(
         # Otherwise the last of several would silently win.
         if key in keys:
             raise InputError(
-                f"{where}: {key} is set twice, expected one value (several make a study of fits: "
-                "heli-jax fit)"
+                f"{where}: {key} is set twice, expected one value (several: heli-jax fit --over)"
             )
         keys.add(key)
         set_value(content, key, value, where)
@@ -109,8 +107,9 @@ def from_content(content: dict[str, Any], path: Path) -> Experiment:
     # The model comes before the vehicle, because its Params define the vehicle's constants.
     logs = OpenedLogs()
     model = _model(config, path, logs)
-    # After this step all numbers are in SI.
-    config = _in_si(config, model, path)
+    if config.initial_state:
+        in_si = _initial_state(config, model, path)
+        config = config.model_copy(update={"initial_state": in_si})
     vehicle = _vehicle(config, path, model)
     return Experiment(config, path, model, vehicle, logs)
 
@@ -401,8 +400,6 @@ def resolved(experiment: Experiment) -> dict[str, Any]:
         # Links are resolved too, because the run's config.yaml is read from its own directory.
         for log in (flight, *flight["also"]):
             log["log"] = str((path.parent / log["log"]).resolve())
-        if "corrections" in flight:
-            flight["corrections"] = str((path.parent / flight["corrections"]).resolve())
     for design in _designs(content.get("sweep")):
         if "file" in design:
             design["file"] = str((path.parent / design["file"]).resolve())
@@ -422,50 +419,11 @@ def _designs(design: dict[str, Any] | None) -> Iterator[dict[str, Any]]:
             yield from _designs(part)
 
 
-def _in_si(config: Config, model: Model, path: Path) -> Config:
-    """Return the configuration with the initial state and the disturbance in SI."""
-    changes: dict[str, Any] = {}
-    if config.initial_state:
-        changes["initial_state"] = _initial_state(config, model, path)
-    disturbance = config.disturbance
-    if disturbance is not None and disturbance.has_units:
-        where = f"{path}: disturbance"
-        with located(where):
-            params = with_disturbance(model, disturbance.names, disturbance.poles).Params
-        converted = {}
-        for key in ("sigma_w", "tau_w"):
-            # The disturbed model defines the units of its parameters.
-            of_key = {n: _si(n, params) for n in disturbance.parameters if n.startswith(key)}
-            converted[key] = _converted(getattr(disturbance, key), key, of_key, where)
-        changes["disturbance"] = disturbance.model_copy(update=converted)
-    return config.model_copy(update=changes)
-
-
 def _initial_state(config: Config, model: Model, path: Path) -> dict[str, float]:
     """Return the configuration's initial state [SI]."""
     where, states = f"{path}: initial_state", naming.names(model.State)
     require_known(config.initial_state, states, where, f"model {model.name} has no state")
     return {
-        name: constant(entry, name, _si(name, model.State), where).value
+        name: constant(entry, name, naming.unit(model.State, name), where).value
         for name, entry in config.initial_state.items()
     }
-
-
-def _si(name: str, record: type) -> str | None:
-    return naming.unit(record, name)
-
-
-# Any: None, a number, {value, unit}, or one of these by name for several disturbances.
-def _converted(value: Any, key: str, si: Mapping[str, str | None], where: str) -> Any:
-    """Return a disturbance's sizes or time constants [SI], in the form of the file."""
-    if isinstance(value, Mapping) and "value" not in value:
-        return {
-            n: _one(v, f"{key}.{n}", si.get(f"{key}_{n}", si.get(key)), where)
-            for n, v in value.items()
-        }
-    # One number for several disturbances can only be a time constant; they share its unit.
-    return None if value is None else _one(value, key, next(iter(si.values())), where)
-
-
-def _one(entry: Any, place: str, si: str | None, where: str) -> float:
-    return constant(entry, place, si, where).value

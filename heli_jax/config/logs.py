@@ -8,12 +8,10 @@ from typing import Any, Literal
 import numpy as np
 
 from heli_jax import naming, units
-from heli_jax.config.corrections import read_corrections, with_corrections, with_notes
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.feedthrough import follows
 from heli_jax.config.kinematics import between_samples, prepared
 from heli_jax.config.measurement import (
-    coloured_noise_cautions,
     filter_cautions,
 )
 from heli_jax.config.preset_signals import Resolved, resolve
@@ -25,22 +23,21 @@ from heli_jax.config.schema import (
     SignalsConfig,
     TimeConfig,
 )
-from heli_jax.config.vibration import vibration_notes, with_notches
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, located, require_known
-from heli_jax.finding import LEFT_OUT, Finding, note
+from heli_jax.finding import Finding, note, without_repeats
 from heli_jax.flights import Also, Flight, Signal, read_flight, read_parts
 from heli_jax.flights.clock import by_rate
-from heli_jax.flights.convert import Selection
 from heli_jax.flights.flight import Source
 from heli_jax.flights.log import ChannelLog, Table
-from heli_jax.flights.preset import Named, NamedBy
 from heli_jax.flights.request import unit_note
-from heli_jax.identification.methods import objective_of
+from heli_jax.flights.vibration import lines
 
 _PULSE = (800.0, 2200.0)
 """Pulse widths of receivers and servos [us]."""
 _OFFSET_AND_SCALE = "such as offset: 1500, scale: 0.002"
+_MOST_LINES = 3
+"""Most vibration lines in the note of an output."""
 
 
 def require_flights(experiment: Experiment) -> None:
@@ -129,22 +126,16 @@ def _read_flight(experiment: Experiment, i: int, f: FlightConfig, gain: bool) ->
     flights = (flights,) if isinstance(flights, Flight) else flights
     notes = (*_unstated_units(model, everything, flights[0].source), *named.notes)
     flights = tuple(_with_instruments(flight, instruments) for flight in flights)
-    first, *others = _treated(experiment, flights, f, where)
+    first, *others = (
+        dataclasses.replace(prepared(model, flight, where), choose_windows=f.window == "auto")
+        for flight in flights
+    )
     cautions = (
         *filter_cautions(first.source, everything.outputs),
-        *(coloured_noise_cautions(first, experiment.model) if _noise_given(experiment) else ()),
         *_pulse_width_doubts(first),
-        *vibration_notes(first),
+        *_vibration_notes(first),
     )
     return (_with_notes(first, notes, cautions), *others)
-
-
-def _noise_given(experiment: Experiment) -> bool:
-    """True if filter error uses the outputs' stated noise without estimating it."""
-    fit, disturbance = experiment.config.fit, experiment.config.disturbance
-    if fit is None or disturbance is None or objective_of(fit.method).noise_model != "disturbance":
-        return False
-    return "sigma_y" in disturbance.fixed
 
 
 def _check(model: Model, f: FlightConfig, where: str) -> None:
@@ -157,25 +148,6 @@ def _check(model: Model, f: FlightConfig, where: str) -> None:
         raise InputError(
             f"{where}.window: auto chooses data to fit, expected two numbers with hold_out"
         )
-
-
-def _treated(
-    experiment: Experiment, flights: Sequence[Flight], f: FlightConfig, where: str
-) -> tuple[Flight, ...]:
-    """Return the flights for the fit, with the configured corrections applied."""
-    model, corrections = experiment.model, None
-    if f.corrections is not None:
-        place = experiment.path.parent / f.corrections
-        corrections = read_corrections(place, f"{where}.corrections")
-    treated = []
-    for flight in flights:
-        # Angles are unwrapped before the notch, which would ring at the jumps. Delays come after
-        # it, because they leave samples without a value.
-        flight = with_notches(prepared(model, flight, where), f.notch or (), f"{where}.notch")
-        if corrections is not None:
-            flight = with_corrections(model, flight, corrections, where)
-        treated.append(dataclasses.replace(flight, choose_windows=f.window == "auto"))
-    return tuple(treated)
 
 
 def _with_also(named: Resolved, f: FlightConfig, where: str) -> Resolved:
@@ -220,30 +192,6 @@ def _also(
     )
 
 
-def as_configured(experiment: Experiment, selection: Selection) -> Selection:
-    """Return the selection of a log, completed by a configuration's first flight.
-
-    Args:
-        selection: overrides the configuration's rate, flight and clock. Without signals of its own,
-            the columns are the model's inputs and outputs, in SI.
-
-    Raises:
-        InputError: the configuration has no flight.
-    """
-    config = experiment.config
-    require_flights(experiment)
-    first = config.flights[0]
-    time, ccpm = first.signals.time, first.signals.ccpm
-    return dataclasses.replace(
-        selection,
-        rate=first.rate if selection.rate is None else selection.rate,
-        flight=first.flight if selection.flight is None else selection.flight,
-        **_of_clock(selection, time),
-        named=None if selection.signals else _columns(experiment),
-        swashplate=None if ccpm is None else ccpm.swashplate(),
-    )
-
-
 def _clock(time: TimeConfig | None) -> Signal | None:
     """Return the clock of a table, as a configuration states it."""
     if time is None:
@@ -251,38 +199,6 @@ def _clock(time: TimeConfig | None) -> Signal | None:
     if time.rate is not None:
         return by_rate(time.rate, time.signal)
     return Signal(time.signal or "", time.unit, "s", assumed="unit" not in time.model_fields_set)
-
-
-def _of_clock(selection: Selection, time: TimeConfig | None) -> dict[str, Any]:
-    """Return the fields of a selection that define the clock, unless it does so itself."""
-    if time is None or selection.time is not None or selection.time_rate is not None:
-        return {}
-    unit = time.unit if time.rate is None else None
-    return {"time": time.signal, "time_unit": unit, "time_rate": time.rate}
-
-
-def _columns(experiment: Experiment) -> NamedBy:
-    """Return the names of columns from the inputs and outputs of the first flight."""
-    config, path = experiment.config, experiment.path
-    first, where = config.flights[0], f"{path}: flights[0]"
-    gain = config.fit is not None and config.fit.nuisance.input_gain
-
-    def named(log: Table | ChannelLog) -> Named:
-        own = _resolved(experiment, first, f"{where}.signals", log)
-        everything = _with_also(own, first, where)
-        inputs, outputs = _of_model(experiment.model, everything, f"{where}.signals", gain)
-        both = {n: inputs[n] for n in own.inputs} | {n: outputs[n] for n in own.outputs}
-        constants = [n for n, signal in both.items() if signal.constant is not None]
-        notes = [note(LEFT_OUT, f"{n} is a constant in {path}, not a column", n) for n in constants]
-        notes += [
-            note(LEFT_OUT, (f"the signals that {path} takes from {also.log} are left out"))
-            for also in first.also
-        ]
-        notes += [*_unstated_units(experiment.model, own), *own.notes]
-        signals = {n: signal for n, signal in both.items() if n not in constants}
-        return Named(signals, tuple(notes))
-
-    return named
 
 
 def first_signals(experiment: Experiment) -> Resolved:
@@ -354,10 +270,47 @@ def _unstated_units(
 def _with_notes(
     flight: Flight, notes: tuple[Finding, ...], cautions: tuple[Finding, ...]
 ) -> Flight:
-    flight = with_notes(flight, notes)
-    if not cautions or flight.source is None:
+    source = flight.source
+    if source is None:
         return flight
-    return dataclasses.replace(flight, source=dataclasses.replace(flight.source, cautions=cautions))
+    cautions = cautions or source.cautions
+    source = dataclasses.replace(source, notes=(*source.notes, *notes), cautions=cautions)
+    return dataclasses.replace(flight, source=source)
+
+
+def _vibration_notes(flight: Flight) -> tuple[Finding, ...]:
+    """Return a note for each output with strong lines in its spectrum."""
+    notes = []
+    for name, y in flight.outputs.items():
+        if vibration := lines(y, flight.dt):
+            each = "; ".join(
+                f"{line.hz:.3g} Hz has {100 * line.share:.2g} % of its variance"
+                for line in vibration[:_MOST_LINES]
+            )
+            words = f"{name} vibrates: {each}"
+            notes.append(note("vibration.lines", words, name, value=vibration[0].share))
+    return tuple(notes)
+
+
+def log_notes(flights: Sequence[Flight]) -> list[Finding]:
+    """Return the notes of the logs' readers; each sentence begins with its log."""
+    notes = []
+    for flight in flights:
+        where = flight.source.path if flight.source else flight.name
+        notes += [n.of(where) for n in (flight.source.notes if flight.source else ())]
+        for name, reason in flight.hold_reason.items():
+            # Readers expect held sticks, so these need no note.
+            if flight.hold[name] == "zero-order":
+                continue
+            half = 0.5 * flight.logged_step(name, "input")
+            words = (
+                f"{where}: {name} is taken as {flight.hold[name]} between samples, because it "
+                f"{reason}; if a computer commanded it, state hold: zero-order, since delays are "
+                f"up to half a sample, {1e3 * half:.3g} ms, too short"
+            )
+            notes.append(note("hold.guessed", words, name, value=half))
+    # Flights may be windows of one log, so repeated notes are removed.
+    return without_repeats(notes)
 
 
 def signals(

@@ -13,10 +13,9 @@ from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.onboard.filters import Filter, cutoff, with_filters
 from heli_jax.errors import InputError, located, nearest
 from heli_jax.finding import Finding
-from heli_jax.flights.flight import Flight, Source
+from heli_jax.flights.flight import Source
 from heli_jax.flights.log import ChannelLog, Table, shown
 from heli_jax.flights.open_log import open_log
-from heli_jax.identification.defaults import filtered_noise
 
 type _Channel = tuple[tuple[Filter, ...], float]
 
@@ -158,28 +157,6 @@ def filter_cautions(
             )
             doubts.append(Finding("filters.unknown", "doubt", words, subjects=(name,)))
     return tuple(doubts)
-
-
-def coloured_noise_cautions(flight: Flight, model: Model) -> tuple[Finding, ...]:
-    """Return doubts on outputs whose fixed noise is not white.
-
-    Their noise passed a modelled low-pass, and filter error does not estimate it. The noise is then
-    attributed to a disturbance or a faster vehicle.
-    """
-    return tuple(
-        Finding(
-            "filters.noise-coloured",
-            "doubt",
-            f"{p.output}: the low-pass of {p.hz:.3g} Hz also filtered its noise, which is "
-            f"therefore not white at {1.0 / flight.dt:.4g} Hz, as `disturbance.fixed: [sigma_y]` "
-            "assumes. Estimates may be wrong by several standard deviations; remove sigma_y from "
-            "it, and the noise before the filter is estimated",
-            p.hz,
-            "Hz, the cut-off",
-            (p.output,),
-        )
-        for p in filtered_noise(model.low_passes, (flight,))
-    )
 
 
 def _not_modelled(name: str, output: OutputConfig, logged: LoggedFilters) -> Finding:

@@ -150,7 +150,6 @@ Filters = Annotated[
     ),
 ]
 Delay = Annotated[float, AfterValidator(_delay)]
-Notches = list[_Positive]
 
 
 class OnboardConfig(Section):

@@ -21,7 +21,7 @@ from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, located, nearest, require_known
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.read import require_moving_outputs, require_some_time
-from heli_jax.identification.methods import METHODS, objective_of
+from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Free, Nuisance, Prior, Problem
 from heli_jax.linear_models.read import is_shipped
 from heli_jax.simulation.simulate import substeps_for
@@ -73,9 +73,7 @@ def problem(experiment: Experiment) -> Problem:
             first_guess=guess,
             frequency=_responses(experiment),
         )
-        whole = with_chosen_windows(whole)
-    # Only for the fitted flights, whose windows are chosen by now.
-    return _started_in_frequency(experiment, whole)
+        return with_chosen_windows(whole)
 
 
 def _require_disturbance(experiment: Experiment, place: str) -> None:
@@ -292,8 +290,7 @@ def _first_guesses(
     requested = [n for n, f in free.items() if found or math.isnan(f.start)]
     words = f"model {experiment.model.name} has no parameter"
     require_known(requested, known, f"{path}: fit.free", words)
-    # NaN means that a start was left out; no optimiser can use it. A fit in frequency begins at the
-    # given starts, and its result replaces them later.
+    # NaN means that a start was left out; no optimiser can use it.
     if config.start != "equation-error":
         free = _from_vehicle(experiment, free)
         missing = [n for n, f in free.items() if math.isnan(f.start)]
@@ -340,34 +337,10 @@ def _instrument_for(config: FitConfig, method: str) -> tuple[str, ...] | None:
     """Return the inputs that a method uses by their instrument, as in `Problem.instrument`.
 
     Args:
-        config: section whose `instrument` may apply to the start, or to a method of `also`.
+        config: section whose `instrument` may apply only to a method of `also`.
     """
-    others = [m for m in (config.start, *config.also) if m in METHODS]
     if objective_of(method).noise_model == "spectrum" or not any(
-        objective_of(m).noise_model == "spectrum" for m in others
+        objective_of(m).noise_model == "spectrum" for m in config.also
     ):
         return config.by_instrument
     return None
-
-
-def _started_in_frequency(experiment: Experiment, problem: Problem) -> Problem:
-    """Return the problem with the starts of `fit.start: frequency-error`, else unchanged."""
-    config = experiment.config.fit
-    if config is None or config.start != "frequency-error":
-        return problem
-    # Imported on demand: the optimiser takes a second to import.
-    from heli_jax.identification.fit import frequency_error_start, started
-
-    known = naming.names(experiment.model.Params)
-    bare = {
-        "model": experiment.model,
-        "vehicle": experiment.vehicle.params,
-        "free": {n: f for n, f in problem.free.items() if n in known},
-        "method": "frequency-error",
-        "instrument": config.by_instrument,
-    }
-    whole = {"fixed_noise": (), "window": None, "continuity": None}
-    with experiment.located("fit.start"):
-        base = dataclasses.replace(problem, **bare, **whole)
-        guess = frequency_error_start(base, max_steps=config.max_steps)
-    return started(problem, guess)

@@ -1,7 +1,6 @@
 """Sections of simulated runs: `simulate`, and the design of a sweep."""
 
-import warnings
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
@@ -14,26 +13,33 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 class StickConfig(Section):
     """Movement of one input in a simulation."""
 
-    # "sweep" is the older name of "chirp".
-    kind: Literal["random-steps", "3-2-1-1", "chirp", "sweep", "neutral"] = "random-steps"
+    kind: Literal["random-steps", "doublet", "3-2-1-1", "prbs", "chirp", "multisine", "neutral"] = (
+        "random-steps"
+    )
     """kind of motion"""
     amplitude: Positive
     """largest deflection, in `unit`"""
     unit: str | None = None
     """unit; default the model's SI unit"""
+    rate: Positive | None = None
+    """largest rate of change, in `unit` a second; steps become ramps, sines smaller"""
     hold: tuple[Positive, Positive] = (0.3, 2.0)
     """shortest and longest step of random-steps [s]"""
     step: Positive = 0.3
-    """unit length of 3-2-1-1 [s]"""
+    """shortest step of doublet, 3-2-1-1 and prbs [s]"""
     pause: Positive = 2.0
-    """pause between two 3-2-1-1 [s]"""
+    """pause between two of doublet and 3-2-1-1 [s]"""
     band: tuple[Positive, Positive] = (0.05, 5.0)
-    """first and last frequency of a chirp [Hz]"""
+    """lowest and highest frequency of chirp and multisine [Hz]"""
+    fade: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    """time in which a chirp grows at its begin and fades at its end [s]"""
 
     @model_validator(mode="after")
     def _ordered(self) -> "StickConfig":
         if self.hold[0] > self.hold[1]:
             raise ValueError(f"hold: expected the shortest time first, got {list(self.hold)}")
+        if self.band[0] >= self.band[1]:
+            raise ValueError(f"band: expected the lowest frequency first, got {list(self.band)}")
         return self
 
 
@@ -55,22 +61,6 @@ class StartConfig(Section):
     """climb rate [m/s]"""
     heading: Finite = 0.0
     """heading psi [rad]"""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _renamed(cls, content: Any) -> Any:
-        """Accept the former names of the speeds, with a warning."""
-        if not isinstance(content, dict):
-            return content
-        content = dict(content)
-        for old, new in (("ahead", "forward_speed"), ("aside", "lateral_speed")):
-            if old not in content:
-                continue
-            if new in content:
-                raise ValueError(f"expected {new} alone, got {old} and {new}, which mean the same")
-            warnings.warn(f"{old} is deprecated, expected {new}", DeprecationWarning, stacklevel=2)
-            content[new] = content.pop(old)
-        return content
 
 
 class SimulateConfig(Section):

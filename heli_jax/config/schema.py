@@ -7,7 +7,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from heli_jax.config.disturbance_section import DisturbanceConfig
 from heli_jax.config.frequency_section import FrequencyConfig
-from heli_jax.config.onboard import Delay, Filters, Notches, OnboardConfig
+from heli_jax.config.onboard import Delay, Filters, OnboardConfig
 from heli_jax.config.run_sections import SimulateConfig, SweepConfig
 from heli_jax.config.section import Section
 from heli_jax.config.signal_section import LoggedInputConfig, Numbers, PresetConfig, ScaledConfig
@@ -163,10 +163,6 @@ class FlightConfig(Section):
     """true: predict this flight, do not fit it"""
     known: dict[str, Finite] = {}
     """model parameters known for this flight only, in SI: {Ixx_added: 0.01}"""
-    notch: Notches | None = None
-    """frequencies [Hz] to remove from inputs and outputs alike"""
-    corrections: str | None = None
-    """file of `heli-jax compatibility` with sensor errors, which are removed from the signals"""
 
 
 class PriorConfig(Section):
@@ -226,9 +222,6 @@ class ShootingConfig(Section):
     range; null: free"""
 
 
-StartMethod = Literal["given", "equation-error", "frequency-error"]
-
-
 class FitConfig(Section):
     # From the table of estimators, so that a new one needs no entry here.
     method: Literal[tuple(METHODS)] = "output-error"  # pyright: ignore[reportInvalidTypeForm]
@@ -237,9 +230,9 @@ class FitConfig(Section):
     """further methods that fit the same problem, for comparison with `method`"""
     free: dict[str, FreeConfig]
     """parameters to estimate, by the model's names"""
-    start: StartMethod = "given"
+    start: Literal["given", "equation-error"] = "given"
     """source of the start values: given; equation-error, a regression of the records, for linear
-    models; frequency-error, a fit in frequency from the given values"""
+    models"""
     instrument: str | Annotated[list[str], Field(min_length=1)] | None = None
     """in frequency: inputs used by their instrument, or none; default all inputs with an instrument
     in every flight (docs/frequency-fits.md)"""
@@ -267,12 +260,6 @@ class FitConfig(Section):
         if self.instrument is None:
             return None
         return (self.instrument,) if isinstance(self.instrument, str) else tuple(self.instrument)
-
-    @model_validator(mode="after")
-    def _another_start(self) -> "FitConfig":
-        if self.method == self.start:
-            raise ValueError(f"start: {self.method}: expected another method to fit by")
-        return self
 
     @model_validator(mode="after")
     def _other_methods(self) -> "FitConfig":

@@ -5,7 +5,6 @@ import glob
 import itertools
 import math
 import os
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -87,7 +86,7 @@ def read_study(
 
     Args:
         path: the configuration file.
-        overrides: as in `load`; a key that several texts set takes each value.
+        overrides: as in `load`.
         over: values by key, or as on the command line, `fit.free.a.start=4,5,6`: a YAML list
             without its brackets after =.
 
@@ -95,12 +94,13 @@ def read_study(
         InputError: something in the file or an option is wrong.
     """
     path = Path(path)
-    single, repeated = _single_and_repeated(overrides)
-    content = read_overridden(path, single)
-    # A single override replaces an axis of the file, as for any other key.
-    named = single if isinstance(single, Mapping) else [parse_override(t)[0] for t in single]
+    content = read_overridden(path, overrides)
+    # An override replaces an axis of the file, as for any other key.
+    named = overrides
+    if not isinstance(overrides, Mapping):
+        named = [parse_override(text)[0] for text in overrides]
     stated = {k: v for k, v in _section(content, path).items() if k not in named}
-    axes = {**_listed_logs(content, path), **stated, **repeated, **_over(over)}
+    axes = {**_listed_logs(content, path), **stated, **_over(over)}
     if not axes:
         return None
     axes = {key: _logs(key, values, path) for key, values in axes.items()}
@@ -111,19 +111,6 @@ def read_study(
     if study.size > _MOST:
         raise InputError(f"{path}: study: expected at most {_MOST} fits, got {study.size}")
     return study
-
-
-def _single_and_repeated(
-    overrides: Sequence[str] | Mapping[str, Any],
-) -> tuple[Sequence[str] | Mapping[str, Any], Axes]:
-    """Return the overrides with one value, and the values by key of those given several times."""
-    if isinstance(overrides, Mapping):
-        return overrides, {}
-    parsed = [parse_override(text) for text in overrides]
-    counts = Counter(key for key, *_ in parsed)
-    single = [text for text, p in zip(overrides, parsed, strict=True) if counts[p[0]] == 1]
-    several = dict.fromkeys(key for key, *_ in parsed if counts[key] > 1)
-    return single, {k: tuple(value for key, value, _ in parsed if key == k) for k in several}
 
 
 def _over(over: Sequence[str] | Mapping[str, Sequence[Any]]) -> Axes:

@@ -13,7 +13,6 @@ from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.as_logged import without_marks_and_turns
 from heli_jax.flights.derived import (
     DerivedLog,
-    Swashplate,
     with_derived,
 )
 from heli_jax.flights.describe import describe_table
@@ -54,7 +53,6 @@ class Selection:
         time_rate: samples a second [Hz] of a table without times: of its rows, or of the counts in
             `time`.
         named: names of the columns from a preset, in place of `signals`; the values are then in SI.
-        swashplate: geometry of the channels `ccpm.collective`, `ccpm.roll` and `ccpm.pitch`.
     """
 
     signals: Sequence[str] = ()
@@ -65,7 +63,6 @@ class Selection:
     time_unit: str | None = None
     time_rate: float | None = None
     named: NamedBy | None = None
-    swashplate: Swashplate | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,13 +104,13 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
         raise wrong(
             opened.path, "its topics have clocks of their own, expected no time to be stated"
         )
-    log = with_derived(opened, selection.swashplate)
+    log = with_derived(opened)
     notes += log.notes
     if named is None:
         names = _names(log, selection.signals)
     else:
         names = list(dict.fromkeys(signal.name for signal in named.signals.values()))
-    required = bool(selection.signals) if named is None else named.required
+    required = named is None and bool(selection.signals)
     clocks = _clocks(log, names, selection.window, required, notes)
     names = [name for name in names if log.topic_of(name).name in clocks]
     # Without a rate nothing is resampled: a copy at the log's own samples loses nothing.

@@ -202,7 +202,7 @@ def fitting_presets(log_format: str, names: Sequence[str]) -> list[str]:
     ]
 
 
-# Assignment of channels to columns, by a preset or a configuration.
+# Assignment of channels to columns by a preset.
 
 
 class Named(NamedTuple):
@@ -211,8 +211,6 @@ class Named(NamedTuple):
     signals: Mapping[str, Signal]
     notes: tuple[Finding, ...] = ()
     """Notes on the columns that are absent."""
-    required: bool = True
-    """True if a channel without a usable clock is an error; otherwise it is left out."""
 
 
 type NamedBy = Callable[[Table | ChannelLog], Named]
@@ -249,6 +247,6 @@ def by_preset(name: str) -> NamedBy:
         lacking = [signal for signal in chosen if signal not in signals]
         words = f"preset {table.title}: the log has no {', '.join(lacking)}"
         notes = (note("channels.lacking", words, *lacking),) if lacking else ()
-        return Named(signals, notes, required=False)
+        return Named(signals, notes)
 
     return named

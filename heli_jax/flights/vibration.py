@@ -1,6 +1,5 @@
-"""Vibration lines in a record, and notches that remove them."""
+"""Vibration lines in a record."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -69,69 +68,3 @@ def _without_line(x: np.ndarray) -> np.ndarray:
     t = np.arange(x.shape[-1]) - 0.5 * (x.shape[-1] - 1)
     x = x - np.mean(x, axis=-1, keepdims=True)
     return x - (x @ t)[..., None] * t / (t @ t)
-
-
-def folded(hz: float, rate: float) -> float:
-    """Return the frequency [Hz] at which a frequency appears in samples taken at a rate [Hz]."""
-    return abs(hz - rate * round(hz / rate))
-
-
-def settling(frequencies: Sequence[float], q: float) -> float:
-    """Return the settling time of notches to 5 % [s]."""
-    # Their free response decays by exp(-omega t / (2 q)): to 1/20 in three time constants.
-    return 3.0 * q / (np.pi * min(frequencies))
-
-
-def slow_step(x: np.ndarray) -> int:
-    """Return the usual step between samples (N,) of a sensor slower than the grid [grid steps].
-
-    It is 1 if the sensor is not slower.
-    """
-    steps = np.diff(np.flatnonzero(np.isfinite(x)))
-    return round(float(np.median(steps))) if steps.size else 1
-
-
-def notched_slow(x: np.ndarray, dt: float, frequencies: Sequence[float], q: float) -> np.ndarray:
-    """Apply notches to a sensor that is slower than the grid, at its own samples.
-
-    Frequencies above its Nyquist frequency are left out: they are folded and remain.
-    """
-    step = slow_step(x)
-    own = [hz for hz in frequencies if hz < 0.5 / (step * dt)]
-    there = np.flatnonzero(np.isfinite(x))
-    if step == 1 or (own and np.any(np.diff(there) % step)):
-        return notched(x, dt, frequencies, q)
-    made = np.array(x)
-    if own:
-        every = slice(int(there[0]), None, step)
-        made[every] = notched(x[every], step * dt, own, q)
-    return made
-
-
-def notched(x: np.ndarray, dt: float, frequencies: Sequence[float], q: float) -> np.ndarray:
-    """Remove frequencies from a record (N,) by causal notches that are settled at the first sample.
-
-    After missing samples the notches start again, and their output is missing until they have
-    settled.
-
-    Args:
-        x: samples (N,), NaN where one is missing.
-        dt: time between samples [s].
-        frequencies: centres of the notches [Hz], below half the rate.
-        q: quality factor of the notches.
-    """
-    from scipy.signal import iirnotch, lfilter, lfilter_zi
-
-    x = np.array(x)
-    coefficients = [iirnotch(hz, q, 1.0 / dt) for hz in frequencies]
-    unsettled = int(np.ceil(settling(frequencies, q) / dt))
-    # Stretches of present samples: pairs of first and last + 1.
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], np.isfinite(x), [False]])))
-    for first, last in edges.reshape(-1, 2):
-        for b, a in coefficients:
-            part = x[first:last]
-            x[first:last] = lfilter(b, a, part, zi=lfilter_zi(b, a) * part[0])[0]
-        # At the record's beginning inputs and outputs have the same filter state.
-        if first:
-            x[first : min(first + unsettled, last)] = np.nan
-    return x

@@ -1,13 +1,14 @@
 """Writer of LLVM assembly: scalars that all vehicles share, and vectors over vehicles.
 
-Small arrays are split into elements; long ones stay in memory (`Stored`).
+Numbers are in registers; arrays stay in memory (`Stored`) and are read by element.
 """
 
+import math
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -103,11 +104,10 @@ class Code:
 
     def __init__(self, lanes: int) -> None:
         self.lanes = lanes
-        """Vehicles per vector in one thread; with 1, plain numbers."""
+        """Vehicles per vector in one thread."""
         self.lines: list[str] = []
         self.block = "entry"
         self.declared: dict[str, str] = {}
-        self.globals: dict[str, str] = {}
         self._count = 0
         self._spread: dict[tuple[str, str], str] = {}
         self._whole: dict[str, Value] = {}
@@ -159,11 +159,11 @@ class Code:
 
     def vector(self, kind: str, shared: bool = False) -> str:
         """Return LLVM's type of a shared number, or of one per vehicle."""
-        return kind if shared or self.lanes == 1 else f"<{self.lanes} x {kind}>"
+        return kind if shared else f"<{self.lanes} x {kind}>"
 
     def of(self, value: Value, shared: bool) -> str:
         """Return the operand as a shared number, or spread over the vehicles."""
-        if shared or not value.shared or self.lanes == 1:
+        if shared or not value.shared:
             return value.operand
         kind = type_of(value.dtype)
         if not value.operand.startswith("%"):
@@ -208,8 +208,8 @@ class Code:
     def by_lane(self, function: Callable[..., Value], dtype: np.dtype, *values: Value) -> Value:
         """Apply a scalar function for each vehicle; once if all values are shared."""
         shared = all(v.shared for v in values)
-        if shared or self.lanes == 1:
-            return replace(function(*values), shared=shared)
+        if shared:
+            return function(*values)
         joined = Value("poison", dtype, False)
         vector = self.typed(dtype, False)
         for lane in range(self.lanes):
@@ -232,7 +232,7 @@ class Code:
 
     def many(self, shared: bool) -> str:
         """Return the prefix of a type in an intrinsic's name."""
-        return "" if shared or self.lanes == 1 else f"v{self.lanes}"
+        return "" if shared else f"v{self.lanes}"
 
     def choose(self, which: Value, yes: Value, no: Value) -> Value:
         """Write a selection between two values."""
@@ -275,26 +275,7 @@ class Code:
 
         return self.by_lane(element, dtype, index)
 
-    def table(self, values: np.ndarray) -> str:
-        """Return a pointer to numbers known when the program is written."""
-        kind = type_of(values.dtype)
-        if kind == "i1":
-            kind, values = "i8", values.astype(np.uint8)
-        each = ", ".join(f"{kind} {constant(v, values.dtype).operand}" for v in values.ravel())
-        text = f"private unnamed_addr constant [{values.size} x {kind}] [{each}]"
-        name = next((n for n, t in self.globals.items() if t == text), None)
-        if name is None:
-            name = f"@table{len(self.globals)}"
-            self.globals[name] = text
-        return name
 
-
-MOST = 4096
-"""Most elements of an array that is split; more would take minutes to compile."""
-LONG = 64
-"""Number of elements above which an array of one repeated number is not split, and up to which all
-elements may be searched.
-"""
 INDEX = np.dtype(np.int32)
 """Type of indices into arrays, and of loop counters."""
 
@@ -308,61 +289,30 @@ class Stored(NamedTuple):
     """Function of int32 indices, one for each dimension, that returns the element."""
 
 
-type Elements = np.ndarray[Any, Any]
-"""Array of Values (dtype object), or of known numbers."""
-type Operand = Elements | Stored
-
-
-def elements(operand: Operand) -> Elements:
-    """Return an operand as an array of Values."""
-    if isinstance(operand, Stored):
-        if int(np.prod(operand.shape)) > MOST:
-            raise UnsupportedError(f"an array of {operand.shape} as a whole")
-        every = np.empty(operand.shape, object)
-        for at in np.ndindex(operand.shape):
-            every[at] = operand.element(tuple(constant(i, INDEX) for i in at))
-        return every
-    return operand if operand.dtype == object else applied(constant, operand, dtype=operand.dtype)
-
-
-def applied(function: Callable[..., Any], *arrays: Elements, **others: Any) -> Elements:
-    """Apply a function of Values by element to arrays that NumPy broadcasts."""
-    mapped = np.frompyfunc(lambda *v: function(*v, **others), len(arrays), 1)
-    return np.asarray(mapped(*arrays), object)
+type Operand = Value | Stored
 
 
 def scalar(operand: Operand) -> Value:
-    """Return the Value of an operand with one number."""
-    return elements(operand).item()
+    """Return an operand as one number.
+
+    Raises:
+        UnsupportedError: it is an array.
+    """
+    if isinstance(operand, Value):
+        return operand
+    if math.prod(operand.shape) != 1:
+        raise UnsupportedError(f"an array of {operand.shape} as a whole")
+    return operand.element((constant(0, INDEX),) * len(operand.shape))
 
 
-def dtype_of(operand: Operand) -> np.dtype:
-    """Return the type of an operand's numbers."""
-    if isinstance(operand, Stored) or operand.dtype != object:
-        return operand.dtype
-    return operand.ravel()[0].dtype
+def shape_of(operand: Operand) -> tuple[int, ...]:
+    """Return the shape of an operand; () for a number."""
+    return () if isinstance(operand, Value) else operand.shape
 
 
-def at_place(code: Code, operand: Operand, at: tuple[Value, ...]) -> Value:
-    """Return an element of an operand at computed indices."""
-    if isinstance(operand, Stored):
-        return operand.element(at)
-    if operand.shape == ():
-        return scalar(operand)
-    if operand.dtype != object:
-        return code.load(code.table(operand), flat(code, operand.shape, at), operand.dtype)
-    if all(not i.operand.startswith("%") for i in at):
-        return operand[tuple(int(i.operand) for i in at)]
-    if operand.size > LONG:
-        raise UnsupportedError(
-            f"an element at a computed place of a computed array {operand.shape}"
-        )
-    # Every element is in a register, so the right one is selected among all.
-    place, chosen = flat(code, operand.shape, at), operand.ravel()[-1]
-    for k in range(operand.size - 2, -1, -1):
-        here = code.compare("icmp eq", place, constant(k, place.dtype))
-        chosen = code.choose(here, operand.ravel()[k], chosen)
-    return chosen
+def at_place(operand: Operand, at: tuple[Value, ...]) -> Value:
+    """Return an element of an operand; a number is the same everywhere."""
+    return operand if isinstance(operand, Value) else operand.element(at)
 
 
 def flat(code: Code, shape: tuple[int, ...], at: tuple[Value, ...]) -> Value:

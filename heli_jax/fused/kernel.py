@@ -10,16 +10,14 @@ import numpy as np
 
 from heli_jax.fused.code import (
     INDEX,
-    LONG,
     Code,
-    Elements,
     Operand,
     Stored,
     UnsupportedError,
     Value,
     constant,
-    elements,
     flat,
+    scalar,
     type_of,
 )
 from heli_jax.fused.translate import loop, translate
@@ -29,7 +27,7 @@ class Argument(NamedTuple):
     """An array passed to the program: one for all vehicles, or a row for each."""
 
     shape: tuple[int, ...]
-    """Shape without the vehicles."""
+    """Shape without the vehicles; () unless it is shared."""
     dtype: np.dtype
     shared: bool
 
@@ -44,24 +42,24 @@ class Run(NamedTuple):
     stays: tuple[Argument, ...]
     """Constants over the steps."""
     stored: tuple[Argument, ...]
-    """Records (N, ...), read by sample; each vehicle has its own unless they are shared."""
+    """Records (N,) of all vehicles, read by sample."""
     carry: tuple[Argument, ...]
     steps: int
     """Number of steps, at least one."""
 
 
-def write(run: Run, lanes: int) -> tuple[str, list[Argument]]:
-    """Return a run as LLVM assembly with one function, `run`, and the kinds of its results.
+def write(run: Run, lanes: int) -> tuple[str, list[np.dtype]]:
+    """Return a run as LLVM assembly with one function, `run`, and the types of its results.
 
-    Its arguments are four tables of pointers, the first and last vehicle, and the number of
-    vehicles. The tables are constants, records, carry and results. They have one pointer for each
-    shared array or record, and one for each row of others; a row has a number per vehicle.
+    Its arguments are four tables of pointers, and the first and last vehicle. The tables are
+    constants, records, carry and results. They have one pointer for each array. An array that is
+    not shared has a number per vehicle.
 
     Raises:
         UnsupportedError: an operation without a translation.
     """
     code = Code(lanes)
-    stored = _stored(code, run.stored)
+    stored = [_shared(code, code.pointer("%stored", i), kind) for i, kind in enumerate(run.stored)]
     read_stays, read_carry = (
         _read(code, name, arguments)
         for name, arguments in (("%stays", run.stays), ("%carry", run.carry))
@@ -72,19 +70,14 @@ def write(run: Run, lanes: int) -> tuple[str, list[Argument]]:
     code.write(f"%b = phi i64 [ %begin, %{entry} ], [ %following, %done ]")
     stays, carry = read_stays(), read_carry()
 
-    def step(index: Value, carried: list[Operand]) -> list[Operand]:
-        return translate(
-            code,
-            run.step.jaxpr,
-            run.step.consts,
-            [*stays, *stored, *carried, np.asarray(index, object)],
-        )
+    def step(index: Value, carried: list[Value]) -> list[Operand]:
+        operands = [*stays, *stored, *carried, index]
+        return translate(code, run.step.jaxpr, run.step.consts, operands)
 
     carried = loop(code, run.steps, carry, step)
-    results = translate(code, run.last.jaxpr, run.last.consts, [*stays, *stored, *carried])
-    arrays = [elements(v) for v in results]
-    kinds = [Argument(v.shape, v.ravel()[0].dtype, False) for v in arrays]
-    for i, value in enumerate(v for array in arrays for v in array.ravel()):
+    operands = [*stays, *stored, *carried]
+    results = [scalar(v) for v in translate(code, run.last.jaxpr, run.last.consts, operands)]
+    for i, value in enumerate(results):
         _store(code, value, code.pointer("%results", i))
     code.write("br label %done")
     code.label("done")
@@ -93,87 +86,52 @@ def write(run: Run, lanes: int) -> tuple[str, list[Argument]]:
     code.write("br i1 %more, label %vehicles, label %out")
     code.label("out")
     code.write("ret void")
-    head = [f"{name} = {text}" for name, text in code.globals.items()]
-    head += code.declared.values()
+    head = list(code.declared.values())
     tables = ", ".join(f"ptr %{n}" for n in ("stays", "stored", "carry", "results"))
-    arguments = f"{tables}, i64 %begin, i64 %end, i64 %count"
+    arguments = f"{tables}, i64 %begin, i64 %end"
     body = "\n".join(code.lines)
     # Without the attributes LLVM would use half the width of AVX-512, and spilled registers would
     # cross cache lines. This costs a quarter of an exact step's time.
     attributes = 'alignstack(64) "prefer-vector-width"="512" "min-legal-vector-width"="512"'
     function = f"define void @run({arguments}) nounwind {attributes} {{\nentry:\n{body}\n}}"
-    return "\n".join([*head, function, ""]), kinds
-
-
-def _stored(code: Code, arguments: Sequence[Argument]) -> list[Stored]:
-    """Return the records, read by sample."""
-
-    def read(pointer: str, argument: Argument) -> Stored:
-        if len(argument.shape) != 1:
-            raise UnsupportedError(f"a record of shape {argument.shape}")
-        of_sample = code.load if argument.shared else functools.partial(_own, code)
-        dtype = argument.dtype
-        return Stored(argument.shape, dtype, lambda at: of_sample(pointer, at[0], dtype))
-
-    return [read(code.pointer("%stored", i), argument) for i, argument in enumerate(arguments)]
-
-
-def _own(code: Code, pointer: str, index: Value, dtype: np.dtype) -> Value:
-    """Return the vehicles' own numbers at one sample of arrays (N, vehicles)."""
-    if not index.shared:
-        raise UnsupportedError("an index that is not the same for all vehicles")
-    wide, first, place = (code.register() for _ in range(3))
-    code.write(f"{wide} = sext {type_of(index.dtype)} {index.operand} to i64")
-    code.write(f"{first} = mul i64 {wide}, %count")
-    code.write(f"{place} = add i64 {first}, %b")
-    return _vector(code, pointer, place, dtype)
-
-
-def _read(code: Code, name: str, arguments: Sequence[Argument]) -> Callable[[], list[Operand]]:
-    """Return a reader of arrays in a table of pointers.
-
-    Shared arrays are read now, and the vehicles' own when it is called.
-    """
-    made: list[Callable[[], Operand]] = []
-    place = 0
-    for argument in arguments:
-        size = 1 if argument.shared else int(np.prod(argument.shape))
-        pointers = [code.pointer(name, place + k) for k in range(size)]
-        place += size
-        if argument.shared:
-            shared = _shared(code, pointers[0], argument)
-            made.append(lambda shared=shared: shared)
-        else:
-            made.append(functools.partial(_of_row, code, argument, pointers))
-    return lambda: [read() for read in made]
+    return "\n".join([*head, function, ""]), [v.dtype for v in results]
 
 
 def _shared(code: Code, pointer: str, argument: Argument) -> Operand:
-    """Return an array that all vehicles share."""
+    """Return an array or a number that all vehicles share."""
 
     def element(at: tuple[Value, ...]) -> Value:
         place = flat(code, argument.shape, at) if at else constant(0, INDEX)
         return code.load(pointer, place, argument.dtype)
 
-    table = Stored(argument.shape, argument.dtype, element)
-    # A long array, such as a model's table, stays in memory for look-ups.
-    return table if int(np.prod(argument.shape)) > LONG else elements(table)
+    array = Stored(argument.shape, argument.dtype, element)
+    return array if argument.shape else scalar(array)
 
 
-def _of_row(code: Code, argument: Argument, pointers: list[str]) -> Elements:
-    """Return the vehicles' own numbers, each as a vector."""
-    values = np.empty(argument.shape, object)
-    for pointer, at in zip(pointers, np.ndindex(argument.shape), strict=True):
-        values[at] = _vector(code, pointer, "%b", argument.dtype)
-    return values
+def _read(code: Code, name: str, arguments: Sequence[Argument]) -> Callable[[], list[Operand]]:
+    """Return a reader of the arguments in a table of pointers.
+
+    Shared ones are read now, and the vehicles' own when it is called.
+    """
+    made: list[Callable[[], Operand]] = []
+    for i, argument in enumerate(arguments):
+        pointer = code.pointer(name, i)
+        if argument.shared:
+            shared = _shared(code, pointer, argument)
+            made.append(lambda shared=shared: shared)
+        elif argument.shape:
+            raise UnsupportedError(f"an array of {argument.shape} of each vehicle")
+        else:
+            made.append(functools.partial(_vector, code, pointer, argument.dtype))
+    return lambda: [read() for read in made]
 
 
-def _vector(code: Code, pointer: str, first: str, dtype: np.dtype) -> Value:
-    """Return a number per vehicle, from the given vehicle on."""
+def _vector(code: Code, pointer: str, dtype: np.dtype) -> Value:
+    """Return a number of each vehicle, from the block's first one on."""
     kind = type_of(dtype)
     kept, size = ("i8", 1) if kind == "i1" else (kind, dtype.itemsize)
     place = code.register()
-    code.write(f"{place} = getelementptr {kept}, ptr {pointer}, i64 {first}")
+    code.write(f"{place} = getelementptr {kept}, ptr {pointer}, i64 %b")
     right = f"load {code.vector(kept)}, ptr {place}, align {size}"
     value = code.made(right, dtype, False)
     if kind != "i1":
@@ -225,7 +183,7 @@ class Kernel:
         self.assembly, self._results = write(run, lanes)
         self._engine = _compiled(self.assembly)
         pointer, size = ctypes.c_void_p, ctypes.c_int64
-        kind = ctypes.CFUNCTYPE(None, *([pointer] * 4), size, size, size)
+        kind = ctypes.CFUNCTYPE(None, *([pointer] * 4), size, size)
         self._call = kind(self._engine.get_function_address("run"))
 
     def __call__(
@@ -238,30 +196,25 @@ class Kernel:
         """Compute the runs of all vehicles.
 
         Args:
-            stays: constants of the run; arrays that are not shared have the vehicles as last
-                dimension.
-            stored: arrays (N, ...), or (N, vehicles) if each vehicle has its own.
-            carry: carry before the first sample, with the vehicles as last dimension.
+            stays: constants of the run, arrays (vehicles,) unless they are shared.
+            stored: records (N,).
+            carry: carry before the first sample, arrays (vehicles,).
 
         Returns:
-            The results, with the vehicles as last dimension.
+            The results, arrays (vehicles,).
         """
         count = carry[0].shape[-1]
         assert count % self.lanes == 0
         assert self._run.steps >= 1
         # Keep references during the call, since the program has pointers to the arrays.
         arguments = [[np.ascontiguousarray(v) for v in part] for part in (stays, stored, carry)]
-        results = [np.empty((*r.shape, count), r.dtype) for r in self._results]
-        # The vehicles' own records are also read by sample, so each has one pointer.
-        stored_kinds = [argument._replace(shared=True) for argument in self._run.stored]
-        kinds = (self._run.stays, stored_kinds, self._run.carry)
-        tables = [_pointers(v, count, kind) for v, kind in zip(arguments, kinds, strict=True)]
-        ends = _pointers(results, count, self._results)
+        results = [np.empty(count, dtype) for dtype in self._results]
+        tables = [_pointers(arrays) for arrays in (*arguments, results)]
         blocks = count // self.lanes
         shares = np.linspace(0, blocks, min(threads, blocks) + 1).astype(int) * self.lanes
 
         def part(k: int) -> None:
-            self._call(*tables, ends, int(shares[k]), int(shares[k + 1]), count)
+            self._call(*tables, int(shares[k]), int(shares[k + 1]))
 
         # Python threads suffice, since the call releases the interpreter lock.
         if len(shares) == 2:
@@ -272,14 +225,9 @@ class Kernel:
         return results
 
 
-def _pointers(arrays: Sequence[np.ndarray], count: int, arguments: Sequence[Argument]) -> Any:
-    """Return a table of pointers: one for each shared array, one for each row of others."""
-    table = []
-    for array, argument in zip(arrays, arguments, strict=True):
-        row = 0 if argument.shared else count * array.itemsize
-        rows = 1 if argument.shared else int(np.prod(argument.shape))
-        table += [array.ctypes.data + k * row for k in range(rows)]
-    return (ctypes.c_void_p * max(1, len(table)))(*table)
+def _pointers(arrays: Sequence[np.ndarray]) -> Any:
+    """Return a table of pointers to arrays."""
+    return (ctypes.c_void_p * max(1, len(arrays)))(*(v.ctypes.data for v in arrays))
 
 
 # Any: llvmlite is an extra without types.

@@ -27,14 +27,9 @@ def _arithmetic(of_floats: str, of_integers: str) -> Operation:
 
 
 def _quotient(code: Code, a: Value, b: Value, **_: Any) -> Value:
-    if a.dtype.kind == "f":
-        return code.operation(f"fdiv {_F}", a, b)
-    if a.dtype.kind != "u":
-        raise UnsupportedError("a quotient of signed integers")
-    # The processor traps on division by zero, where XLA returns the largest number.
-    none = code.compare("icmp eq", b, constant(0, b.dtype))
-    result = code.operation("udiv", a, code.choose(none, constant(1, b.dtype), b))
-    return code.choose(none, constant(-1, b.dtype), result)
+    if a.dtype.kind != "f":
+        raise UnsupportedError("a quotient of integers")
+    return code.operation(f"fdiv {_F}", a, b)
 
 
 def _remainder(code: Code, a: Value, b: Value, **_: Any) -> Value:
@@ -71,14 +66,6 @@ def _function(name: str) -> Operation:
         return code.intrinsic(name, *values)
 
     return made
-
-
-def _polynomial(code: Code, x: Value, *factors: Value, **_: Any) -> Value:
-    """Evaluate a polynomial of rising powers by Horner's rule."""
-    total = factors[-1]
-    for factor in reversed(factors[:-1]):
-        total = OPERATIONS["add"](code, OPERATIONS["mul"](code, total, x), factor)
-    return total
 
 
 def _one_minus_square(code: Code, a: Value, **_: Any) -> Value:
@@ -147,17 +134,6 @@ def _finite(code: Code, a: Value, **_: Any) -> Value:
     return code.compare("fcmp olt", code.intrinsic("fabs", a), constant(np.inf, a.dtype))
 
 
-def _less_in_order(code: Code, a: Value, b: Value, **_: Any) -> Value:
-    """Return a < b, with NaN greater than all numbers."""
-    if a.dtype.kind != "f":
-        return OPERATIONS["lt"](code, a, b)
-    return code.operation("and", code.compare("fcmp ult", a, b), code.compare("fcmp ord", a, a))
-
-
-def _not_greater_in_order(code: Code, a: Value, b: Value, **_: Any) -> Value:
-    return _not(code, _less_in_order(code, b, a))
-
-
 def _logic(name: str) -> Operation:
     return lambda code, *values, **_: code.operation(name, *values)
 
@@ -165,16 +141,6 @@ def _logic(name: str) -> Operation:
 def _not(code: Code, a: Value, **_: Any) -> Value:
     ones = constant(True, a.dtype) if a.dtype.kind == "b" else constant(-1, a.dtype)
     return code.operation("xor", a, ones)
-
-
-def _same_bits(code: Code, a: Value, *, new_dtype: Any, **_: Any) -> Value:
-    """Reinterpret the bits as another type."""
-    target = np.dtype(new_dtype)
-    if target.itemsize != a.dtype.itemsize or "b" in (target.kind, a.dtype.kind):
-        raise UnsupportedError(f"the bits of {a.dtype} as {target}")
-    if type_of(target) == type_of(a.dtype):
-        return replace(a, dtype=target)
-    return code.cast("bitcast", a, target)
 
 
 def _selected(code: Code, which: Value, *cases: Value, **_: Any) -> Value:
@@ -208,8 +174,7 @@ def converted(code: Code, a: Value, *, new_dtype: Any, **_: Any) -> Value:
     if integer is not None and to == "i" and target.itemsize >= integer.dtype.itemsize:
         return converted(code, integer, new_dtype=target)
     if source == "f":
-        # Saturate as XLA does, since `fptosi` outside the type's range is undefined.
-        return _saturated(code, a, target)
+        raise UnsupportedError("a real number as an integer")
     if to == "f":
         made = code.cast("sitofp" if source == "i" else "uitofp", a, target)
         if source == "i" and a.shared:
@@ -223,16 +188,6 @@ def converted(code: Code, a: Value, *, new_dtype: Any, **_: Any) -> Value:
     if target.itemsize < a.dtype.itemsize:
         return code.cast("trunc", a, target)
     return code.cast("sext" if source == "i" else "zext", a, target)
-
-
-def _saturated(code: Code, a: Value, target: np.dtype) -> Value:
-    kind = "fptosi" if target.kind == "i" else "fptoui"
-    f, i = {"double": "f64", "float": "f32"}[type_of(a.dtype)], type_of(target)
-    lanes = code.many(a.shared)
-    name = f"@llvm.{kind}.sat.{lanes}{i}.{lanes}{f}"
-    source, result = code.typed(a.dtype, a.shared), code.typed(target, a.shared)
-    code.declared[name] = f"declare {result} {name}({source})"
-    return code.made(f"call {result} {name}({source} {a.operand})", target, a.shared)
 
 
 def _logistic(code: Code, a: Value, **_: Any) -> Value:
@@ -267,7 +222,6 @@ OPERATIONS: dict[str, Operation] = {
     "rsqrt": _inverse_root,
     "square": _square,
     "one_minus_square": _one_minus_square,
-    "polynomial": _polynomial,
     "integer_pow": _power,
     "pow": _power_of,
     "round": _rounded,
@@ -275,8 +229,6 @@ OPERATIONS: dict[str, Operation] = {
     "is_finite": _finite,
     "logistic": _logistic,
     "lt": _comparison("olt", "slt", "ult"),
-    "lt_to": _less_in_order,
-    "le_to": _not_greater_in_order,
     "le": _comparison("ole", "sle", "ule"),
     "gt": _comparison("ogt", "sgt", "ugt"),
     "ge": _comparison("oge", "sge", "uge"),
@@ -287,7 +239,6 @@ OPERATIONS: dict[str, Operation] = {
     "xor": _logic("xor"),
     "not": _not,
     "select_n": _selected,
-    "bitcast_convert_type": _same_bits,
     "convert_element_type": converted,
 }
 """Operations by name of the primitive, applied by element to numbers of equal shape."""

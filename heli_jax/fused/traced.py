@@ -7,7 +7,6 @@ import jax
 import numpy as np
 from jax.extend import core
 
-from heli_jax.fused.code import UnsupportedError
 from heli_jax.fused.kernel import Argument, Kernel, Run
 from heli_jax.numerics.hoist import hoisted
 
@@ -61,16 +60,16 @@ class Traced(NamedTuple):
 
         Args:
             kernel: kernel of `run`.
-            begun: result of `own`, with the elements first.
+            begun: result of `own` for each element.
             common: result of `common`.
-            records: records as traced; those that differ between elements have the elements last.
+            records: records as traced.
 
         Returns:
-            The results, with the elements last.
+            The results of each element.
         """
-        carry, own = jax.tree.map(lambda v: np.moveaxis(np.asarray(v), 0, -1), begun)
+        carry, own = jax.tree.map(np.asarray, begun)
         of_own, of_common = iter(own), iter(map(np.asarray, common))
-        stays = [next(of_own) if varying else next(of_common) for varying in self.varies]
+        stays = [next(of_own if varying else of_common) for varying in self.varies]
         stored = [np.asarray(v) for v in jax.tree.leaves(records)]
         return jax.tree.unflatten(self.results, kernel(stays, stored, carry, threads))
 
@@ -80,14 +79,12 @@ def traced(
     shared: Any,
     records: Any,
     element: Any,
-    own_records: Sequence[bool] | None = None,
 ) -> Traced:
     """Trace a run.
 
     Args:
-        records: arrays (N, ...) that are read by sample.
+        records: arrays (N,) that are read by sample, the same for all elements.
         element: an example of an element's own values.
-        own_records: True for each leaf of the records that differs between elements; default: none.
 
     Raises:
         UnsupportedError: a part of it has no translation.
@@ -123,14 +120,8 @@ def traced(
     closed, shape = jax.make_jaxpr(begin, return_shape=True)(shared, records, element)
     carried, stay = (jax.tree.leaves(part) for part in shape)
     rows = [np.asarray(v) for v in jax.tree.leaves(records)]
-    own_records = [False] * len(rows) if own_records is None else list(own_records)
-    n_shared = len(jax.tree.leaves(shared))
-    n_common = n_shared + len(rows)
-    arguments = closed.jaxpr.invars
-    of_records = zip(arguments[n_shared:n_common], own_records, strict=True)
-    if any(_vary(closed.jaxpr, [v for v, own in of_records if own])):
-        raise UnsupportedError("what begins with a record of each element's own")
-    varies = _vary(closed.jaxpr, arguments[n_common:])[len(carried) :]
+    n_common = len(jax.tree.leaves(shared)) + len(rows)
+    varies = _vary(closed.jaxpr, closed.jaxpr.invars[n_common:])[len(carried) :]
     run = Run(
         parts["step"],
         parts["last"],
@@ -138,7 +129,7 @@ def traced(
             Argument(v.shape, np.dtype(v.dtype), not varying)
             for v, varying in zip(stay, varies, strict=True)
         ),
-        tuple(Argument(v.shape, v.dtype, not o) for v, o in zip(rows, own_records, strict=True)),
+        tuple(Argument(v.shape, v.dtype, True) for v in rows),
         tuple(Argument(v.shape, np.dtype(v.dtype), False) for v in carried),
         parts["steps"],
     )

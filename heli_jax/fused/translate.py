@@ -1,43 +1,35 @@
 """Translation of a jaxpr into LLVM, line by line.
 
-Small arrays are split into elements. Long ones, such as the inputs of a record, stay in memory, and
+The model's equations are expressions of numbers. Arrays are records that stay in memory, and
 expressions of them are computed only for the elements in use.
 
 Loop carries stay in registers, each as an LLVM phi node.
 """
 
 import functools
-import math
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from jax.extend import core
 
-from heli_jax.fused.arrays import MOVED, SHAPED, at_compile_time, moved
+from heli_jax.fused.arrays import VIEWS, moved
 from heli_jax.fused.code import (
     INDEX,
-    MOST,
     Code,
-    Elements,
     Operand,
     Stored,
     UnsupportedError,
     Value,
-    applied,
     at_place,
     constant,
-    dtype_of,
-    elements,
     in_one_line,
+    scalar,
+    shape_of,
 )
 from heli_jax.fused.operations import OPERATIONS
-
-_UNROLLED = 16
-"""Most passes of a loop that is unrolled because derivatives need the results of each pass."""
 
 _NESTED = {
     "jit": "jaxpr",
@@ -62,13 +54,11 @@ def translate(code: Code, jaxpr: Any, consts: Sequence[Any], operands: Sequence[
     Raises:
         UnsupportedError: an operation without a translation.
     """
-    known: dict[Any, Operand] = {}
-    for variable, value in zip(jaxpr.constvars, consts, strict=True):
-        known[variable] = value if isinstance(value, Stored) else np.asarray(value)
-    known |= dict(zip(jaxpr.invars, operands, strict=True))
+    known: dict[Any, Operand] = dict(zip(jaxpr.invars, operands, strict=True))
+    known |= {v: _constant(c) for v, c in zip(jaxpr.constvars, consts, strict=True)}
 
     def read(atom: Any) -> Operand:
-        return np.asarray(atom.val) if isinstance(atom, core.Literal) else known[atom]
+        return _constant(atom.val) if isinstance(atom, core.Literal) else known[atom]
 
     for equation in jaxpr.eqns:
         inputs = [read(v) for v in equation.invars]
@@ -86,6 +76,14 @@ def translate(code: Code, jaxpr: Any, consts: Sequence[Any], operands: Sequence[
     return [read(v) for v in jaxpr.outvars]
 
 
+def _constant(value: Any) -> Value:
+    """Return a number of the program."""
+    value = np.asarray(value)
+    if value.shape:
+        raise UnsupportedError(f"a constant array of {value.shape}")
+    return constant(value, value.dtype)
+
+
 def _named(equation: Any) -> tuple[str, dict[str, Any]]:
     """Return an operation's name and parameters."""
     name, params = equation.primitive.name, equation.params
@@ -94,16 +92,6 @@ def _named(equation: Any) -> tuple[str, dict[str, Any]]:
     # Such as jnp.searchsorted, whose primitive is shared by many operations.
     of = params["_prim"]
     return type(of).__name__, {**getattr(of, "params", {}), **params}
-
-
-def _made_of(of: Any, equation: Any) -> Any:
-    """Return the jaxpr of a composite operation of JAX, such as jnp.ldexp."""
-    arguments = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in equation.invars]
-
-    def expanded(*flat: Any) -> Any:
-        return jax.tree.leaves(of.expand(*jax.tree.unflatten(of.in_tree, flat)))
-
-    return jax.make_jaxpr(expanded)(*arguments)
 
 
 def _equation(code: Code, equation: Any, inputs: list[Operand]) -> list[Operand]:
@@ -123,60 +111,32 @@ def _equation(code: Code, equation: Any, inputs: list[Operand]) -> list[Operand]
     if "callback" in name:
         # Refused even for known operands, since Python would be called in branches not taken.
         raise UnsupportedError(f"the operation {name}")
-    known = not any(isinstance(v, Stored) or v.dtype == object for v in inputs)
-    if known and not (name in OPERATIONS and all(v.shape == () for v in inputs)):
-        # Any operation; LLVM folds single numbers itself.
-        return at_compile_time(equation, inputs)
     if name in OPERATIONS:
-        dtype = np.dtype(equation.outvars[0].aval.dtype)
-        return [_elementwise(code, name, params, inputs, dtype)]
-    if name in MOVED:
-        return moved(code, equation, name, inputs)
-    if name in SHAPED:
-        return [SHAPED[name](code, inputs, params)]
-    if hasattr(params.get("_prim"), "expand"):
-        made_of = _made_of(params["_prim"], equation)
-        return translate(code, made_of.jaxpr, made_of.consts, inputs)
+        return [_elementwise(code, name, params, inputs, equation.outvars[0].aval.dtype)]
+    if name in VIEWS:
+        return [moved(code, name, inputs, params)]
     raise UnsupportedError(f"the operation {name}")
 
 
 def _elementwise(
     code: Code, name: str, params: dict[str, Any], inputs: list[Operand], dtype: np.dtype
 ) -> Operand:
-    """Apply an operation to arrays of one shape, numbers, and arrays with axes of length 1."""
+    """Apply an operation to numbers, or to arrays of one shape and numbers."""
     operation = functools.partial(OPERATIONS[name], code, **params)
-    shape = np.broadcast_shapes(*(v.shape for v in inputs))
-    if any(isinstance(v, Stored) for v in inputs):
-
-        def element(at: tuple[Value, ...]) -> Value:
-            return operation(*(at_place(code, v, _repeated(v.shape, shape, at)) for v in inputs))
-
-        return Stored(shape, dtype, element)
-    if math.prod(shape) > MOST:
-        raise UnsupportedError(f"an array of {shape} as a whole")
-    return applied(operation, *(elements(v) for v in inputs))
-
-
-def _repeated(
-    own: tuple[int, ...], shape: tuple[int, ...], at: tuple[Value, ...]
-) -> tuple[Value, ...]:
-    """Return the index into an array for an index of its broadcast shape."""
-    if not own:
-        return ()
-    zero = constant(0, INDEX)
-    return tuple(i if n == m else zero for n, m, i in zip(own, shape, at, strict=True))
+    shapes = {v.shape for v in inputs if isinstance(v, Stored)}
+    if not shapes:
+        return operation(*inputs)
+    if len(shapes) > 1:
+        raise UnsupportedError(f"{name} of arrays with different shapes")
+    return Stored(shapes.pop(), dtype, lambda at: operation(*(at_place(v, at) for v in inputs)))
 
 
 def _branches(code: Code, params: dict[str, Any], inputs: list[Operand]) -> list[Operand]:
     """Translate cond: compute all branches, and select a result for each vehicle."""
     which, operands, branches = inputs[0], inputs[1:], params["branches"]
-    if not isinstance(which, Stored) and which.dtype != object:
-        branch = branches[int(np.clip(which, 0, len(branches) - 1))]
-        return translate(code, branch.jaxpr, branch.consts, operands)
     results = [translate(code, b.jaxpr, b.consts, operands) for b in branches]
-    taken = elements(which)
     return [
-        _elementwise(code, "select_n", {}, [taken, *case], dtype_of(case[0]))
+        _elementwise(code, "select_n", {}, [which, *case], case[0].dtype)
         for case in zip(*results, strict=True)
     ]
 
@@ -187,17 +147,17 @@ def _scan(code: Code, params: dict[str, Any], inputs: list[Operand]) -> list[Ope
     consts, carry = inputs[:n_consts], inputs[n_consts : n_consts + n_carry]
     rows = inputs[n_consts + n_carry :]
     if len(body.jaxpr.outvars) > n_carry:
-        return _written_out(code, params, consts, carry, rows)
+        raise UnsupportedError("a loop whose results are all kept")
     if length == 0:
         return list(carry)
 
-    def once(index: Value, carried: list[Operand]) -> list[Operand]:
+    def once(index: Value, carried: list[Value]) -> list[Operand]:
         if params["reverse"]:
             index = code.operation("sub", constant(length - 1, INDEX), index)
-        now = [_row(code, v, index) for v in rows]
+        now = [_row(v, index) for v in rows]
         return translate(code, body.jaxpr, body.consts, [*consts, *carried, *now])
 
-    return loop(code, length, carry, once)
+    return list(loop(code, length, carry, once))
 
 
 def _counts(params: dict[str, Any]) -> tuple[int, int]:
@@ -209,100 +169,64 @@ def _counts(params: dict[str, Any]) -> tuple[int, int]:
     return len(list(consts)), len(list(carry))
 
 
-def _row(code: Code, operand: Operand, index: Value) -> Operand:
+def _row(operand: Operand, index: Value) -> Operand:
     """Return operand[index]."""
-    shape = operand.shape[1:]
-    view = Stored(shape, dtype_of(operand), lambda at: at_place(code, operand, (index, *at)))
-    return view if int(np.prod(shape)) > MOST else elements(view)
-
-
-def _written_out(
-    code: Code,
-    params: dict[str, Any],
-    consts: list[Operand],
-    carry: list[Operand],
-    rows: list[Operand],
-) -> list[Operand]:
-    length, body = params["length"], params["jaxpr"]
-    if not 0 < length <= _UNROLLED:
-        raise UnsupportedError(f"a loop of {length} passes whose results are all kept")
-    order = range(length - 1, -1, -1) if params["reverse"] else range(length)
-    kept: list[list[Elements]] = [[] for _ in body.jaxpr.outvars[len(carry) :]]
-    for k in order:
-        now = [_row(code, v, constant(k, INDEX)) for v in rows]
-        outputs = translate(code, body.jaxpr, body.consts, [*consts, *carry, *now])
-        carry = outputs[: len(carry)]
-        for column, value in zip(kept, outputs[len(carry) :], strict=True):
-            column.append(elements(value))
-    if params["reverse"]:
-        kept = [column[::-1] for column in kept]
-    return [*carry, *(np.stack(column) for column in kept)]
+    view = Stored(shape_of(operand)[1:], operand.dtype, lambda at: at_place(operand, (index, *at)))
+    return view if view.shape else scalar(view)
 
 
 def loop(
     code: Code,
     passes: int,
     carry: Sequence[Operand],
-    body: Callable[[Value, list[Operand]], list[Operand]],
-) -> list[Operand]:
+    body: Callable[[Value, list[Value]], list[Operand]],
+) -> list[Value]:
     """Write a loop with at least one pass.
 
     Args:
         body: function of the pass number (int32) and the carry that returns the next carry.
     """
-    starts = [elements(v) for v in carry]
-    varies = [_vary(v) for v in starts]
+    starts = [scalar(v) for v in carry]
+    shared = [v.shared for v in starts]
     # A carry that starts shared may not stay so; repeat until nothing changes.
     while True:
         mark = code.mark()
-        results = _tried(code, passes, starts, varies, body)
-        changed = [old | _vary(new) for old, new in zip(varies, results, strict=True)]
-        if all(np.array_equal(a, b) for a, b in zip(varies, changed, strict=True)):
-            return list(results)
-        varies = changed
+        results = _tried(code, passes, starts, shared, body)
+        still = [old and new.shared for old, new in zip(shared, results, strict=True)]
+        if still == shared:
+            return results
+        shared = still
         code.back_to(mark)
-
-
-def _vary(values: Elements) -> np.ndarray:
-    """Return a mask of values that differ between vehicles."""
-    return applied(lambda v: not v.shared, values).astype(bool)
 
 
 def _tried(
     code: Code,
     passes: int,
-    starts: list[Elements],
-    varies: list[np.ndarray],
-    body: Callable[[Value, list[Operand]], list[Operand]],
-) -> list[Elements]:
-    """Write the loop; `varies` marks carries that differ between vehicles."""
-    before = [
-        [code.of(v, not bool(w)) for v, w in zip(s.ravel(), each.ravel(), strict=True)]
-        for s, each in zip(starts, varies, strict=True)
-    ]
+    starts: list[Value],
+    shared: list[bool],
+    body: Callable[[Value, list[Value]], list[Operand]],
+) -> list[Value]:
+    """Write the loop; `shared` marks carries that are the same for all vehicles."""
+    before = [code.of(v, same) for v, same in zip(starts, shared, strict=True)]
     entry, inside = code.block, code.new_label("loop")
     code.write(f"br label %{inside}")
     code.label(inside)
     # The phi nodes need the values of the next pass, so they are inserted later at this place.
     place = len(code.lines)
     index = Value(code.register(), INDEX, True)
-    carried = []
-    for s, each in zip(starts, varies, strict=True):
-        carried.append(applied(lambda v, w: Value(code.register(), v.dtype, not w), s, each))
-    results = [elements(v) for v in body(index, list(carried))]
-    around = [
-        [code.of(v, not bool(w) and v.shared) for v, w in zip(r.ravel(), e.ravel(), strict=True)]
-        for r, e in zip(results, varies, strict=True)
+    carried = [
+        Value(code.register(), v.dtype, same) for v, same in zip(starts, shared, strict=True)
     ]
+    results = [scalar(v) for v in body(index, list(carried))]
+    around = [code.of(v, same and v.shared) for v, same in zip(results, shared, strict=True)]
     following = code.operation("add", index, constant(1, INDEX))
     again = code.compare("icmp slt", following, constant(passes, INDEX))
     end = code.block
     after = code.new_label("after")
     phis = [f"{index.operand} = phi i32 [ 0, %{entry} ], [ {following.operand}, %{end} ]"]
-    for values, first, then in zip(carried, before, around, strict=True):
-        for v, a, b in zip(values.ravel(), first, then, strict=True):
-            kind = code.typed(v.dtype, v.shared)
-            phis.append(f"{v.operand} = phi {kind} [ {a}, %{entry} ], [ {b}, %{end} ]")
+    for v, a, b in zip(carried, before, around, strict=True):
+        kind = code.typed(v.dtype, v.shared)
+        phis.append(f"{v.operand} = phi {kind} [ {a}, %{entry} ], [ {b}, %{end} ]")
     code.lines[place:place] = [f"  {p}" for p in phis]
     code.write(f"br i1 {again.operand}, label %{inside}, label %{after}")
     code.label(after)

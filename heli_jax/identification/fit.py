@@ -2,12 +2,12 @@
 
 import dataclasses
 import time
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 
-from heli_jax.finding import Finding, distrusted, found
+from heli_jax.finding import Finding, distrusted
 from heli_jax.identification.design.accuracy import starting_at_zero, unstated_gusts
 from heli_jax.identification.design.windows import Ranking, rank_windows
 from heli_jax.identification.diagnostics import diagnose
@@ -19,7 +19,6 @@ from heli_jax.identification.diagnostics.record import (
     of_rates,
     rates_enough,
 )
-from heli_jax.identification.equation_error.start import StartValue, reasons_of
 from heli_jax.identification.estimation import multistart as starting
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import measured_count
@@ -263,66 +262,3 @@ def _result(c: Context, starts: tuple[StartRow, ...], seed: int, timing: dict[st
         seed=seed,
         timing=timing,
     )
-
-
-# Start values for a fit in time from a fit by frequency error, whose cost needs no simulation. Far
-# from the optimum the cost in time has local minima, and simulations of an unstable vehicle
-# overflow.
-
-
-class FrequencyErrorStart(NamedTuple):
-    """Start values, and the fit they come from."""
-
-    values: dict[str, StartValue]
-    status: Status
-    """Status of the fit in frequency."""
-    seconds: float
-    """Processing time [s]."""
-    notes: tuple[str, ...]
-    """Notes of the fit in frequency."""
-
-    @property
-    def findings(self) -> list[Finding]:
-        """Notes on the start values."""
-        taken = [n for n, v in self.values.items() if v.origin == "frequency error"]
-        run = {"status": self.status, "seconds": self.seconds}
-        if not taken:
-            reasons = list(dict.fromkeys(v.reason for v in self.values.values() if v.reason))
-            return [found("start.frequency-error-failed", "note", reasons=reasons, **run)]
-        out = [found("start.frequency-error", "note", names=taken, **run)]
-        return out + reasons_of(self.values)
-
-
-def frequency_error_start(problem: Problem, *, max_steps: int = 200) -> FrequencyErrorStart:
-    """Return start values of the free parameters from a fit of the same flights in frequency.
-
-    Args:
-        problem: a problem for frequency error, without a disturbance.
-
-    Raises:
-        ValueError: frequency error cannot solve it, with the reason.
-    """
-    began = time.perf_counter()
-    first = fit(dataclasses.replace(problem, flights=problem.training), max_steps=max_steps)
-    # If there are several solutions, each is a good start.
-    of_several = {n for other in first.verdict.second for n in other.changed}
-    values = {}
-    for name, e in first.estimates.items():
-        if first.status == "not-converged":
-            reason = "frequency error did not converge"
-        elif e.sd is None and name not in of_several:
-            reason = "the spectra do not determine them"
-        else:
-            reason = "frequency error ended at their bounds" if e.at_bound else ""
-        values[name] = StartValue(e.value, e.unit, "frequency error", "")
-        if reason:
-            stated = problem.free[name].start
-            values[name] = StartValue(stated, e.unit, "as stated", reason)
-    return FrequencyErrorStart(values, first.status, time.perf_counter() - began, first.notes)
-
-
-def started(problem: Problem, guess: FrequencyErrorStart) -> Problem:
-    """Return the problem with the guess as its start values."""
-    free = dict(problem.free)
-    free |= {n: free[n]._replace(start=v.value) for n, v in guess.values.items() if n in free}
-    return dataclasses.replace(problem, free=free, first_guess=guess)

@@ -36,11 +36,10 @@ from heli_jax.flights.flight import as_content
 from heli_jax.identification.diagnostics.residuals import COLOURED, TOO_NARROW
 from heli_jax.identification.equation_error.start import (
     Equation,
-    EquationErrorStart,
     StartValue,
 )
 from heli_jax.identification.estimation.multistart import StartRow
-from heli_jax.identification.fit import Fit, FrequencyErrorStart
+from heli_jax.identification.fit import Fit
 from heli_jax.identification.identifiability.profile import Profile
 from heli_jax.identification.identifiability.verdict import Combination, Pair
 from heli_jax.identification.problem import Problem
@@ -295,16 +294,6 @@ class EquationErrorContent(TypedDict):
     sentences: Annotated[list[str], lambda start: sentences(start.findings)]
 
 
-class FrequencyErrorContent(TypedDict):
-    """Start values by frequency error."""
-
-    status: Status
-    seconds: float
-    values: dict[str, StartValue]
-    sentences: Annotated[list[str], lambda start: sentences(start.findings)]
-    notes: list[str]
-
-
 class SignalSource(TypedDict, total=False):
     """Source of a model's signal."""
 
@@ -352,16 +341,6 @@ class HoldContent(TypedDict):
 
     hold: Literal["zero-order", "linear", "mixed"]
     reason: str
-
-
-def _start(kind: type) -> Callable[[Any], Any]:
-    """Return the source of start values of one method."""
-
-    def found(analysis: Any) -> Any:
-        guess = analysis.problem.first_guess
-        return guess if isinstance(guess, kind) else None
-
-    return found
 
 
 _NOISE = ("white", "coloured residuals")
@@ -444,8 +423,7 @@ class FitFile(TypedDict):
     """Agreement of held-out flights with a fit in frequency."""
     baseline_rls: Annotated[BaselineContent | None, "baseline"]
     handling_qualities: Annotated[list[HandlingPair], lambda a: _handling(a)]
-    equation_error_start: Annotated[EquationErrorContent | None, _start(EquationErrorStart)]
-    frequency_error_start: Annotated[FrequencyErrorContent | None, _start(FrequencyErrorStart)]
+    equation_error_start: Annotated[EquationErrorContent | None, "problem.first_guess"]
     starts: Annotated[list[StartRow], lambda a: _starts(a.fit)]
     """End of each start."""
     steps: Annotated[int, "fit.steps"]

@@ -14,7 +14,6 @@ from heli_jax.finding import sentences
 from heli_jax.flights.flight import in_words
 from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.equation_error.start import EquationErrorStart
-from heli_jax.identification.fit import FrequencyErrorStart
 from heli_jax.identification.identifiability.verdict import Z95, Combination
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Fit
@@ -475,15 +474,7 @@ def _complex(p: complex) -> str:
     return f"{number(p.real, 5)} {sign} {number(abs(p.imag), 5)}i ({size})"
 
 
-type Start = EquationErrorStart | FrequencyErrorStart
-
-
-def start_method(start: Start) -> str:
-    """Name the method that found the start values."""
-    return "equation error" if isinstance(start, EquationErrorStart) else "frequency error"
-
-
-def first_guess(start: Start) -> Table:
+def first_guess(start: EquationErrorStart) -> Table:
     """Return the table of start values, with the method that found each."""
     rows = []
     for name, v in start.values.items():

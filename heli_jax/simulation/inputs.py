@@ -202,7 +202,10 @@ def least_crest(lines: np.ndarray, rng: np.random.Generator) -> Float[np.ndarray
         phases = rng.uniform(0.0, 2.0 * np.pi, k.size) if attempt else -np.pi * k**2 / k.size
         for power in _POWERS:
             steps = {"maxiter": _STEPS}
-            phases = minimize(norm, phases, (power,), "L-BFGS-B", jac=True, options=steps).x
+            found = minimize(
+                norm, phases, args=(power,), method="L-BFGS-B", jac=True, options=steps
+            )
+            phases = found.x
         if (top := float(np.max(np.abs(wave(phases))))) < least:
             best, least = phases, top
     return best
@@ -223,7 +226,7 @@ KINDS = (
     Kind("doublet", lambda n, dt, rng, s: multistep(n, dt, rng, s.step, s.pause, DOUBLET), False),
     Kind("3-2-1-1", lambda n, dt, rng, s: multistep(n, dt, rng, s.step, s.pause), smooth=False),
     Kind("prbs", lambda n, dt, rng, s: prbs(n, dt, rng, s.step), smooth=False),
-    Kind("chirp", lambda n, dt, rng, s: chirp(n, dt, *s.band, s.fade), smooth=True),
+    Kind("chirp", lambda n, dt, rng, s: chirp(n, dt, s.band[0], s.band[1], s.fade), smooth=True),
     Kind("multisine", lambda n, dt, rng, s: multisine(n, dt, rng, s.band, s.place), smooth=True),
     Kind("neutral", lambda n, dt, rng, s: np.zeros(n), smooth=False),
 )

@@ -67,6 +67,7 @@ def _fitted(task: Task) -> Outcome:
     # Here, because the requesting process needs neither.
     from heli_jax import workflow
     from heli_jax.config.experiment import from_content
+    from heli_jax.config.logs import log_notes
     from heli_jax.report.origin import made_for
 
     run = workflow.run_fit(from_content(task.content, Path(task.path)))
@@ -81,7 +82,7 @@ def _fitted(task: Task) -> Outcome:
             for file in sorted(place.rglob("*"))
             if file.is_file()
         }
-    return Outcome(files, notes=tuple(sentences(workflow.log_notes(run.problem))))
+    return Outcome(files, notes=tuple(sentences(log_notes(run.problem.flights))))
 
 
 def _in_words(point: dict[str, Any]) -> str:

@@ -8,7 +8,6 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from heli_jax.sweeps.datasets import as_grid as as_grid
     from heli_jax.sweeps.design import Design as Design
     from heli_jax.sweeps.design import Range as Range
     from heli_jax.sweeps.design import grid as grid
@@ -32,7 +31,6 @@ _HOMES = {
     ),
     **dict.fromkeys(("Trajectories", "Trimmed"), "spec"),
     **dict.fromkeys(("Reduce", "Streaming"), "reducers"),
-    "as_grid": "datasets",
     "sweep": "run",
 }
 __all__ = list(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]

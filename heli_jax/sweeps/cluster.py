@@ -9,9 +9,8 @@ import functools
 import logging
 import signal
 import threading
-import time
 import uuid
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import dask
@@ -34,13 +33,6 @@ _RETRIES = 5  # retries of a failed chunk; dask itself counts dead workers
 # travels; with all, a large sweep's results would wait in this process's memory.
 _AHEAD = 3
 _CONNECT_S = 20  # [s] without a reply after which an address counts as wrong
-_ALONE_S = 120.0
-"""Time [s] without any worker after which the run fails. A nanny restarts a worker in seconds; a
-job queue may take longer."""
-_LOOK_S = 2.0
-"""Time [s] between two checks for workers."""
-_WAIT_S = 0.02
-"""Time [s] between two checks for finished tasks."""
 _IMPORTS = (
     "your own modules must exist there too: start scheduler and workers with PYTHONPATH set to "
     "their folder"
@@ -173,7 +165,7 @@ def _ignore_sigint() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Suppress the client's log of a lost scheduler; `_answering` reports it."""
+    """Suppress the client's log of a lost scheduler; `_dask_errors` reports it."""
     logger = logging.getLogger("distributed.client")
     before = logger.level
     logger.setLevel(logging.CRITICAL)
@@ -263,58 +255,6 @@ def computed(
         yield todo[k], results
 
 
-# Any: dask's futures and as_completed have no types.
-def _gathered(futures: list[Any]) -> Any:
-    """Return futures as they finish, with their results already here.
-
-    Fetching a result later may block forever if its worker has died.
-    """
-    return as_completed(futures, with_results=True, raise_errors=False)
-
-
-def _as_completed(client: Client, running: Any) -> Iterator[tuple[Any, Callable[[], Any]]]:
-    """Yield the futures as they end, each with a function that returns its result or raises.
-
-    More futures may be added meanwhile.
-    """
-    seen = looked = time.monotonic()
-    while not running.is_empty():
-        if running.has_ready():
-            future, result = next(running)
-            yield future, functools.partial(_value, future, result)
-            seen = looked = time.monotonic()
-            continue
-        time.sleep(_WAIT_S)
-        now = time.monotonic()
-        if now - looked < _LOOK_S:
-            continue
-        looked = now
-        with _dask_errors():
-            there = client.scheduler_info()["workers"].values()
-        seen = now if any(map(_works, there)) else seen
-        if now - seen > _ALONE_S:
-            paused = f"no worker except {len(there)} that lack memory" if there else "no worker"
-            raise InputError(
-                f"dask: the scheduler has had {paused} for {now - seen:.0f} s, expected at least "
-                "one until the end; finished elements are kept: --resume continues"
-            )
-
-
-def _value(future: Any, result: Any) -> Any:
-    """Return the result of a future that ended, or raise its error."""
-    if future.status == "error":
-        raise result[1]
-    if isinstance(result, CancelledError):
-        raise result
-    return result
-
-
-def _works(worker: Mapping[str, Any]) -> bool:
-    """True if a worker accepts or runs tasks: dask pauses those that are short of memory."""
-    counts = worker.get("metrics", {}).get("task_counts", {})
-    return worker.get("status") != "paused" or bool(counts.get("executing"))
-
-
 def mapped(
     client: Client,
     function: Callable[..., Any],
@@ -343,10 +283,16 @@ def mapped(
 
     # Submit a few tasks ahead.
     ahead = zip(range(_AHEAD * _threads(client)), waiting, strict=False)
-    running = _gathered([submitted(k) for _, k in ahead])
-    for future, result in _as_completed(client, running):
+    # With results, because fetching one later may block forever if its worker has died.
+    running: Any = as_completed([submitted(k) for _, k in ahead], with_results=True)
+    while True:
         with _dask_errors():
-            value = result()
+            ended = next(running, None)
+            if ended is None:
+                return
+            future, value = ended
+            if isinstance(value, CancelledError):
+                raise value
         # Before it is written, otherwise the worker would keep its results until then.
         future.release()
         following = next(waiting, None)

@@ -29,12 +29,7 @@ def described(job: Job) -> dict[str, Any]:
             "dt": f.dt,
             "known": dict(f.known),
             "sha256": digest({**f.inputs, **{f"measured {n}": v for n, v in f.outputs.items()}}),
-            # Only if it applies: older stores, from before inputs could be linear, lack this key.
-            **{
-                hold: held
-                for hold in ("linear", "mixed")
-                if (held := [n for n, own in moving_inputs_of(model, f) if own == hold])
-            },
+            "holds": dict(moving_inputs_of(model, f)),
         }
         for f in job.flights
     ]

@@ -13,7 +13,7 @@ from heli_jax import naming
 from heli_jax.analysis.trim import STICKS, Trim, equilibrium, plausible
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
-from heli_jax.simulation.accumulate import Steps, accumulated, in_steps
+from heli_jax.simulation.accumulate import Accumulated, Steps, accumulated, in_steps
 from heli_jax.simulation.options import SimulationOptions
 from heli_jax.simulation.simulate import simulate
 from heli_jax.simulation.trajectory import Trajectory
@@ -213,15 +213,14 @@ def of_steps(
     numbers: FlightNumbers,
     values: Scalars,
     trim: InitialTrim | None,
-    reduced: tuple[Any, Any, dict[str, Any]],
+    reduced: Accumulated,
 ) -> ElementResults:
-    """Return the results of an element from the steps of `steps_of`.
+    """Return the results of an element from the end of `steps_of`.
 
     Args:
         plan, numbers, values, trim: as in `design_point`.
-        reduced: final value, state and limits of the run.
     """
-    return _concluded(plan, numbers, values, trim, _of_reduced(plan, numbers, *reduced))
+    return _concluded(plan, numbers, values, trim, _of_reduced(plan, numbers, reduced))
 
 
 def _concluded(
@@ -370,7 +369,7 @@ def _streamed(plan: Plan, numbers: FlightNumbers, params: Any, state: Any, input
         limits=True,
         options=options,
     )
-    return _of_reduced(plan, numbers, reduced.value, reduced.state, reduced.outside)
+    return _of_reduced(plan, numbers, reduced)
 
 
 def _streamed_options(
@@ -380,12 +379,11 @@ def _streamed_options(
     return plan.simulation(dt=numbers.dt, initial_state=state, block=block)
 
 
-def _of_reduced(
-    plan: Plan, numbers: FlightNumbers, value: Any, state: Any, outside: dict[str, Any]
-) -> _Run:
+def _of_reduced(plan: Plan, numbers: FlightNumbers, reduced: Accumulated) -> _Run:
     """Return the results of a run that was not stored."""
     n = jax.tree.leaves(numbers.inputs)[0].shape[0]
-    return _finished(plan, numbers, value, n), {}, state, list(outside.values())
+    results = _finished(plan, numbers, reduced.value, n)
+    return results, {}, reduced.state, list(reduced.outside.values())
 
 
 def _whole(

@@ -115,30 +115,9 @@ def _example(job: Job, index: int) -> tuple[Plan, FlightNumbers, Scalars, Any]:
     return plan, numbers, values, trim
 
 
-class _Elements(NamedTuple):
-    """An element's run in steps, with results in the form for `of_steps`."""
-
-    of: Steps
-
-    @property
-    def carry(self) -> Any:
-        return self.of.carry
-
-    @property
-    def steps(self) -> int:
-        return self.of.steps
-
-    def step(self, carry: Any, k: Any, /) -> Any:
-        return self.of.step(carry, k)
-
-    def last(self, carry: Any, /) -> Any:
-        left = self.of.last(carry)
-        return left.value, left.state, left.outside
-
-
 def _traced(plan: Plan, numbers: FlightNumbers, values: Scalars, trim: Any) -> Traced:
-    def making(bare: FlightNumbers, records: Any, element: Any) -> _Elements:
-        return _Elements(steps_of(plan, _with(bare, records), *element))
+    def making(bare: FlightNumbers, records: Any, element: Any) -> Steps:
+        return steps_of(plan, _with(bare, records), *element)
 
     return traced(making, _without(numbers), _records(numbers), (values, trim))
 

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 import xarray as xr
 
@@ -18,7 +17,7 @@ from heli_jax.flights.flight import Flight
 from heli_jax.stages import Note
 from heli_jax.sweeps import store as stores
 from heli_jax.sweeps.batching import split_for
-from heli_jax.sweeps.design import Design, table
+from heli_jax.sweeps.design import Design
 from heli_jax.sweeps.reducers import Reduce
 from heli_jax.sweeps.spec import Job, RunOptions, unread
 from heli_jax.sweeps.spec import job as checked
@@ -28,8 +27,6 @@ from heli_jax.versions import changed_since, versions
 
 # `Any` below: Params of the user's own class, JSON content, and a dask Client, which is imported
 # only if workers are used.
-
-_SAMPLED = 64  # elements for the comparison of float32 with float64: enough to show its magnitude
 
 
 class Progress(NamedTuple):
@@ -149,15 +146,15 @@ def run_sweep(
     kept["notes"] = [as_data(f) for f in notes]
     if out is None:
         # The same store as on disk, so that a sweep in memory uses the same code.
-        store = stores.create(None, job, *_cut(job, options, kept), "the sweep")
+        store = stores.create(None, job, _cut(job, options), kept, "the sweep")
         _compute(job, store, store.done(), options)
         return store.dataset().load()
     if run_directory.is_new(out, options.resume):
-        cut = _cut(job, options, kept)
+        split = _cut(job, options)
         with run_directory.whole(out) as directory:
             for name, text in (files or {}).items():
                 (directory / name).write_text(text, encoding="utf-8")
-            stores.create(directory / "sweep.zarr", job, *cut, f"--out {out}")
+            stores.create(directory / "sweep.zarr", job, split, kept, f"--out {out}")
     run_directory.require_writable(out)
     return _resume(job, out, options)
 
@@ -205,8 +202,8 @@ def _resume(job: Job, out: Path, options: Options) -> xr.Dataset:
     return dataset
 
 
-def _cut(job: Job, options: Options, words: dict[str, Any]) -> tuple[Split, dict[str, Any]]:
-    """Return the division of the sweep and the attributes of its store."""
+def _cut(job: Job, options: Options) -> Split:
+    """Return the division of the sweep."""
     for name in ("chunk", "lanes"):
         number = getattr(options, name)
         if number is not None and number < 1:
@@ -220,10 +217,7 @@ def _cut(job: Job, options: Options, words: dict[str, Any]) -> tuple[Split, dict
         split = split_there(options.client, job, **requested)
     else:
         split = split_for(job, devices=options.devices, say=options.say, **requested)
-    # Once, when the store is made, so that a resumed sweep keeps the error from its start.
-    if job.options.precision == "float32":
-        words = {**words, "float32_error": float32_error(job)}
-    return split, words
+    return split
 
 
 def _same_cut(store: stores.Store, job: Job, options: Options, where: str) -> None:
@@ -286,33 +280,3 @@ def _local(
         if following is not None:
             begun = worker.begin(following)
         yield chunk, worker.finish(pending)
-
-
-def float32_error(job: Job) -> dict[str, float | str]:
-    """Return the error of float32 against float64, relative to the largest value of each result.
-
-    It is measured on elements spread over the design.
-    """
-    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
-        return {"note": "not measured: float64 is switched off in JAX"}
-    n = job.design.size
-    chosen = np.unique(np.linspace(0, n - 1, min(n, _SAMPLED)).astype(int))
-    columns = [job.design.values(int(k), int(k) + 1) for k in chosen]
-    some = table({name: np.concatenate([c[name] for c in columns]) for name in columns[0]})
-    split = Split(len(chosen), len(chosen))
-    exact = job.options._replace(precision="float64")
-    # One device: compiling for others would not pay for 64 elements.
-    devices = jax.local_devices()[:1]
-    single = Worker(job._replace(design=some), split, devices).run(0)
-    double = Worker(job._replace(design=some, options=exact), split, devices).run(0)
-    errors: dict[str, float | str] = {}
-    for name, values in double.items():
-        if name in some.names or values.dtype.kind != "f":
-            continue
-        off = np.abs(single[name] - values)
-        off, size = off[np.isfinite(off)], np.abs(values[np.isfinite(values)])
-        # Relative to the largest value, not to each value: one that is zero up to rounding has no
-        # valid digits.
-        largest = size.max(initial=0.0)
-        errors[name] = float(off.max(initial=0.0) / largest) if largest > 0 else 0.0
-    return errors

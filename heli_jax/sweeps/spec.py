@@ -55,8 +55,7 @@ class RunOptions(NamedTuple):
     substeps: int | None = None
     """Steps per sample; by default enough for steps of 5 ms."""
     precision: Precision = "float64"
-    """Precision. float32 is faster on some devices; its error is measured on 64 elements and stored
-    in the attributes."""
+    """Precision. float32 is faster on some devices."""
     trajectories: Trajectories | None = None
     """Outputs to keep, thinned."""
     trimmed: Trimmed | None = None

@@ -9,7 +9,6 @@ import numpy as np
 import xarray as xr
 
 from heli_jax import run_directory
-from heli_jax.finding import as_data, note
 from heli_jax.sweeps.design_point import MEANINGS, OK
 from heli_jax.sweeps.spec import Job
 
@@ -46,7 +45,7 @@ def summary(dataset: xr.Dataset, job: Job, timing: dict[str, Any]) -> dict[str, 
         # Quantiles over times and elements together have no meaning for a run.
         if not str(name).startswith("trajectory_")
     }
-    content = {
+    return {
         "model": job.model.name,
         "elements": int(status.size),
         "status": {word: int(np.count_nonzero(status == k)) for k, word in MEANINGS.items()},
@@ -60,15 +59,8 @@ def summary(dataset: xr.Dataset, job: Job, timing: dict[str, Any]) -> dict[str, 
         "timing": timing,
         "versions": dataset.attrs["versions"],
         "seed": dataset.attrs["seed"],
-        # A store of an earlier version has only sentences.
-        "notes": [
-            n if isinstance(n, dict) else as_data(note("sweep.note", n))
-            for n in dataset.attrs.get("notes", [])
-        ],
+        "notes": dataset.attrs["notes"],
     }
-    if "float32_error" in dataset.attrs:
-        content["float32_error"] = dataset.attrs["float32_error"]
-    return content
 
 
 def _finite(values: np.ndarray) -> np.ndarray:

@@ -9,7 +9,6 @@ import pytest
 from heli_jax import linearize, load_vehicle, models, naming, trim
 from heli_jax.analysis.linear import eigenmodes, modes
 from heli_jax.analysis.trim import Condition, equilibrium
-from heli_jax.config.run_sections import StartConfig
 from heli_jax.dynamics import helicopter as whole
 from tests.dynamics import full_helicopter as second
 from tests.dynamics import whole_helicopter as oracle
@@ -121,13 +120,6 @@ def test_steady_flights_are_steady(condition, xcell):
     assert rates["z"] == condition.climb
     if condition.forward_speed > 5:
         assert s["theta"] < 0  # nose down against the drag
-
-
-def test_the_old_names_of_the_speeds_are_read_with_a_warning():
-    with pytest.warns(DeprecationWarning, match="forward_speed"):
-        assert StartConfig.model_validate({"ahead": 8.0}).forward_speed == 8.0
-    with pytest.raises(ValueError, match="forward_speed"):
-        StartConfig.model_validate({"ahead": 8.0, "forward_speed": 8.0})
 
 
 def test_trim_has_the_derivative_of_a_root(xcell):

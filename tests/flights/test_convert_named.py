@@ -1,16 +1,14 @@
-"""`heli-jax convert` of derived channels, presets and configurations."""
+"""`heli-jax convert` of derived channels and presets."""
 
 import numpy as np
 import pytest
 
 from heli_jax.cli import main
-from heli_jax.config import load
-from heli_jax.config.logs import as_configured
 from heli_jax.flights.convert import Selection, convert_log
 from heli_jax.flights.preset import by_preset
 
 from .test_convert_and_info import table_of
-from .test_presets import ARDUPILOT, PHI, STICK, P, ardupilot_log
+from .test_presets import PHI, P, ardupilot_log
 
 
 @pytest.fixture(scope="module")
@@ -43,17 +41,3 @@ def test_the_signals_of_a_preset(log):
     assert converted.units["roll_rate"] == "rad/s"
     [lacking] = [n for n in converted.notes if n.code == "channels.lacking"]
     assert "north" in lacking.subjects
-
-
-def test_the_signals_of_a_configuration(log, tmp_path):
-    out = tmp_path / "out.csv"
-    assert main(["convert", str(log), str(out), "--config", str(ARDUPILOT)]) == 0
-    columns = table_of(out)
-    assert set(columns) == {"time", "lat", "p", "phi"}
-    np.testing.assert_allclose(columns["p"], P, atol=1e-6)
-    selection = as_configured(load(ARDUPILOT), Selection(["ccpm.roll", "RATE.R"], 100.0))
-    unmixed = convert_log(log, selection).columns
-    np.testing.assert_array_equal(unmixed["ccpm.roll"], columns["lat"])
-    # Two servos at 60 degrees from the nose, in whole microseconds.
-    lift = 0.002 * np.round(STICK * 0.75**0.5 / 0.002) / 0.75**0.5
-    np.testing.assert_allclose(unmixed["ccpm.roll"], lift, atol=1e-12)

@@ -87,7 +87,6 @@ UNARY = {
     "where": lambda x: jnp.where(x > 0.1, x, -2.0 * x),
     "isfinite": lambda x: jnp.where(jnp.isfinite(1.0 / (x - x)), 1.0, x),
     "logic": lambda x: jnp.where(((x > 0) & ~(x > 1)) | (x < -1), x, 0.5 * x),
-    "integers": lambda x: (jnp.floor(3 * x).astype(int) * 2 - 1).astype(x.dtype),
     "atan2": lambda x: jnp.arctan2(x, x - 0.5),
     "minimum": lambda x: jnp.minimum(x, 0.3) + jnp.maximum(x, -0.2),
 }
@@ -104,93 +103,8 @@ GROUPS = {
         )
     ),
     "remainders": lambda x: jnp.mod(x, 0.7) + jnp.fmod(x, -0.3) + jnp.remainder(x, -0.45),
-    "powers of integers": lambda x: (
-        lambda n: n**3 + n**2 + jnp.square(n) + jnp.sign(n) + jnp.abs(n)
-    )(jnp.floor(3 * x).astype(jnp.int32)).astype(x.dtype),
     "truth values": lambda x: jnp.where(
         jnp.maximum(x > 0, x > 1), 1.0, jnp.where(jnp.minimum(x > -1, x < -0.5), 2.0, x)
-    ),
-}
-_M = np.array([[0.0, 1.0], [-1.0, -0.5]])
-_PAIRS = {
-    "M * v": lambda v: _M * v,
-    "M + v": lambda v: _M + v,
-    "M / v": lambda v: _M / (2.0 + v * v),
-    "max": lambda v: jnp.maximum(_M, v),
-    "v v'": lambda v: v[:, None] * v,
-    "outer": jnp.outer,
-    "keep": lambda v: v / (1.0 + jnp.sum(v**2, keepdims=True)),
-    "atan2": lambda v: jnp.arctan2(_M, v[None, :]),
-    "where": lambda v: jnp.where(_M > 0, v, v[:, None]),
-    "put": lambda v: jnp.zeros((2, 2)).at[1].set(v).at[0, 1].set(v[0]) + v.at[1].set(0.5),
-}
-
-
-_POINTS, _LONGER = np.linspace(-2.0, 2.0, 9), np.linspace(-2.0, 2.0, 301)
-_TABLE, _PLANE = _POINTS**3, np.outer(_POINTS**3, _POINTS)
-
-
-def _place(v, by=2):
-    return (by * jnp.abs(v)).astype(int)
-
-
-LOOKUPS = {
-    "interp": lambda v, s, u: (
-        jnp.interp(v, _POINTS, _TABLE)
-        + jnp.interp(v, _LONGER, np.sin(_LONGER))
-        + jnp.interp(v, s[0] * _POINTS, _TABLE)
-    ),
-    "searches": lambda v, s, u: (
-        1e-2
-        * sum(
-            jnp.sum(jnp.searchsorted(t, q, side=side)).astype(v.dtype)
-            for t in (_POINTS, _LONGER)
-            for q in (v, jnp.nan * v, t[3] + 0 * v)
-            for side in ("left", "right")
-        )
-    ),
-    "an element": lambda v, s, u: (
-        jnp.asarray(_TABLE)[_place(v)]
-        + u[_place(v)]
-        + jnp.stack([v, s[0], 2 * v])[_place(v)]
-        + jnp.asarray(_PLANE)[_place(v, 3), _place(v)]
-    ),
-    "windows written": jax.jit(
-        lambda v, s, u: (
-            jnp.zeros(5).at[1:3].set(jnp.stack([v, s[0]])) @ np.arange(5.0)
-            + jax.lax.dynamic_update_slice(jnp.zeros(5), jnp.stack([v, s[0]]), (2,))
-            @ np.arange(5.0)
-            + jnp.sum(jnp.asarray(_PLANE)[np.array([1, 3])] * v)
-        )
-    ),
-    "made of others": jax.jit(
-        lambda v, s, u: jax.lax.custom_root(
-            lambda y: y + y**3 - v,
-            v,
-            lambda f, y: jax.lax.fori_loop(0, 20, lambda _, y: y - f(y) / (1 + 3 * y * y), y),
-            lambda g, y: y / g(jnp.ones_like(y)),
-        )
-    ),
-    "indices of what is infinite": jax.jit(
-        lambda v, s, u: (
-            jnp.asarray(_TABLE)[(v / 0.0).astype(int)]
-            + u[(v / 0.0).astype(jnp.int64)]
-            + jnp.sum(jax.lax.dynamic_slice(_TABLE, ((v / 0.0).astype(jnp.int64),), (2,)))
-        )
-    ),
-    "counts": jax.jit(
-        lambda v, s, u: jnp.dot(
-            jnp.stack([_place(v), _place(v, 3)]), np.arange(2), preferred_element_type=v.dtype
-        )
-    ),
-    "shapes": lambda v, s, u: (
-        jax.lax.pad(jnp.stack([v, 2 * v, 3 * v]), 1.5 * v, [(1, -1, 2)])[1:5] @ np.arange(4.0)
-        + jnp.roll(jnp.stack([v, 2 * v, 3 * v]), 1)[0]
-        + jnp.split(jnp.stack([v, s[0]]), 2)[1][0]
-    ),
-    "batches of matrices": lambda v, s, u: (
-        jnp.sum(jnp.einsum("bij,bj->bi", v * _PLANE[:8].reshape(2, 4, 9)[..., :3], _PLANE[:2, :3]))
-        + jnp.sum(jnp.einsum("ijb,jb->bi", v * np.ones((2, 3, 4)), _LONGER[:12].reshape(3, 4)))
     ),
 }
 
@@ -198,15 +112,6 @@ LOOKUPS = {
 def _several(names, count=4):
     """Return a program of a few, which compiles as fast as one of one."""
     return [tuple(names)[i::count] for i in range(count)]
-
-
-@pytest.mark.parametrize("names", _several(LOOKUPS, 6), ids=",".join)
-def test_what_depends_on_the_vehicle(names):
-    def step(stays, u, x, k):
-        z = stays[0] * x + u[k]
-        return 0.2 * sum(jnp.tanh(LOOKUPS[n](z, stays, u)) for n in names) / len(names) + stays[1]
-
-    agree(step)
 
 
 @pytest.mark.parametrize("names", _several([*UNARY, *GROUPS]), ids=",".join)
@@ -218,35 +123,19 @@ def test_operations(names):
     agree(step)
 
 
-def test_axes_of_length_one_are_repeated():
-    def step(stays, u, x, k):
-        pair = jnp.stack([x, stays[0]])
-        arrays = [f(pair) if n != "outer" else f(pair, pair) for n, f in _PAIRS.items()]
-        # A record also, which is not split.
-        late = (2.0 * u[:, None] + jnp.ones((1, 2)))[k]
-        return 0.1 * jnp.tanh(sum(jnp.sum(a) for a in arrays)) + 0.1 * jnp.sum(late)
-
-    # JAX's default setting; the tests' setting refuses such sums.
-    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
-        agree(step)
-
-
 # tests/sweeps/test_fused.py compares sweeps in single precision.
 @pytest.mark.slow
-def test_records_loops_and_small_arrays():
+def test_records_and_loops():
     def step(stays, u, x, k):
         a, b = stays
         # Clipped, as in the simulation; before the first sample the first applies.
         before = u[jnp.clip(k - 1, 0, N - 1)]
-        late = 2.0 * u + 1.0  # a function of a whole record is computed for the element read
-        M = jnp.stack([jnp.stack([a, b]), jnp.stack([-b, x])])
-        v = M @ jnp.stack([x, before])
-        reach = jnp.asarray([0.0, 0.5, 0.5, 1.0], x.dtype)
-        total, _ = jax.lax.scan(lambda c, r: (c + 0.1 * r * jnp.sin(c + a), None), v[0], reach)
-        inner = jax.lax.fori_loop(0, 3, lambda i, y: 0.5 * y + 0.1 * i, v[1])
+        late = 2.0 * u + a  # a function of a whole record is computed for the element read
+        total, _ = jax.lax.scan(lambda c, r: (c + 0.1 * r * jnp.sin(c + a), None), b * x, u)
+        inner = jax.lax.fori_loop(0, 3, lambda i, y: 0.5 * y + 0.1 * i, before)
         inner = jax.lax.fori_loop(0, 0, lambda i, y: y + 1.0, inner)
         chosen = jax.lax.cond(x > 0, lambda y: y, lambda y: -2.0 * y, total)
-        return 0.2 * (chosen + inner + late[k] + jnp.max(v))
+        return 0.2 * (chosen + inner + late[k] + u[1:3][0])
 
     agree(step)
 
@@ -277,9 +166,8 @@ def _never(_):
     "step",
     [
         lambda s, u, x, k: jax.scipy.special.erfinv(x),
-        lambda s, u, x, k: jnp.sort(x * np.arange(17.0))[0],
-        lambda s, u, x, k: jnp.linalg.eigvalsh(x * np.eye(2))[0],
-        lambda s, u, x, k: (x * np.arange(65.0))[jnp.floor(jnp.abs(x)).astype(int)],
+        lambda s, u, x, k: jnp.sum(jnp.stack([x, 2 * x])),
+        lambda s, u, x, k: u[jnp.floor(jnp.abs(x)).astype(int)],
         lambda s, u, x, k: jax.lax.reduce_precision(x, 5, 10),
         _drawn,
         _called,
@@ -304,9 +192,7 @@ def test_threads_share_the_vehicles(threads):
 
 _SMOOTH = ("sin", "cos", "tanh", "arctan", "clip", "sqrt", "log", "square", "abs", "minimum")
 _NEWER = {
-    "table": lambda v: jnp.interp(v, _POINTS, _TABLE),
     "loop": lambda v: jax.lax.fori_loop(0, 3, lambda i, y: 0.5 * y + 0.1 * i * v, v),
-    "product": lambda v: jnp.sum(jnp.asarray(_M, v.dtype) @ jnp.stack([v, 0.3 * v])),
     "branch": lambda v: jax.lax.cond(v > 0, lambda y: 0.5 * y, lambda y: 2.0 * y, v),
     "remainder": lambda v: (v - 0.7 * jnp.floor(v / 0.7)) * (v - 0.7 * jnp.ceil(v / 0.7)),
 }

@@ -3,7 +3,17 @@
 import numpy as np
 import pytest
 
-from heli_jax.simulation.inputs import chirp, multistep, random_steps
+from heli_jax.config import StickConfig
+from heli_jax.simulation.inputs import (
+    KINDS,
+    Shape,
+    chirp,
+    excitation,
+    multisine,
+    multistep,
+    prbs,
+    random_steps,
+)
 
 
 def lengths(u):
@@ -41,3 +51,51 @@ def test_sweep_runs_from_low_to_high():
     assert 1.0 / (up[-1] - up[-2]) == pytest.approx(high, rel=0.03)
     # Integral of an exponential frequency: (high - low) T / ln(high / low) turns.
     assert len(up) == pytest.approx((high - low) * n * dt / np.log(high / low), abs=2)
+
+
+def test_a_chirp_fades():
+    u, whole = chirp(3000, 0.01, 0.1, 2.0, fade=3.0), chirp(3000, 0.01, 0.1, 2.0)
+    t = np.arange(3000) * 0.01
+    np.testing.assert_array_equal(u[300:-300], whole[300:-300])
+    assert np.all(np.abs(u) <= np.minimum(t, t[-1] - t) / 3.0 + 1e-12)
+
+
+def test_a_binary_sequence_has_the_autocorrelation_of_one_of_maximum_length():
+    # 2^9 - 1 levels, one period: minus one over the length beside the peak.
+    u = prbs(511, 0.01, np.random.default_rng(0), 0.01)
+    assert set(np.unique(u)) == {-1.0, 1.0}
+    periodic = np.fft.ifft(np.abs(np.fft.fft(u)) ** 2).real / u.size
+    np.testing.assert_allclose(periodic[1:], -1.0 / u.size, atol=1e-12)
+
+
+def test_a_multisine_has_a_low_crest_factor():
+    u = multisine(2000, 0.01, np.random.default_rng(0), (0.05, 1.0))
+    power = np.abs(np.fft.rfft(u)) ** 2
+    lines = np.flatnonzero(power > 1e-9 * power.max())
+    assert lines.tolist() == list(range(1, 21))
+    np.testing.assert_allclose(power[lines], power[1], rtol=1e-9)
+    assert np.max(np.abs(u)) == 1.0
+    assert 1.0 / np.sqrt(np.mean(u**2)) < 1.45
+    with pytest.raises(ValueError, match="band"):
+        multisine(200, 0.01, np.random.default_rng(0), (0.1, 0.3))
+
+
+def test_multisines_of_several_inputs_are_orthogonal():
+    rng = np.random.default_rng(0)
+    each = np.array([multisine(2000, 0.01, rng, (0.1, 1.5), (k, 3)) for k in range(3)])
+    products = each @ each.T
+    size = np.sqrt(np.diag(products))
+    np.testing.assert_allclose(products / np.outer(size, size), np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", [k.name for k in KINDS])
+def test_every_kind_keeps_its_limits(kind):
+    assert StickConfig(kind=kind, amplitude=1.0).kind == kind
+    rng = np.random.default_rng(0)
+    shape = Shape(band=(0.1, 2.0))
+    u = excitation(kind, 2000, 0.01, rng, shape, amplitude=0.3, rate=1.5)
+    assert u.shape == (2000,)
+    assert np.max(np.abs(u)) <= 0.3 + 1e-12
+    assert np.max(np.abs(np.diff(u))) <= 1.5 * 0.01 + 1e-12
+    if kind not in ("neutral", "chirp", "multisine"):
+        assert np.max(np.abs(u)) > 0.25

@@ -130,8 +130,8 @@ def test_a_study_of_which_no_fit_could_be_made_says_so(config, tmp_path, monkeyp
 def test_values_with_commas_stay_one_value(config):
     study = read_study(
         config,
-        ["fit.seed=1", "fit.seed=2", "flights.0.window=[0, 10]", "flights.0.name=a, b"],
-        ["flights.0.rate=10,20", "fit.intervals.profile=[], [Ixx]"],
+        ["flights.0.window=[0, 10]", "flights.0.name=a, b"],
+        ["fit.seed=1,2", "flights.0.rate=10,20", "fit.intervals.profile=[], [Ixx]"],
     )
     assert study is not None
     assert study.axes == {

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
-from distributed import CancelledError, Client, LocalCluster, wait
+from distributed import CancelledError, Client
 from distributed.comm.core import CommClosedError
 
 from heli_jax import models, sweep
@@ -87,62 +87,3 @@ def test_what_dask_says_ends_in_one_sentence(error, words):
     assert "\n" not in str(e.value)
     with pytest.raises(RuntimeError, match="another"), cluster._dask_errors():
         raise RuntimeError("another")
-
-
-@pytest.mark.parametrize("state", [None, "paused"])
-def test_a_scheduler_without_workers_is_not_waited_for_without_end(monkeypatch, state):
-    class Future:
-        status = "finished"
-
-    class Running:
-        """Return tasks that wait for a worker."""
-
-        def __init__(self, done):
-            self.done = done
-
-        def is_empty(self):
-            return False
-
-        def has_ready(self):
-            return bool(self.done)
-
-        def __next__(self):
-            return Future(), self.done.pop()
-
-    class Scheduler:
-        """A cluster with workers by time; finally none, or one short of memory."""
-
-        def __init__(self, *looks):
-            self.looks = list(looks)
-
-        def scheduler_info(self):
-            there = {} if state is None else {"tcp://a": {"status": state}}
-            return {"workers": self.looks.pop(0) if self.looks else there}
-
-    monkeypatch.setattr(cluster, "_ALONE_S", 0.2)
-    monkeypatch.setattr(cluster, "_LOOK_S", 0.05)
-    busy = {"status": "paused", "metrics": {"task_counts": {"executing": 1}}}
-    scheduler = Scheduler({}, {"tcp://a": busy}, {"tcp://a": {"status": "running"}})
-    ended = cluster._as_completed(scheduler, Running(["a", "b"]))
-    assert [next(ended)[1](), next(ended)[1]()] == ["b", "a"]
-    with pytest.raises(InputError, match=r"\d+ s.*--resume"):
-        next(ended)
-    assert scheduler.looks == []
-
-
-@pytest.mark.filterwarnings("ignore::ResourceWarning")
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_result_whose_worker_has_died_is_not_waited_for_without_end(monkeypatch):
-    pytest.importorskip("distributed")
-    monkeypatch.setattr(cluster, "_ALONE_S", 1.0)
-    monkeypatch.setattr(cluster, "_LOOK_S", 0.2)
-    local = LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None)
-    with local, Client(local) as client:
-        future = client.submit(int, 7)
-        wait(future)
-        # Computed there, and lost with the worker before it is fetched.
-        local.scale(0)
-        while client.scheduler_info()["workers"]:
-            pass
-        with pytest.raises(InputError):
-            list(cluster._as_completed(client, cluster._gathered([future])))

@@ -261,18 +261,6 @@ def test_several_flights_are_a_dimension(bench30, record):
         np.testing.assert_array_equal(both["misfit"][:, i], one["misfit"])
 
 
-@pytest.mark.slow
-def test_float32_says_how_far_off_it_is(bench30, record):
-    design, reduce = sobol(AXES, 30), {"rms": Reduce("rms", "roll"), "end": Reduce("final", "roll")}
-    single = sweep(ROLL, bench30, record, design, reduce, precision="float32")
-    double = sweep(ROLL, bench30, record, design, reduce)
-    assert single["rms"].dtype == np.float32
-    for name in reduce:
-        off = np.max(np.abs(single[name] - double[name])) / np.max(np.abs(double[name]))
-        assert 1e-9 < off < 1e-2
-        np.testing.assert_allclose(single.attrs["float32_error"][name], off, rtol=0.05)
-
-
 def test_exactly_the_bad_elements_are_flagged(bench30, record):
     n = 3000
     rng = np.random.default_rng(8)
