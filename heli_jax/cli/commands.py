@@ -20,7 +20,7 @@ from heli_jax.cli import interrupts, terminal
 from heli_jax.cli.interrupts import resumable
 from heli_jax.cli.terminal import print_page_table, print_table, print_text
 from heli_jax.errors import InputError, located
-from heli_jax.numbers import ADEQUATE
+from heli_jax.numbers import adequacy_of
 from heli_jax.regular_file import read_regular
 from heli_jax.stages import Note
 from heli_jax.versions import version
@@ -615,7 +615,7 @@ def _found(folder: Path) -> Iterator[dict[str, Any]]:
         try:
             content = json.loads(read_regular(path, "the fit.json of a run", _LARGEST_FIT))
             # The table has no room for the reasons.
-            adequate = ADEQUATE[content["adequate"]]
+            adequate = adequacy_of(content).partition(" (")[0]
             row = {k: content[k] for k in ("model", "method", "status")}
             untrusted = ", ".join(map(str, content.get("untrusted") or ()))
             date = time.strftime("%Y-%m-%d %H:%M", time.localtime(path.stat().st_mtime))

@@ -55,7 +55,8 @@ def _print_details(run: FitRun) -> None:
     problem, fit, supplementary = run.problem, run.fit, run.supplementary
     if supplementary.intervals is not None:
         table = report_tables.intervals(supplementary.intervals, fit)
-        print_page_table(table)
+        if table.rows:
+            print_page_table(table)
         for sentence in supplementary.intervals.sentences:
             print_text(f"! {sentence}")
     if supplementary.methods is not None:

@@ -214,8 +214,8 @@ def _check_intervals(config: FitConfig, path: Path) -> None:
     in_frequency = objective.noise_model == "spectrum"
     if config.intervals.bootstrap and config.nuisance.time_shift and not in_frequency:
         raise InputError(
-            f"{path}: fit.intervals.bootstrap: not available with fit.nuisance.time_shift, "
-            "expected one of the two"
+            f"{path}: remove fit.intervals.bootstrap or fit.nuisance.time_shift: the bootstrap "
+            "does not estimate the time shift"
         )
 
 

@@ -15,6 +15,7 @@ from heli_jax.flights.derived import Swashplate
 from heli_jax.flights.flight import HOLDS, Signal, scale_problem
 from heli_jax.flights.log import ChannelLog, Table, column, shown, wrong
 from heli_jax.flights.marks import REPEATS
+from heli_jax.flights.name_units import without_unit
 
 Key = tuple[str, str]
 """The model's name, and `input` or `output`."""
@@ -196,6 +197,10 @@ def with_file_units(log: ChannelLog, request: Request) -> Request:
 
 def _with_file_unit(log: ChannelLog, signal: Signal, name: str) -> Signal:
     stated = log.topic_of(signal.name).units.get(signal.name, "").strip()
+    if not stated and (named := without_unit(signal.name)[1]) and signal.scale == 1.0:
+        # A name states less than a file: it is no unit to read by, and `lat_A` may be no current.
+        fits = units.fits(named, signal.unit) and units.factor(named, signal.unit) != 1.0
+        return dataclasses.replace(signal, contradicted=named) if fits else signal
     # A stated scale already includes the unit.
     if signal.scale != 1.0 or (signal.assumed and signal.offset) or stated in ("", "-", "1"):
         return signal

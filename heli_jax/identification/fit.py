@@ -222,19 +222,17 @@ def _result(c: Context, starts: tuple[StartRow, ...], seed: int, timing: dict[st
     # no effect either.
     unknowns = layout.determined + noise_unknowns(layout) - len(c.absent)
     findings = diagnose(c)
-    estimates = {n: c.estimates[n] for n in layout.free}
-    doubted = distrusted(findings, estimates) if c.status != "not-converged" else {}
+    everything = {**c.nuisance, **c.estimates}
+    doubted = distrusted(findings, everything) if c.status != "not-converged" else {}
+    everything |= {n: everything[n]._replace(lower95=None, upper95=None) for n in doubted}
     held = c.held_out
     return Fit(
         model=c.problem.model.name,
         method=c.problem.method,
         status=c.status,
         n_samples=measured_count(data),
-        estimates={
-            n: e._replace(lower95=None, upper95=None) if n in doubted else e
-            for n, e in estimates.items()
-        },
-        nuisance=c.nuisance,
+        estimates={n: everything[n] for n in layout.free},
+        nuisance={n: everything[n] for n in c.nuisance},
         params=c.params,
         verdict_before=c.before,
         verdict=c.verdict,

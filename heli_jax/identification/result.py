@@ -137,10 +137,10 @@ class Fit:
 
     @property
     def distrusts(self) -> dict[str, Distrust]:
-        """Reason to distrust a parameter's interval, by parameter; empty without an optimum."""
+        """Reason to distrust an interval, by parameter or nuisance; empty without an optimum."""
         if self.status == "not-converged":
             return {}
-        return distrusted(self.findings, self.estimates)
+        return distrusted(self.findings, {**self.nuisance, **self.estimates})
 
     @property
     def untrusted(self) -> tuple[str, ...]:
@@ -160,9 +160,9 @@ class Fit:
 
     def _shifts(self, names: Sequence[str]) -> str:
         """Return the words on how far a misfit shifts the estimates; empty if unknown."""
-        sizes = {n: self.distrusts[n].shift for n in names}
+        sizes, units = {n: self.distrusts[n].shift for n in names}, self.nuisance | self.estimates
         words = [
-            f"{n} by about {number(abs(size), 2)} {self.estimates[n].unit}".removesuffix(" 1")
+            f"{n} by about {number(abs(size), 2)} {units[n].unit}".removesuffix(" 1")
             for n, size in sizes.items()
             if size is not None
         ]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax import units
-from heli_jax.new_config.name_units import FILLERS, without_unit
+from heli_jax.flights.name_units import FILLERS, without_unit
 
 _UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue"})
 _NUMBERED = re.compile(r"(?<=[a-z])(?=[0-9])")

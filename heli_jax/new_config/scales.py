@@ -3,8 +3,8 @@
 import numpy as np
 
 from heli_jax import units
+from heli_jax.flights.name_units import without_unit
 from heli_jax.new_config.guess import Guess, Series, are_whole, words_of
-from heli_jax.new_config.name_units import without_unit
 from heli_jax.yaml_file import EDIT
 
 _PULSES = (700.0, 2300.0)

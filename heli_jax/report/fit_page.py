@@ -225,7 +225,7 @@ def lines(fit: Fit) -> tuple[Line, Line, Line]:
     best, runs = sum(row.optimum == 1 for row in fit.starts), len(fit.starts)
     reached = f"The optimiser reached an optimum in {fit.steps} steps."
     if runs > 1:
-        reached = f"{best} of {runs} runs of the optimiser reached this optimum."
+        reached = f"{best} of {runs} searches ended at this optimum, the best one."
     text = " ".join(filter(None, (fit.verdict.text, fit.distrust)))
     determined = Line("good", "Identifiable", text)
     if fit.status == "not-identifiable" or fit.not_identifiable:

@@ -11,6 +11,7 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.finding import Finding, Severity, found
 from heli_jax.flights.flight import labels
+from heli_jax.flights.marks import written_again
 from heli_jax.flights.signal_facts import DROP_SHARE, RAIL_SHARE, STUCK_SECONDS
 from heli_jax.identification.design.accuracy import plan_next_flight, unstated_gusts
 from heli_jax.identification.diagnostics.context import Context
@@ -25,6 +26,7 @@ from heli_jax.identification.validation.logging_rate import (
     rates_against_modes,
 )
 from heli_jax.identification.validation.shifts import SHIFT, shift_in_time
+from heli_jax.numerics.white_noise import without_noise
 
 _CUT_OFF = 0.02
 """Share of an output's samples at its limits from which on no model of it is adequate."""
@@ -86,6 +88,24 @@ def stuck_outputs(c: Context) -> Iterator[Finding]:
                     begin=facts.stuck.begin,
                     at=facts.stuck.value,
                     limit=STUCK_SECONDS,
+                )
+
+
+def held_values(c: Context) -> Iterator[Finding]:
+    """Find outputs that hold values, in flights made of arrays: the readers leave them out."""
+    for label, flight in c.flights:
+        for name, y in {} if flight.source else flight.outputs.items():
+            share = float(np.mean(written_again(y)))
+            if share >= DROP_SHARE:
+                yield found(
+                    "quality.held-values",
+                    "doubt",
+                    name,
+                    value=share,
+                    distrusts=c.free,
+                    flight=label,
+                    percent=100.0 * share,
+                    limit=DROP_SHARE,
                 )
 
 
@@ -173,13 +193,14 @@ def loop_between_samples(c: Context) -> Iterator[Finding]:
 def rates_enough(c: Context) -> Iterator[Finding]:
     """Compare rates of inputs and outputs with the fastest mode that matters."""
     if c.fitted:
-        yield from of_rates(c.problem, measurement_noise(c.problem, c.at.noise.sd), c.params)
+        noise = measurement_noise(c.problem, c.at.noise.sd)
+        yield from of_rates(c.problem, noise, c.params, white=c.white)
     else:
         yield from of_rates(c.problem, c.at.noise.sd)
 
 
 def of_rates(
-    problem: Problem, sd: Sequence[Mapping[str, Any]], params: Any = None
+    problem: Problem, sd: Sequence[Mapping[str, Any]], params: Any = None, *, white: bool = False
 ) -> Iterator[Finding]:
     """Compare logging rates with the model's modes; if all suffice, report only the lowest.
 
@@ -188,6 +209,7 @@ def of_rates(
     Args:
         sd: standard deviation of the assumed noise, by flight and output [SI].
         params: the model's Params with the estimates in place [SI]; by default the start values.
+        white: True for a fit with white residuals.
     """
     where = "start values" if params is None else "estimates"
     params = problem.start_params() if params is None else params
@@ -197,22 +219,26 @@ def of_rates(
         for label, flight, noise in zip(labels(training), training, sd, strict=True)
         for one in rates_against_modes(problem, params, flight, noise)
     ]
+    # White residuals show that such an input is known between its steps.
+    rates = [(label, one) for label, one in rates if not (white and one.may_be_steps)]
     low = [(label, one) for label, one in rates if one.samples < RATE.enough]
     for label, one in low or sorted(rates, key=lambda pair: pair[1].samples)[:1]:
         severity: Severity = "ok"
         if low:
-            severity = "refuse" if one.samples < one.least else "doubt"
+            hopeless = one.samples < one.least and not one.may_be_steps
+            severity = "refuse" if hopeless else "doubt"
         yield found(
             "timing.logging-rate",
             severity,
             value=one.samples,
             flight=label,
             signals=one.signals,
-            rate=one.hz,
+            logged="" if one.may_be_steps else f"{one.hz:.3g} Hz",
+            changes=f"{1.0 / one.hz:.3g} s" if one.may_be_steps else "",
             hz=one.mode.hz,
             output=one.mode.output,
             where=where,
-            low=f"{RATE.enough * one.mode.hz:.3g} Hz" if low else "",
+            low=f"{RATE.enough * one.mode.hz:.3g} Hz" if low and not one.may_be_steps else "",
             enough=RATE.enough,
             least=one.least,
         )
@@ -244,6 +270,14 @@ def nothing_follows(c: Context) -> Iterator[Finding]:
             p_values=list(c.unrelated.values()),
             level=LEVEL / len(c.unrelated),
         )
+
+
+def smoothed_outputs(c: Context) -> Iterator[Finding]:
+    """Find outputs without sensor noise before a fit, whose accuracy nothing predicts."""
+    for label, flight in [] if c.fitted else c.flights:
+        smooth = [n for n, y in flight.outputs.items() if n not in flight.sd and without_noise(y)]
+        if smooth:
+            yield found("noise.smoothed", "doubt", *smooth, flight=label)
 
 
 def gusts_guessed(c: Context) -> Iterator[Finding]:
@@ -287,8 +321,10 @@ DIAGNOSTICS = (
     rates_enough,
     saturation,
     stuck_outputs,
+    held_values,
     outlying_residuals,
     nothing_follows,
+    smoothed_outputs,
     gusts_guessed,
     next_flight,
 )

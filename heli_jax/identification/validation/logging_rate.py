@@ -100,6 +100,8 @@ class Rate(NamedTuple):
     mode: _Mode
     least: float
     """Samples per period below which the mode is not visible."""
+    may_be_steps: bool = False
+    """True for an input that may have been commanded in steps of equal length."""
 
     @property
     def samples(self) -> float:
@@ -122,7 +124,8 @@ def rates_against_modes(
         rate = input_rate(flight, name, u)
         driven = [mode for mode in modes if mode.input == name]
         if rate is not None and driven:
-            rates.append(Rate((name,), rate, driven[-1], RATE.hopeless))
+            steps = _jumps_at_random(u)
+            rates.append(Rate((name,), rate, driven[-1], RATE.hopeless, steps))
     of = {y: output_rate(flight, y) for y in flight.outputs}
     fastest = max(of.values())
     # A decay has no alias, but it may end between two samples.
@@ -185,6 +188,15 @@ def input_rate(flight: Flight, name: str, u: Float[np.ndarray, " N"]) -> float |
     return min(1.0 / (usual * flight.dt), slower or np.inf)
 
 
+def _jumps_at_random(u: Float[np.ndarray, " N"]) -> bool:
+    """True if the levels of a staircase hardly depend on the level before.
+
+    A slow log of a moving stick has steps from level to neighbouring level.
+    """
+    levels = u[np.flatnonzero(np.diff(u, prepend=np.nan) != 0)]
+    return bool(np.var(np.diff(levels)) > 2.0 * (1.0 - _RELATED) * np.var(levels))
+
+
 def output_rate(flight: Flight, name: str) -> float:
     """Return the rate [Hz] of an output's measured samples."""
     seen = np.flatnonzero(np.isfinite(flight.outputs[name]))
@@ -219,6 +231,8 @@ def power_between_samples(flight: Flight, name: str) -> tuple[float, float] | No
 # therefore has aliases that fit equally well, each with a narrow interval.
 
 
+_RELATED = 0.5
+"""Correlation of neighbouring levels above which a staircase is a slow log."""
 _NEAR = 0.8
 """Share of the Nyquist frequency from which on an alias of a mode fits equally well."""
 _TURNED = 0.2

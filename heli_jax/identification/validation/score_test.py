@@ -309,7 +309,8 @@ def _trials(
 
     The slowest filter has two periods in the longest record.
     """
-    low, high = 2.0 * float(angles[0]), 0.9 * float(angles[-1])
+    # Above, resampled outputs are low-passed and held inputs are not.
+    low, high = 2.0 * float(angles[0]), 0.8 * float(angles[-1])
     back, bands = np.exp(-1j * angles), _bands(angles)
     for (bank, plain, removed_first), group in itertools.groupby(
         drives, lambda d: (d.bank, d.kind != "input", d.removed_first)
