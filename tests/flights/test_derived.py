@@ -81,9 +81,10 @@ def test_marks_in_the_sources_are_missing_in_what_is_derived(tmp_path):
     plate = Swashplate(
         ("n", "e", "d"), (-60, 60, 180), *((1.0,) * 3, (0.0,) * 3, (1.0,) * 3), (False,) * 3
     )
-    mixed = convert_log(path, Selection(["ccpm.collective"], swashplate=plate))
-    lift = mixed.columns["ccpm.collective"]
-    assert np.flatnonzero(np.isnan(lift)).tolist() == [20]
+    lift = {"lift": Signal("ccpm.collective", "1", "1")}
+    inputs = {"u": Signal("u", "1", "1")}
+    f = read_flight(path, time="t", inputs=inputs, outputs=lift, swashplate=plate)
+    assert np.flatnonzero(np.isnan(f.outputs["lift"])).tolist() == [20]
 
 
 ATTITUDE = [("uint64_t", "timestamp"), ("float[4]", "q")]
