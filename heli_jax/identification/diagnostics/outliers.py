@@ -19,7 +19,7 @@ from heli_jax.identification.search import first_guess, search
 from heli_jax.identification.unknowns.layout import Solution
 
 _FAR = 10.0
-"""Distance of an outlier from the running median [robust sds of that distance]."""
+"""Distance of an outlier from the running median [robust sds of the white noise]."""
 _NEIGHBOURS = 11
 """Samples of the running median, which sees up to five outliers in a row."""
 _MEDIAN = 0.6745
@@ -78,10 +78,19 @@ def _outlying(
     """
     if error.size < 2 * _NEIGHBOURS:
         return np.zeros(error.shape, bool), np.zeros(error.shape)
-    around = sliding_window_view(np.pad(error, _NEIGHBOURS // 2, "edge"), _NEIGHBOURS)
-    away = error - np.median(around, axis=1)
-    far = np.abs(away) > max(_FAR * float(np.median(np.abs(away))) / _MEDIAN, least)
+    away = error - np.median(_around(error), axis=1)
+    # Third differences leave noise and jumps, and remove smooth motion. A jump to an outlier leaves
+    # at least its own size.
+    rough = np.pad(np.abs(np.diff(error, 3)), (1, 2), "edge")
+    noise = float(np.median(rough)) / (_MEDIAN * np.sqrt(20.0))
+    far = np.abs(away) > max(_FAR * noise, least)
+    far &= np.max(_around(rough), axis=1) > np.abs(away)
     return far & (np.mean(far) <= _MOST), away
+
+
+def _around(x: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N k"]:
+    """Return each sample with its neighbours."""
+    return sliding_window_view(np.pad(x, _NEIGHBOURS // 2, "edge"), _NEIGHBOURS)
 
 
 def _shifts(
