@@ -26,8 +26,8 @@ _MEDIAN = 0.6745
 """Median size of a standard normal number."""
 _MOST = 0.05
 """Largest share of outliers; more belong to the noise."""
-_ROUNDING = 1e-6
-"""Distance over the output's range below which it is rounding."""
+_SMALL = 0.05
+"""Distance over the output's sd below which an outlier does no harm."""
 _STEPS = 100
 """Most steps of each run of the optimiser without the outliers."""
 
@@ -51,7 +51,7 @@ def outliers(problem: Problem, at: Solution, e: Evaluation) -> list[Outliers]:
     for i, name in signals(at.layout):
         y, raw = np.asarray(flights[i][name]), np.asarray(e.raw[i][name])
         seen = np.isfinite(y) & np.isfinite(raw)
-        error, least = raw[seen], _ROUNDING * float(np.max(np.abs(y[seen]), initial=0.0))
+        error, least = raw[seen], _SMALL * float(np.std(y[seen])) if seen.any() else 0.0
         far, away = _outlying(error, least)
         found.setdefault(name, []).append((y[seen][far], error.size))
         # The output's own motion takes their place: missing samples would change the program.
@@ -83,6 +83,8 @@ def _outlying(
     # at least its own size.
     rough = np.pad(np.abs(np.diff(error, 3)), (1, 2), "edge")
     noise = float(np.median(rough)) / (_MEDIAN * np.sqrt(20.0))
+    # A smoothed log has no noise, but its residual still bends.
+    noise = max(noise, float(np.median(np.abs(away))) / _MEDIAN)
     far = np.abs(away) > max(_FAR * noise, least)
     far &= np.max(_around(rough), axis=1) > np.abs(away)
     return far & (np.mean(far) <= _MOST), away
