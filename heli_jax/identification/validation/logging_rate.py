@@ -124,7 +124,9 @@ def rates_against_modes(
         rate = input_rate(flight, name, u)
         driven = [mode for mode in modes if mode.input == name]
         if rate is not None and driven:
-            steps = _jumps_at_random(u)
+            own_clock = flight.logged_step(name, "input") > RATE.slower * flight.dt
+            staircase = flight.hold[name] == "zero-order" and not own_clock
+            steps = staircase and _jumps_at_random(u)
             rates.append(Rate((name,), rate, driven[-1], RATE.hopeless, steps))
     of = {y: output_rate(flight, y) for y in flight.outputs}
     fastest = max(of.values())
