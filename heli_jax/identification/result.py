@@ -1,6 +1,6 @@
 """Result of a fit, as plain data."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -150,17 +150,17 @@ class Fit:
     @property
     def distrust(self) -> str:
         """One sentence for each reason to distrust intervals; empty if all are trusted."""
-        by_reason: dict[str, list[str]] = {}
+        by_reason: dict[str, dict[str, float | None]] = {}
         for name, d in self.distrusts.items():
-            by_reason.setdefault(d.brief, []).append(name)
+            by_reason.setdefault(d.brief, {})[name] = d.shift
         return " ".join(
-            f"Do not use {' or '.join(names)}: {reason}{self._shifts(names)}."
-            for reason, names in by_reason.items()
+            f"Do not use {' or '.join(sizes)}: {reason}{self._shifts(sizes)}."
+            for reason, sizes in by_reason.items()
         )
 
-    def _shifts(self, names: Sequence[str]) -> str:
+    def _shifts(self, sizes: Mapping[str, float | None]) -> str:
         """Return the words on how far a misfit shifts the estimates; empty if unknown."""
-        sizes, units = {n: self.distrusts[n].shift for n in names}, self.nuisance | self.estimates
+        units = self.nuisance | self.estimates
         words = [
             f"{n} by about {number(abs(size), 2)} {units[n].unit}".removesuffix(" 1")
             for n, size in sizes.items()

@@ -38,7 +38,7 @@ def noise_guess(signal: np.ndarray) -> float:
     # With three samples or fewer, the signal itself bounds its noise.
     if not d.size:
         d = signal - np.median(signal)
-    guess = _noise_sd(d)
+    guess = robust_sd(d)
     # A record without noise would lead to division by zero.
     floor = 1e-9 * float(np.sqrt(np.mean(signal**2)))
     return max(guess, floor, 1e-300)
@@ -113,7 +113,7 @@ def rises_when_slower(signal: np.ndarray, every: int) -> bool:
     fast, slow = (d[np.isfinite(d)] for d in differences)
     if min(fast.size, slow.size) < _FEWEST:
         return False
-    powers = [float(np.mean(_without_corners(d, _noise_sd(d)) ** 2)) for d in (fast, slow)]
+    powers = [float(np.mean(_without_corners(d, robust_sd(d)) ** 2)) for d in (fast, slow)]
     spread = _POWER_SPREAD * np.sqrt(1.0 / fast.size + 1.0 / slow.size)
     return bool(powers[1] > powers[0] * np.exp(3.0 * spread))
 
@@ -129,7 +129,7 @@ def _third_differences(signal: np.ndarray, every: int) -> np.ndarray:
     return y / np.sqrt(20.0)  # 1 + 9 + 9 + 1
 
 
-def _noise_sd(d: np.ndarray) -> float:
+def robust_sd(d: np.ndarray) -> float:
     """Return the sd of normal numbers from the median of their sizes, 0.674 sd (robust)."""
     return float(np.median(np.abs(d)) / 0.6744897501960817)
 

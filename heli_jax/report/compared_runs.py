@@ -81,8 +81,8 @@ class ComparedRuns(NamedTuple):
                     cells = (_agreement(m.get(output), key, text) for m in of)
                     rows.append((output, where, words, *cells))
         # Likelihoods are comparable only for the same samples in time.
-        same = len({_samples(run) for run in self.runs}) == 1
-        if same and _samples(self.runs[0]) and all(map(_converged, self.runs)):
+        first, *others = {_samples(run) for run in self.runs}
+        if first and not others and all(map(_converged, self.runs)):
             aic = [run.content["aic"] for run in self.runs]
             above = (number(value - min(aic), 3) for value in aic)
             rows.append(("all", "fitted", "AIC above the best", *above))

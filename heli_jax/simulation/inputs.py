@@ -102,10 +102,6 @@ def chirp(n: int, dt: float, low: float, high: float, fade: float = 0.0) -> Samp
     return u * np.clip(np.minimum(t, t[-1] - t) / fade, 0.0, 1.0) if fade else u
 
 
-_TAPS = {5: 3, 6: 5, 7: 6, 9: 5, 10: 7, 11: 9, 15: 14}
-"""Second tap of shift registers of maximum length, by their number of bits."""
-
-
 def prbs(n: int, dt: float, rng: np.random.Generator, step: float) -> Samples:
     """Return a pseudo-random binary sequence of maximum length, from a random place in it.
 
@@ -115,15 +111,14 @@ def prbs(n: int, dt: float, rng: np.random.Generator, step: float) -> Samples:
         dt: sample time [s].
         step: shortest time at a level [s].
     """
+    from scipy.signal import max_len_seq
+
     length = max(1, round(step / dt))
     count = -(-n // length)
-    bits = next((b for b in _TAPS if 2**b > count), max(_TAPS))
+    bits = max(5, count.bit_length())
     register = rng.integers(0, 2, bits)
     register[0] |= not register.any()
-    levels = np.empty(count)
-    for k in range(count):
-        levels[k] = 1.0 - 2.0 * register[-1]
-        register = np.r_[register[-1] ^ register[_TAPS[bits] - 1], register[:-1]]
+    levels = 1.0 - 2.0 * max_len_seq(bits, register, count)[0]
     return np.repeat(levels, length)[:n]
 
 

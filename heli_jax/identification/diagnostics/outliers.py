@@ -17,13 +17,12 @@ from heli_jax.identification.estimation.simulated_flights import signals
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.search import first_guess, search
 from heli_jax.identification.unknowns.layout import Solution
+from heli_jax.numerics.white_noise import noise_guess, robust_sd
 
 _FAR = 10.0
 """Distance of an outlier from the running median [robust sds of the white noise]."""
 _NEIGHBOURS = 11
 """Samples of the running median, which sees up to five outliers in a row."""
-_MEDIAN = 0.6745
-"""Median size of a standard normal number."""
 _MOST = 0.05
 """Largest share of outliers; more belong to the noise."""
 _SMALL = 0.05
@@ -82,9 +81,8 @@ def _outlying(
     # Third differences leave noise and jumps, and remove smooth motion. A jump to an outlier leaves
     # at least its own size.
     rough = np.pad(np.abs(np.diff(error, 3)), (1, 2), "edge")
-    noise = float(np.median(rough)) / (_MEDIAN * np.sqrt(20.0))
     # A smoothed log has no noise, but its residual still bends.
-    noise = max(noise, float(np.median(np.abs(away))) / _MEDIAN)
+    noise = max(noise_guess(error), robust_sd(away))
     far = np.abs(away) > max(_FAR * noise, least)
     far &= np.max(_around(rough), axis=1) > np.abs(away)
     return far & (np.mean(far) <= _MOST), away

@@ -190,6 +190,10 @@ def input_rate(flight: Flight, name: str, u: Float[np.ndarray, " N"]) -> float |
     return min(1.0 / (usual * flight.dt), slower or np.inf)
 
 
+_RELATED = 0.5
+"""Correlation of neighbouring levels above which a staircase is a slow log."""
+
+
 def _jumps_at_random(u: Float[np.ndarray, " N"]) -> bool:
     """True if the levels of a staircase hardly depend on the level before.
 
@@ -233,8 +237,6 @@ def power_between_samples(flight: Flight, name: str) -> tuple[float, float] | No
 # therefore has aliases that fit equally well, each with a narrow interval.
 
 
-_RELATED = 0.5
-"""Correlation of neighbouring levels above which a staircase is a slow log."""
 _NEAR = 0.8
 """Share of the Nyquist frequency from which on an alias of a mode fits equally well."""
 _TURNED = 0.2

@@ -13,6 +13,7 @@ from heli_jax.flights.resample import PASSED
 from heli_jax.identification.estimation.evaluation import Evaluation, directions
 from heli_jax.identification.estimation.kalman import Innovations
 from heli_jax.identification.unknowns.layout import Layout
+from heli_jax.numerics.white_noise import robust_sd
 
 
 class Metrics(NamedTuple):
@@ -162,7 +163,8 @@ def whiteness(
     fitted = None if fitted is None else fitted[kept(residual)]
     residual = sequence(residual)
     # A few wild samples have most of the power, and correlate with each other by chance.
-    size = float(np.nanmedian(np.abs(residual))) / _MEDIAN if residual.size else 0.0
+    known = residual[~np.isnan(residual)]
+    size = robust_sd(known) if known.size else 0.0
     residual = np.clip(residual, -_WILD * size, _WILD * size) if size > 0 else residual
     n = int(np.count_nonzero(~np.isnan(residual)))
     _, r, pairs, whole = seen_autocorrelation(residual, fitted)
@@ -178,8 +180,8 @@ def whiteness(
     return Whiteness(bool(p > 0.01), float(p), lags, outside, float(r[0] * whole[0]))
 
 
-_WILD, _MEDIAN = 5.0, 0.6745
-"""Bound of a residual that is tested [robust sds], and the median size of a normal number."""
+_WILD = 5.0
+"""Bound of a residual that is tested [robust sds]."""
 _SPREAD = 2.2
 """Relative excess variance of the Ljung-Box statistic over chi-squared, per lags over samples.
 

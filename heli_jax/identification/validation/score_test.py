@@ -25,6 +25,7 @@ import scipy.special
 from jaxtyping import Complex, Float, Inexact, Int
 
 from heli_jax.identification.estimation.evaluation import directions
+from heli_jax.numerics.white_noise import robust_sd
 
 ORDER = 10
 """Order of the autoregression that whitens."""
@@ -44,8 +45,6 @@ _AT_LEAST = 14.0
 """Least gain for which a p-value is computed; one filter exceeds it by chance in 1 of 1000."""
 _ROUNDING = 1e-9
 """Share of a column below which the rest is rounding."""
-_MEDIAN = 0.6745
-"""Median size of a standard normal number."""
 _EULER = 0.5772156649015329
 _BAND = 0.01
 """Width of a band of lines over its frequency; that of the narrowest filter is 0.06."""
@@ -134,7 +133,7 @@ def lines_of(
     # A jump across missing samples is no response: drop all samples that the filter mixes.
     white[:, across(holes, e.size)[ORDER:]] = 0.0
     if np.isfinite(most):
-        most *= float(np.median(np.abs(white[0][white[0] != 0.0]))) / _MEDIAN
+        most *= robust_sd(white[0][white[0] != 0.0])
         white[0] = np.clip(white[0], -most, most)
     v = np.asarray(scipy.fft.rfft(white))[:, 1 : 1 + (n - 1) // 2] / np.sqrt(n)
     # A bias leaves only rounding here. Set it to zero, so that nothing is regressed on it.
@@ -199,7 +198,7 @@ def strongest(records: Sequence[Lines], drives: Sequence[Drive]) -> Strongest:
     # A fixed seed gives the same phases each time.
     turns = 2.0 * np.pi * np.random.default_rng(0).random((e.size, _SURROGATES))
 
-    def by_chance(turns: Float[np.ndarray, "K r"]) -> Float[np.ndarray, " r"]:
+    def largest_gains(turns: Float[np.ndarray, "K r"]) -> Float[np.ndarray, " r"]:
         """Return the largest gain of each surrogate."""
         # Single precision halves the work; the distribution is known to about 10 % anyway.
         turns = turns.astype(np.float32)
@@ -210,9 +209,9 @@ def strongest(records: Sequence[Lines], drives: Sequence[Drive]) -> Strongest:
         return np.max(of_chance, axis=0)
 
     # Most residuals follow nothing, which a few surrogates show (Besag and Clifford, 1991).
-    chance = by_chance(turns[:, :_FEW])
+    chance = largest_gains(turns[:, :_FEW])
     if np.count_nonzero(chance >= gain) < _OFTEN:
-        chance = np.concatenate([chance, by_chance(turns[:, _FEW:])])
+        chance = np.concatenate([chance, largest_gains(turns[:, _FEW:])])
     own = one.removed_first + 2 * at
     through = one.columns[[*range(one.removed_first), own, own + 1]]
     response = _responses(one.filters[[of_filter]], angles)
