@@ -1,5 +1,6 @@
 """The shipped models, and look-up of a model by its name in a configuration."""
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
@@ -51,6 +52,18 @@ _HELICOPTERS: dict[str, Literal["paper", "consistent", "full"]] = {
     "helicopter-consistent": "consistent",
     "helicopter-paper": "paper",
 }
+_MEANINGS = {
+    "roll": "Roll with a Bell-Hiller flybar (Kim and Tilbury, eqs 21-22)",
+    "roll-on-stand": "Roll with a Bell-Hiller flybar, on a stand with stiffness and damping",
+    "pitch": "Pitch with a Bell-Hiller flybar (Kim and Tilbury, eqs 21-22)",
+    "pitch-on-stand": "Pitch with a Bell-Hiller flybar, on a stand with stiffness and damping",
+    "kinematics-attitude": "Angles from gyros, for data compatibility",
+    "kinematics-velocity": "Angles and speeds from gyros and accelerometers",
+    "kinematics-position": "Angles, speeds and positions from gyros and accelerometers",
+    "helicopter": "Whole helicopter with tip-path plane, inflow, tail rotor and governor",
+    "helicopter-consistent": "Whole helicopter of Kim and Tilbury with corrections",
+    "helicopter-paper": "Whole helicopter of Kim and Tilbury as printed (eqs 2-20)",
+}
 
 
 def by_name(
@@ -92,6 +105,32 @@ def by_name(
 def names() -> tuple[str, ...]:
     """Return the names of the shipped models, without those from files."""
     return (*_SHIPPED, *_HELICOPTERS)
+
+
+def listed() -> dict[str, str]:
+    """Return a line on each shipped model, by its name for `by_text`."""
+    linear = {f"linear:{n}": linear_models.linear_model(n) for n in linear_models.shipped()}
+    return _MEANINGS | {n: re.split(r"[.:;] ", m.content.meaning)[0] for n, m in linear.items()}
+
+
+def by_text(
+    text: str, where: str = "model", folder: str | Path | None = None
+) -> tuple[Model, str | dict[str, str]]:
+    """Return the model that a command line names, and its name in a configuration.
+
+    Args:
+        text: such as 'helicopter', 'linear:roll', 'yaw', 'mine.yaml' or 'package.module:name'.
+        where: start of error messages.
+        folder: folder of modules.
+    """
+    # For roll and pitch there are the paper's model and a linear one: {linear: roll} is the latter.
+    stated = text.strip().removeprefix("{").removesuffix("}")
+    linear = stated.startswith("linear:")
+    stated = stated.removeprefix("linear:").strip()
+    file = linear_models.is_shipped(stated) or stated.endswith((".yaml", ".yml"))
+    if linear or (file and stated not in _SHIPPED):
+        return linear_models.linear_model(stated).model, {"linear": stated}
+    return by_name(stated, where, folder), stated
 
 
 def _imported(name: str, where: str, folder: str | Path | None) -> Model:

@@ -165,6 +165,12 @@ _COMMANDS = {
              help="write the JSON schema for editors"),
         _arg("--fit", help="keys of fit.json instead"),
     )),
+    "models": ("list the models that ship, or describe one", (
+        _arg("name", nargs="?", metavar="NAME",
+             help="roll-on-stand, linear:roll or mine.yaml: states, parameters, sources, modes "
+             "(default: all models, a line each)"),
+        _JSON,
+    )),
     "new-model": ("write the files of a model of your own", (
         _arg("name", metavar="NAME", help="name of the model and its module"),
         _arg("--out", metavar="DIR", help="new folder (default: NAME)"),
@@ -718,6 +724,26 @@ def _keys(options: argparse.Namespace) -> int:
                 text, width, initial_indent=first, subsequent_indent=indent, break_on_hyphens=False
             )
             print(*lines, sep="\n", end="\n" if lines else "")
+    return DONE
+
+
+def _models(options: argparse.Namespace) -> int:
+    _prepare_jax()
+    from heli_jax import models, summaries
+    from heli_jax.cli.described import described
+
+    if options.name is None:
+        listed = models.listed()
+        width = max(map(len, listed))
+        lines = [f"{name:{width}}  {words}" for name, words in listed.items()]
+        print(json.dumps(listed, indent=1)) if options.json else print_text("\n".join(lines))
+        return DONE
+    title, tables = described(options.name)
+    if options.json:
+        content = {t.title: [dict(zip(t.head, r, strict=True)) for r in t.rows] for t in tables}
+        print(json.dumps({"model": title, **content}, indent=1))
+    else:
+        print_text("\n".join([title, *map(summaries.as_text, tables)]))
     return DONE
 
 

@@ -373,6 +373,20 @@ def reads(model: Model, params: Record, name: str) -> bool:
     return not np.array_equal(at_one, at_two, equal_nan=True)
 
 
+def vehicle_constants(model: Model) -> dict[str, float]:
+    """Return the constants that a vehicle may have, with defaults; NaN where it must state one."""
+    defaults, known = naming.defaults(model.Params), naming.names(model.Params)
+    # Any number replaces required ones: it only shows which constants the model reads.
+    params = model.Params(**{n: defaults.get(n, 1.0) for n in known})
+    needed = {*(n for n in known if n not in defaults), *missing_parameters(model, params)}
+    values = {n: np.nan if n in needed else float(getattr(params, n)) for n in known}
+    return {
+        n: v
+        for n, v in values.items()
+        if n in needed or (np.isfinite(v) and reads(model, params, n))
+    }
+
+
 def _at_one(model: Model, params: Record, name: str, value: float) -> np.ndarray:
     """Return rates and outputs with a parameter at `value`; states, inputs and missing ones are
     1.

@@ -65,6 +65,7 @@ class Content(NamedTuple):
     parameters: dict[str, Quantity]
     delays: tuple[tuple[str, str], ...]
     axes: tuple[Axis, ...]
+    meaning: str = ""
 
 
 def content_of(mapping: Mapping[str, Any]) -> Content:
@@ -99,6 +100,7 @@ def content_of(mapping: Mapping[str, Any]) -> Content:
         parameters,
         _delays(mapping, inputs, parameters),
         _axes(mapping, states, inputs),
+        _words(mapping, "meaning", name),
     )
 
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from heli_jax import naming
 from heli_jax.config.firmware_filters import logged_filters
-from heli_jax.dynamics.model import axes_of, missing_parameters, reads
+from heli_jax.dynamics.model import axes_of, vehicle_constants
 from heli_jax.flights.clock import ROWS
 from heli_jax.flights.describe import TimeInfo
 from heli_jax.flights.preset import Alternative, choose, model_outputs, preset
@@ -182,17 +182,10 @@ def configuration(
 def vehicle(model: Any, means: Mapping[str, tuple[str, float]]) -> str:
     """Return a vehicle file to fill in."""
     lines = ["# Constants of your vehicle, measured or from drawings, with their source."]
-    defaults, known = naming.defaults(model.Params), naming.names(model.Params)
-    # Any number replaces required ones: it only shows which constants the model reads.
-    params = model.Params(**{n: defaults.get(n, 1.0) for n in known})
-    needed = {*(n for n in known if n not in defaults), *missing_parameters(model, params)}
-    for name in known:
-        unset = not math.isfinite(float(getattr(params, name)))
-        if name not in needed and (unset or not reads(model, params, name)):
-            continue
+    for name, default in vehicle_constants(model).items():
         unit, meaning = naming.unit(model.Params, name) or "1", naming.meaning(model.Params, name)
-        ask = name in needed or name in _OF_THE_STAND
-        value = EDIT if ask else f"{float(getattr(params, name)):g}"
+        ask = math.isnan(default) or name in _OF_THE_STAND
+        value = EDIT if ask else f"{default:g}"
         if name in means:
             channel, mean = means[name]
             value, meaning = f"{mean:.5g}", f"{meaning}; GUESS: mean of {channel}"
