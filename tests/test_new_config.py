@@ -21,7 +21,7 @@ from heli_jax.new_config.guess import (
     without_unit,
     words_of,
 )
-from heli_jax.new_config.model_choice import other_vehicle
+from heli_jax.new_config.model_choice import vehicle_of
 from heli_jax.new_config.rate import channels_of_preset, common_rate
 from heli_jax.new_config.scales import scaled
 from heli_jax.new_config.signals import is_place
@@ -299,24 +299,29 @@ def test_no_stick_tilts_a_blade_by_a_radian(most: float, unit: str, scale: float
 
 
 @pytest.mark.parametrize(
-    ("firmware", "parameters", "is_other"),
+    ("firmware", "parameters", "vehicle"),
     [
-        ("ArduPlane V4.3", {"Q_ENABLE": 1.0}, True),
-        ("ArduCopter V4.5.1", {"FRAME_CLASS": 1.0}, True),
-        ("ArduCopter V4.5.1", {"FRAME_CLASS": 6.0, "H_SW_TYPE": 3.0}, False),
-        ("ArduCopter V3.1 (heli)", {"FRAME": 0.0}, False),
-        ("", {}, False),
-        ("PX4 A", {"MAV_TYPE": 22}, True),
-        ("PX4 A", {"MAV_TYPE": 2, "CA_AIRFRAME": 10}, False),
-        ("PX4 A", {"MAV_TYPE": 4}, False),
-        ("PX4 A", {"CA_AIRFRAME": 0}, True),
-        ("Rotorflight 4.3.0", {}, False),
+        ("ArduPlane V4.3", {}, "aeroplane"),
+        ("ArduPlane V4.3", {"Q_ENABLE": 1.0}, "other vehicle"),
+        ("ArduRover V4.3", {"FRAME_CLASS": 1.0}, "other vehicle"),
+        ("ArduCopter V4.5.1", {"FRAME_CLASS": 1.0}, "multirotor"),
+        ("ArduCopter V4.5.1", {"FRAME_CLASS": 0.0}, ""),
+        ("ArduCopter V4.5.1", {"FRAME_CLASS": 6.0, "H_SW_TYPE": 3.0}, "helicopter"),
+        ("ArduCopter V3.1 (heli)", {"FRAME": 0.0}, ""),
+        ("", {}, ""),
+        ("PX4 A", {"MAV_TYPE": 22}, "other vehicle"),
+        ("PX4 A", {"MAV_TYPE": 1}, "aeroplane"),
+        ("PX4 A", {"MAV_TYPE": 2, "CA_AIRFRAME": 10}, "helicopter"),
+        ("PX4 A", {"MAV_TYPE": 4}, "helicopter"),
+        ("PX4 A", {"CA_AIRFRAME": 0}, "multirotor"),
+        ("Betaflight 4.4.0 S405", {}, "multirotor"),
+        ("Rotorflight 4.3.0", {}, "helicopter"),
     ],
 )
-def test_what_vehicle_a_log_is_of(firmware: str, parameters, is_other: bool) -> None:
+def test_what_vehicle_a_log_is_of(firmware: str, parameters, vehicle: str) -> None:
     topics = (Topic("main", np.arange(9.0), {"x": np.zeros(9)}, {}, "time"),)
     log = ChannelLog("a", "any", 1, "0", topics, firmware, parameters)
-    assert bool(other_vehicle(log)) == is_other
+    assert vehicle_of(log)[0] == vehicle
 
 
 def test_sticks_that_count_to_their_stops() -> None:

@@ -379,12 +379,12 @@ def vehicle_constants(model: Model) -> dict[str, float]:
     # Any number replaces required ones: it only shows which constants the model reads.
     params = model.Params(**{n: defaults.get(n, 1.0) for n in known})
     needed = {*(n for n in known if n not in defaults), *missing_parameters(model, params)}
-    values = {n: np.nan if n in needed else float(getattr(params, n)) for n in known}
-    return {
-        n: v
-        for n, v in values.items()
-        if n in needed or (np.isfinite(v) and reads(model, params, n))
-    }
+    values = dict.fromkeys(needed, np.nan)
+    for name in known:
+        value = float(getattr(params, name))
+        if name not in needed and np.isfinite(value) and reads(model, params, name):
+            values[name] = value
+    return {n: values[n] for n in known if n in values}
 
 
 def _at_one(model: Model, params: Record, name: str, value: float) -> np.ndarray:

@@ -11,7 +11,7 @@ from heli_jax.flights.preset import fitting_presets
 from heli_jax.linear_models import read as linear_models
 from heli_jax.new_config import tables, text
 from heli_jax.new_config.logs import Log, read_log
-from heli_jax.new_config.model_choice import chosen_model, other_models, other_vehicle
+from heli_jax.new_config.model_choice import chosen_model, other_models, vehicle_of
 from heli_jax.new_config.rate import channels_of_preset, common_rate, rate_of_outputs
 from heli_jax.new_config.signals import (
     rate_by_angle,
@@ -109,16 +109,15 @@ def write_config(
             "{signal: EDIT} by {constant: 0} if the stick was not moved"
         )
         notes.append(note("channels.lacking", words, *lacking))
-    if vehicle_of_log := other_vehicle(read.autopilot):
-        words = f"the log is of {vehicle_of_log}: check that the model fits it"
+    kind, shown_by = vehicle_of(read.autopilot)
+    if model is not None and kind not in ("", "helicopter"):
+        words = f"{shown_by} shows a log of no helicopter ({kind}): check that the model fits it"
         notes.append(note("model.other-vehicle", words))
-    if others:
+    if chosen.reason:
         assert isinstance(chosen.name, dict)
-        words = (
-            f"the model {chosen.name['linear']} is a guess from the stick that moves; with a "
-            f"stand or a flybar use --model {' or '.join(name for name, _ in others)}"
-        )
-        notes.append(note("model.guessed", words))
+        words = f"the model {chosen.name['linear']} is a guess: it {chosen.reason}"
+        more = f"; others: --model {' or '.join(name for name, _ in others)}" if others else ""
+        notes.append(note("model.guessed", f"{words}{more}"))
     words = f"check the lines marked GUESS, then run heli-jax check {out}"
     notes.append(note("configuration.guessed", words))
     return Written((out, *paths), tuple(notes))

@@ -1,5 +1,6 @@
-"""Choice of the model for a log: the stated one, or that of the axis that moves."""
+"""Choice of the model for a log: the stated one, or that of the vehicle's axis that moves."""
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -8,94 +9,112 @@ import numpy as np
 from heli_jax import models
 from heli_jax.flights.log import ChannelLog, shown, wrong
 from heli_jax.flights.preset import fitting_presets
-from heli_jax.linear_models import read as linear_models
 from heli_jax.new_config import guess, tables
 from heli_jax.new_config.logs import Log
 from heli_jax.new_config.signals import is_place, moving_channels, outputs_by_name
 
-_AXES = {
-    "roll": ("roll-flybarless", ("roll_rate", "roll")),
-    "pitch": ("pitch-flybarless", ("pitch_rate", "pitch")),
-    "yaw": ("yaw", ("yaw_rate",)),
-    "collective": ("heave", ("down_speed",)),
+_MEASURED = {
+    "roll": ("roll_rate", "roll"),
+    "pitch": ("pitch_rate", "pitch"),
+    "yaw": ("yaw_rate",),
+    "collective": ("down_speed",),
 }
-"""Linear model of the axis by stick, and the signals that must be logged for it."""
+"""Signals of which one must be logged, by the stick that moves it."""
 _UNITS = {"roll": "rad", "pitch": "rad", "down_speed": "m/s"} | dict.fromkeys(
     ("roll_rate", "pitch_rate", "yaw_rate"), "rad/s"
 )
-_OTHER_FIRMWARE = ("ArduPlane", "ArduRover", "Rover", "Blimp", "ArduSub", "APM:Plane", "APM:Rover")
-"""Names of ArduPilot firmware for other vehicles."""
-_HELICOPTERS = {"FRAME_CLASS": (0, 6, 11, 13), "CA_AIRFRAME": (10, 11, 12), "MAV_TYPE": (0, 3, 4)}
-"""Values for helicopters, and 0 for none, of settings of ArduPilot and PX4 by their rank."""
+_OTHER = "other vehicle"
+_FIRMWARE = {
+    **dict.fromkeys(("ArduPlane", "APM:Plane"), "aeroplane"),
+    **dict.fromkeys(("ArduRover", "Rover", "Blimp", "ArduSub", "APM:Rover"), _OTHER),
+    "Betaflight": "multirotor",
+    "Rotorflight": "helicopter",
+}
+"""Vehicle by the beginning of the firmware's name, for firmware of one kind of vehicle."""
+_SETTINGS = {
+    "FRAME_CLASS": {
+        "helicopter": (6, 11, 13), "multirotor": (1, 2, 3, 4, 5, 7, 12, 14, 15, 17), "": (0,)
+    },
+    "CA_AIRFRAME": {"helicopter": (10, 11, 12), "multirotor": (0, 8), "aeroplane": (1,)},
+    "MAV_TYPE": {
+        "helicopter": (3, 4), "multirotor": (2, 13, 14, 15, 29, 35), "aeroplane": (1,), "": (0,)
+    },
+}  # fmt: skip
+"""Values of settings of ArduPilot and PX4 by vehicle, by the rank of the setting."""
+_ARTICLES = {"multirotor": "a multirotor", "aeroplane": "an aeroplane"}
 _FULL_TRAVEL = 1.5
 """Largest value of a stick in parts of full travel; radios may exceed 1."""
 
 
 def chosen_model(
     name: str | None, log: Log, path: str, folder: Path
-) -> tuple[Any, str | dict[str, str], bool]:
-    """Return the model, its name in a configuration, and True if it is linear from a file.
+) -> tuple[Any, str | dict[str, str], str]:
+    """Return the model, its name in a configuration, and the reason for the choice.
 
     Args:
-        name: as stated; by default chosen from the signals that move.
+        name: as stated, which needs no reason; by default chosen by the vehicle and its motion.
         path: path of the log, for messages.
         folder: folder of the configuration.
     """
+    reason = ""
     if name is None:
-        vehicle = other_vehicle(log.autopilot)
-        if vehicle:
-            problem = f"the log is of {vehicle}, and new chooses only helicopter models"
-            remedy = "expected --model NAME, such as linear:FILE.yaml, a model file of your own"
+        vehicle, shown_by = vehicle_of(log.autopilot)
+        offered = tables.models()["vehicles"]
+        if vehicle not in ("", *offered):
+            problem = f"{shown_by} is no {', '.join(offered)}"
+            remedy = "expected --model NAME, see heli-jax models, or a model file of your own"
             raise wrong(path, f"{problem}; {remedy}")
-        name = _by_moving_stick(log, path)
-    # For roll and pitch there are the paper's model and a linear one: {linear: roll} is the latter.
-    stated = name.strip().removeprefix("{").removesuffix("}")
-    linear = stated.startswith("linear:")
-    stated = stated.removeprefix("linear:").strip()
-    file = linear_models.is_shipped(stated) or stated.endswith((".yaml", ".yml"))
-    if not linear and (not file or stated in ("roll", "pitch")):
-        return models.by_name(stated, "--model", folder), stated, False
-    return linear_models.linear_model(stated).model, {"linear": stated}, True
+        by_stick = offered[vehicle or "helicopter"]
+        has_preset = bool(fitting_presets(log.format, tuple(log.series)))
+        stick = "roll" if has_preset else _moving_stick(log, path, by_stick)
+        name = by_stick[stick]
+        found = f"{shown_by} shows it" if vehicle else "the log shows no vehicle"
+        axis = "roll by default" if has_preset else f"{stick}, whose input moves most"
+        reason = f"is for {axis}, of {_ARTICLES.get(vehicle, 'a helicopter')} ({found})"
+    return *models.by_text(name, "--model", folder), reason
 
 
-def other_vehicle(log: ChannelLog | None) -> str:
-    """Return why an autopilot's log is of no helicopter; empty if it may be of one."""
+def vehicle_of(log: ChannelLog | None) -> tuple[str, str]:
+    """Return the vehicle of an autopilot's log and what shows it; empty if it is not known.
+
+    A vehicle is 'helicopter', 'multirotor', 'aeroplane' or, without models here, 'other vehicle'.
+    """
     if log is None:
-        return ""
-    if log.firmware.startswith(_OTHER_FIRMWARE):
-        return f"no helicopter ({log.firmware})"
-    name = next((n for n in _HELICOPTERS if n in log.parameters), None)
-    if name is None or log.parameters[name] in _HELICOPTERS[name]:
-        return ""
-    return f"no helicopter ({name} {log.parameters[name]})"
+        return "", ""
+    vehicle = next((v for n, v in _FIRMWARE.items() if log.firmware.startswith(n)), None)
+    if vehicle is not None:
+        # An aeroplane that hovers is no aeroplane in hover.
+        return _OTHER if log.parameters.get("Q_ENABLE") else vehicle, log.firmware
+    name = next((n for n in _SETTINGS if n in log.parameters), None)
+    if name is None:
+        return "", ""
+    value = log.parameters[name]
+    vehicle = next((v for v, values in _SETTINGS[name].items() if value in values), _OTHER)
+    return vehicle, f"{name} {value:g}" if vehicle else ""
 
 
-def _by_moving_stick(log: Log, path: str) -> str:
-    """Return the linear model of the axis whose stick moves most and whose motion is logged."""
+def _moving_stick(log: Log, path: str, sticks: Collection[str]) -> str:
+    """Return the stick that moves most, of those whose motion is logged."""
     called = tables.names()
     names = tuple(n for n in log.series if not is_place(n, log.series))
     moving = {}
-    for stick, (model, measured) in _AXES.items():
+    for stick in sticks:
         by_name = guess.by_name(called["inputs"][stick], names, called["commands"][stick])
         by_name = by_name or guess.by_number(called["numbered"][stick], names)
-        sticks = moving_channels(log, [n for n in by_name if not guess.is_excitation(n)])
-        outputs = [
-            n for m in measured for n in outputs_by_name(log, called["outputs"][m], _UNITS[m])
-        ]
-        if sticks and moving_channels(log, outputs):
-            moving[model] = log.series[sticks[0]].values
-    if fitting_presets(log.format, names):
-        return "roll-flybarless"
+        moved = moving_channels(log, [n for n in by_name if not guess.is_excitation(n)])
+        outputs = (outputs_by_name(log, called["outputs"][m], _UNITS[m]) for m in _MEASURED[stick])
+        if moved and any(moving_channels(log, each) for each in outputs):
+            moving[stick] = log.series[moved[0]].values
     if not moving:
         listed = ", ".join(map(shown, names[:12]))
         problem = "no column names match a stick and a rate or angle of its axis that both move"
         remedy = "name a model by --model, then fill in the signals in the file it writes"
         raise wrong(path, f"{problem} (columns: {listed or 'none with numbers'}); {remedy}")
-    most = {model: float(np.nanmax(np.abs(values))) for model, values in moving.items()}
+    most = {stick: float(np.nanmax(np.abs(values))) for stick, values in moving.items()}
     # Fractions of full travel are compared directly; the full travel of other numbers is unknown.
     alike = max(most.values()) <= _FULL_TRAVEL
-    size = {m: np.nanstd(values) / (1.0 if alike else most[m]) for m, values in moving.items()}
-    return max(size, key=lambda model: size[model])
+    size = {s: np.nanstd(values) / (1.0 if alike else most[s]) for s, values in moving.items()}
+    return max(size, key=lambda stick: size[stick])
 
 
 def other_models(name: str | dict[str, str]) -> tuple[tuple[str, str], ...]:

@@ -73,11 +73,16 @@ def filtered_outputs(
 
 
 class Chosen(NamedTuple):
-    """The model, its name in a configuration, and True if it is linear from a file."""
+    """The model, its name in a configuration, and the reason if it was not stated."""
 
     model: Any
     name: str | dict[str, str]
-    linear: bool
+    reason: str = ""
+
+    @property
+    def linear(self) -> bool:
+        """True if the model is linear from a file."""
+        return isinstance(self.name, dict)
 
 
 class Signals(NamedTuple):
@@ -133,7 +138,7 @@ def configuration(
     lines = [
         f"# Made from {_comment(log)}. Check the lines marked GUESS.",
         "# heli-jax keys TEXT explains a key; heli-jax check tests the log before a fit.",
-        *_models(others),
+        *_models(chosen.reason, others),
         f"model: {_value(chosen.name)}",
         *([] if vehicle is None else [f"vehicle: {_value(vehicle)}"]),
     ]
@@ -226,14 +231,15 @@ def _clock(time: TimeInfo | None, rate: float | None) -> list[str]:
     return lines
 
 
-def _models(others: Sequence[str]) -> list[str]:
-    if not others:
-        return []
-    return [
-        "# GUESS: the model, from the stick that moves. A log does not show a stand or a flybar,",
-        "# and a wrong model gives wrong numbers. Other models of these signals (--model NAME):",
-        *(f"#   {words}" for words in others),
-    ]
+def _models(reason: str, others: Sequence[str]) -> list[str]:
+    lines = [f"# GUESS: the model {_comment(reason)}."] if reason else []
+    if others:
+        lines += [
+            "# A log does not show a stand or a flybar, and a wrong model gives wrong numbers.",
+            "# Other models of these signals (--model NAME):",
+            *(f"#   {words}" for words in others),
+        ]
+    return lines
 
 
 def _flight(chosen: Chosen, signals: Signals, time: TimeInfo | None, log: str) -> list[str]:
