@@ -11,6 +11,7 @@ from heli_jax.flights.log import ChannelLog, shown, wrong
 from heli_jax.flights.preset import fitting_presets
 from heli_jax.new_config import guess, tables
 from heli_jax.new_config.logs import Log
+from heli_jax.new_config.rate import channels_of_preset
 from heli_jax.new_config.signals import is_place, moving_channels, outputs_by_name
 
 _MEASURED = {
@@ -65,12 +66,14 @@ def chosen_model(
             remedy = "expected --model NAME, see heli-jax models, or a model file of your own"
             raise wrong(path, f"{problem}; {remedy}")
         by_stick = offered[vehicle or "helicopter"]
-        has_preset = bool(fitting_presets(log.format, tuple(log.series)))
-        stick = "roll" if has_preset else _moving_stick(log, path, by_stick)
+        preset = next(iter(fitting_presets(log.format, tuple(log.series))), None)
+        # The throttle of a vehicle that hovers may move most, but roll has more to identify.
+        by_default = preset is not None and "collective" in by_stick
+        stick = "roll" if by_default else _moving_stick(log, path, by_stick, preset)
         name = by_stick[stick]
-        found = f"{shown_by} shows it" if vehicle else "the log shows no vehicle"
-        axis = "roll by default" if has_preset else f"{stick}, whose input moves most"
-        reason = f"is for {axis}, of {_ARTICLES.get(vehicle, 'a helicopter')} ({found})"
+        found = shown_by or "the log shows no vehicle"
+        axis = f"{stick} axis, the default" if by_default else f"{stick} axis, which moves most"
+        reason = f"suits {_ARTICLES.get(vehicle, 'a helicopter')} ({found}) and its {axis}"
     return *models.by_text(name, "--model", folder), reason
 
 
@@ -93,17 +96,27 @@ def vehicle_of(log: ChannelLog | None) -> tuple[str, str]:
     return vehicle, f"{name} {value:g}" if vehicle else ""
 
 
-def _moving_stick(log: Log, path: str, sticks: Collection[str]) -> str:
+def _moving_stick(log: Log, path: str, sticks: Collection[str], preset: str | None) -> str:
     """Return the stick that moves most, of those whose motion is logged."""
     called = tables.names()
     names = tuple(n for n in log.series if not is_place(n, log.series))
     moving = {}
     for stick in sticks:
-        by_name = guess.by_name(called["inputs"][stick], names, called["commands"][stick])
-        by_name = by_name or guess.by_number(called["numbered"][stick], names)
-        moved = moving_channels(log, [n for n in by_name if not guess.is_excitation(n)])
-        outputs = (outputs_by_name(log, called["outputs"][m], _UNITS[m]) for m in _MEASURED[stick])
-        if moved and any(moving_channels(log, each) for each in outputs):
+        if preset is None:
+            by_name = guess.by_name(called["inputs"][stick], names, called["commands"][stick])
+            by_name = by_name or guess.by_number(called["numbered"][stick], names)
+            inputs = [n for n in by_name if not guess.is_excitation(n)]
+            outputs = [
+                n
+                for m in _MEASURED[stick]
+                for n in outputs_by_name(log, called["outputs"][m], _UNITS[m])
+            ]
+        else:
+            command = {"yaw": "tail"}.get(stick, f"cyclic_{stick}")
+            inputs = channels_of_preset(preset, log.series, [command])
+            outputs = channels_of_preset(preset, log.series, _MEASURED[stick])
+        moved = moving_channels(log, inputs)
+        if moved and moving_channels(log, outputs):
             moving[stick] = log.series[moved[0]].values
     if not moving:
         listed = ", ".join(map(shown, names[:12]))

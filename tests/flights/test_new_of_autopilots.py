@@ -23,10 +23,10 @@ STICK = 0.2 * np.sign(np.sin(np.arange(800) / 60))
 RATE = 0.3 * np.sin(np.arange(800) / 60) + 0.01 * np.random.default_rng(1).normal(size=800)
 
 
-def px4_log(path, settings):
-    """Write a gyro at 100 Hz, stick and attitude at 50 Hz."""
-    rate = [(t, t, p, 0, 0) for t, p in zip(US, RATE, strict=True)]
-    stick = [(t, t, u, 0, 0) for t, u in zip(US, STICK, strict=True)]
+def px4_log(path, settings, axis=0):
+    """Write a gyro at 100 Hz, stick and attitude at 50 Hz; one axis moves."""
+    rate = [(t, t, *np.roll((p, 0, 0), axis)) for t, p in zip(US, RATE, strict=True)]
+    stick = [(t, t, *np.roll((u, 0, 0), axis)) for t, u in zip(US, STICK, strict=True)]
     topics = [
         ("vehicle_angular_velocity", 0, VECTOR, rate),
         ("vehicle_attitude", 0, QUATERNION, [(t, 1, 0, 0, 0) for t in US[::2]]),
@@ -122,3 +122,21 @@ def test_no_rotor_is_written_for_another_vehicle(tmp_path):
     assert not out.exists()
     write_config(log, out, "linear:roll")
     assert out.exists()
+
+
+@pytest.mark.parametrize(
+    ("settings", "axis", "model", "inputs", "outputs"),
+    [
+        ([], 1, "roll-flybarless", "lat", "p"),
+        ([("MAV_TYPE", 4)], 0, "roll-flybarless", "lat", "p"),
+        ([("CA_AIRFRAME", 0)], 0, "rate-first-order", "lat lon ped", "p q r"),
+        ([("MAV_TYPE", 1)], 0, "lateral-directional", "ail rud", "p r phi"),
+        ([("MAV_TYPE", 1)], 1, "short-period", "ele", "q"),
+    ],
+)
+def test_the_model_is_for_the_firmwares_vehicle(tmp_path, settings, axis, model, inputs, outputs):
+    out = tmp_path / "new.yaml"
+    write_config(px4_log(tmp_path / "flight.ulg", settings, axis), out)
+    assert yaml.safe_load(out.read_text())["model"] == {"linear": model}
+    (flight,) = read_flights(load(out))
+    assert (" ".join(flight.inputs), " ".join(flight.outputs)) == (inputs, outputs)

@@ -29,6 +29,13 @@ STATES = {
     "hybrid": "u v p q phi theta a b w r r_fb c d",
     "hybrid-flybarless": "u v p q phi theta a b w r r_fb",
     "r50-hover": "u v p q phi theta a b w r r_fb c d",
+    "longitudinal": "u w q theta",
+    "short-period": "alpha q",
+    "phugoid": "u theta",
+    "lateral-directional": "beta p r phi",
+    "rate-first-order": "p q r",
+    "rate-second-order": "p dp act",
+    "quad-roll": "v p phi mot",
 }
 
 
@@ -57,6 +64,107 @@ def test_the_r50_has_its_published_eigenvalues(name):
     np.testing.assert_allclose(
         np.sort_complex(values[values.imag >= 0]), np.sort_complex(R50), atol=5.1e-5
     )
+
+
+def modes_of(name):
+    """Return the eigenvalues with an imaginary part of at least zero, slowest first."""
+    found = linear_model(name)
+    values = modes(found.model, found.vehicle().params)
+    return values[values.imag >= 0]
+
+
+def test_the_navion_has_its_published_modes():
+    """Test against NASA CR-177943, table 4.1, and rounded lateral modes after Nelson."""
+    phugoid, short = modes_of("longitudinal")
+    np.testing.assert_allclose([phugoid.real, phugoid.imag], [-0.017, 0.213], atol=5e-4)
+    np.testing.assert_allclose([short.real, short.imag], [-2.51, 2.59], atol=5e-3)
+    spiral, dutch_roll, roll = modes_of("lateral-directional")
+    assert spiral == pytest.approx(-0.009, abs=5e-4)
+    assert roll == pytest.approx(-8.4, abs=0.05)
+    assert abs(dutch_roll) == pytest.approx(2.4, abs=0.05)
+    assert -dutch_roll.real / abs(dutch_roll) == pytest.approx(0.20, abs=5e-3)
+
+
+def test_approximate_modes_of_an_aeroplane():
+    """Test against the published short period, and Lanchester's phugoid sqrt(2) g/U0."""
+    assert modes_of("short-period") == pytest.approx([-2.51 + 2.59j], abs=0.007)
+    assert abs(modes_of("phugoid")[0]) == pytest.approx(np.sqrt(2) * 32.2 / 176, rel=0.01)
+
+
+def test_rate_responses_are_those_of_the_r50_without_its_flybar():
+    found = {n: linear_model(n) for n in ("roll-flybarless", "rate-first-order")}
+    A, B, *_ = linearize(*(f := found["roll-flybarless"])[:1], f.vehicle().params).matrices
+    # p and b, and their roll rate if b follows at once.
+    A, B = np.asarray(A)[1:, 1:], np.asarray(B)[1:]
+    settled = A[0, 0] - A[0, 1] * A[1, 0] / A[1, 1], -A[0, 1] * B[1] / A[1, 1]
+    first = found["rate-first-order"].vehicle().params
+    np.testing.assert_allclose(-1 / first.tau_roll, settled[0], rtol=1e-3)
+    np.testing.assert_allclose(first.K_roll / first.tau_roll, settled[1], rtol=1e-3)
+    np.testing.assert_allclose(
+        modes_of("rate-second-order")[0], modes_of("roll-flybarless")[1], rtol=1e-3
+    )
+
+
+def test_the_quadrotor_is_that_of_rotors():
+    """Test derivatives by differences of the rotors' forces, as in gazebo_motor_model.cpp."""
+    mass, inertia, height, arms = (
+        1.5 + 4 * 0.005,
+        0.0347563,
+        0.023,
+        np.array([-0.22, 0.2, 0.22, -0.2]),
+    )
+    thrust, drag = 8.54858e-6, 8.06428e-5
+    hover = mass * 9.81 / 4
+
+    def rates(v, p, lat):
+        # y to the right, z down: arms are positive on the left, rotors are above the body.
+        lift = hover * (1 + lat * np.sign(arms))
+        side = -np.sqrt(hover / thrust) * drag * (v + height * p)
+        return np.array([4 * side / mass, (np.sum(arms * lift) + height * 4 * side) / inertia])
+
+    own = {n: c.value for n, c in linear_model("quad-roll").vehicle().constants.items()}
+    at_rest = rates(0, 0, 0)
+    by_v, by_p, by_lat = (rates(*step) - at_rest for step in np.eye(3))
+    assert by_v == pytest.approx([own["Yv"], own["Lv"]], rel=1e-4)
+    assert [by_p[1], by_lat[1]] == pytest.approx([own["Lp"], own["Llat"]], rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "free"),
+    [
+        ("longitudinal", ("Zw", "Mw", "Mq", "Mde")),
+        ("short-period", ("Ma", "Mq", "Mde")),
+        ("phugoid", ("Xu", "Zu", "Xthr")),
+        ("lateral-directional", ("Lp", "Lda", "Nbeta", "Nr", "Ndr")),
+        ("rate-first-order", ("K_roll", "tau_roll", "delay_roll", "K_yaw", "tau_yaw")),
+        ("rate-second-order", ("K", "omega", "zeta")),
+        ("quad-roll", ("Lv", "Llat", "tau_mot")),
+    ],
+)
+def test_a_fit_of_its_own_record_finds_a_model(name, free):
+    found, rng = linear_model(name), np.random.default_rng(3)
+    (params, constants, _), dt, n = found.vehicle(), 0.02, 400
+    truth = {p: constants[p].value for p in free}
+    names = naming.names(found.model.Inputs)
+    inputs = {i: np.repeat(0.01 * rng.uniform(-1.0, 1.0, n // 20), 20) for i in names}
+    outputs = simulate(found.model, params, found.model.Inputs(**inputs), dt=dt).outputs
+    measured = {
+        o: np.asarray(y) + 0.01 * np.std(y) * rng.standard_normal(n)
+        for o, y in naming.asdict(outputs).items()
+    }
+    problem = Problem(
+        found.model,
+        params,
+        [Flight(dt=dt, inputs=inputs, outputs=measured)],
+        {p: Free(1.2 * value) for p, value in truth.items()},
+        Nuisance(initial_state=False, bias=False, input_offset=False),
+    )
+    fitted = heli_jax.fit(problem)
+    assert fitted.status == "converged"
+    for p, value in truth.items():
+        estimate = fitted.estimates[p]
+        assert estimate.sd < 0.1 * abs(value)
+        assert abs(estimate.value - value) < 4.0 * estimate.sd
 
 
 def test_inflow_that_has_settled_leaves_the_heave_of_the_r50():
