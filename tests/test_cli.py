@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 import yaml
 
-from heli_jax import run_directory
+from heli_jax import models, run_directory
 from heli_jax.cli import commands, main
 from heli_jax.errors import InputError
+from heli_jax.linear_models.read import shipped
 
 ROOT = Path(__file__).parents[1]
 TREX = ROOT.parent / "shared" / "data" / "trex550" / "Pitchtest.csv"
@@ -193,6 +194,21 @@ WRONG = {
     ),
 }
 BENCH_30 = yaml.safe_load((ROOT / "configs" / "vehicles" / "bench-30.yaml").read_text())
+
+
+def test_models_are_listed_and_described(capsys):
+    assert main(["models", "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)
+    assert set(listed) == {*models.names(), *(f"linear:{n}" for n in shipped())}
+    assert all(listed.values())
+    assert main(["models", "short-period", "--json"]) == 0
+    described = json.loads(capsys.readouterr().out)
+    assert [row["name"] for row in described["states"]] == ["alpha", "q"]
+    assert all(row["source"] for row in described["parameters"])
+    [mode] = described["modes"]
+    assert float(mode["damping"]) == pytest.approx(2.505 / 3.606, abs=1e-3)
+    assert main(["models", "helicopter"]) == 0
+    assert main(["models", "nothing"]) == 2
 
 
 @pytest.mark.parametrize("case", WRONG)

@@ -228,28 +228,18 @@ def _findings() -> str:
     return "\n\n".join("\n\n".join((f"## {g}", *entries)) for g, entries in groups.items())
 
 
-def _linear_models() -> str:
-    from heli_jax.linear_models.read import linear_model, shipped
-
-    def rows() -> Iterator[tuple[str, ...]]:
-        for name in shipped():
-            model = linear_model(name).model
-            records = (model.State, model.Inputs, model.Outputs)
-            yield f"`{{linear: {name}}}`", *(_names(record) for record in records)
-
-    return _table(("model", "states", "inputs", "outputs"), rows())
-
-
-def _models() -> str:
+def _models(linear: bool) -> str:
     from heli_jax import models
 
     def rows() -> Iterator[tuple[str, ...]]:
-        for name in (*models._SHIPPED, *models._HELICOPTERS):
-            model = models.by_name(name)
-            records = (model.State, model.Inputs, model.Outputs)
-            yield f"`{name}`", *(_names(record) for record in records)
+        for text, meaning in models.listed().items():
+            model, name = models.by_text(text)
+            if isinstance(name, dict) == linear:
+                shown = f"{{linear: {name['linear']}}}" if isinstance(name, dict) else name
+                records = (model.State, model.Inputs, model.Outputs)
+                yield f"`{shown}`", _cell(meaning), *(_names(record) for record in records)
 
-    return _table(("model", "states", "inputs", "outputs"), rows())
+    return _table(("model", "meaning", "states", "inputs", "outputs"), rows())
 
 
 def _names(record: type) -> str:
@@ -327,8 +317,8 @@ _PARTS: dict[str, Callable[[], str]] = {
     "commands": _commands,
     "findings": _findings,
     "configurations": _configurations,
-    "linear-models": _linear_models,
-    "models": _models,
+    "linear-models": lambda: _models(linear=True),
+    "models": lambda: _models(linear=False),
     "symbols": _symbols,
     "presets": _presets,
     "api": _api,

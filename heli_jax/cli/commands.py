@@ -153,7 +153,7 @@ _COMMANDS = {
         _LOG, _TIME_RATE, _FLIGHT,
         _arg("--model", metavar="NAME",
              help="as a configuration names it, such as roll-on-stand or attitude-flybarless "
-             "(default: the linear model of the axis whose stick moves most)"),
+             "(default: by the vehicle and the axis that moves most, see heli-jax models)"),
         _arg("--vehicle", metavar="FILE", help="an existing vehicle file"),
         _arg("--out", metavar="FILE", help="configuration (default: the log's name)"),
     )),
