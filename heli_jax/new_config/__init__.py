@@ -46,7 +46,7 @@ def write_config(
         log: path of the log.
         out: path of the configuration; an existing file is not replaced.
         model: name as in a configuration, or the file name of a linear model; by default chosen
-            from the signals that move.
+            by the vehicle and the signals that move.
         vehicle: path of an existing vehicle file.
         flight: number of the flight in a log that holds several, from 1.
         time_rate: samples a second [Hz] of a table without times.

@@ -70,7 +70,7 @@ def chosen_model(
         # The throttle of a vehicle that hovers may move most, but roll has more to identify.
         by_default = preset is not None and "collective" in by_stick
         stick = "roll" if by_default else _moving_stick(log, path, by_stick, preset)
-        name = by_stick[stick]
+        name = str(by_stick[stick])
         found = shown_by or "the log shows no vehicle"
         axis = f"{stick} axis, the default" if by_default else f"{stick} axis, which moves most"
         reason = f"suits {_ARTICLES.get(vehicle, 'a helicopter')} ({found}) and its {axis}"

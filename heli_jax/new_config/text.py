@@ -235,7 +235,7 @@ def _models(reason: str, others: Sequence[str]) -> list[str]:
     lines = [f"# GUESS: the model {_comment(reason)}."] if reason else []
     if others:
         lines += [
-            "# A log does not show a stand or a flybar, and a wrong model gives wrong numbers.",
+            "# A log does not show how a vehicle is built, and a wrong model gives wrong numbers.",
             "# Other models of these signals (--model NAME):",
             *(f"#   {words}" for words in others),
         ]
