@@ -1,10 +1,10 @@
 """Design of a flight: the inputs within limits that determine the parameters best.
 
-The candidates of the library are compared first. From the best of them, SciPy's SLSQP searches
-over values of the inputs at nodes, with gradients in reverse mode. Limits of the motion hold along
-the whole flight: the largest value over time is replaced by a smooth one that is never smaller
-(Kreisselmeier and Steinhauser, 1979). Sources: Mehra (1974); Goodwin and Payne (1977) for the
-criteria.
+The candidates of the library are compared first. From the best of them, SciPy's L-BFGS-B searches
+over values of the inputs at nodes, with gradients in reverse mode. Limits of the inputs are bounds.
+Limits of the motion hold along the whole flight, by an augmented Lagrangian: the largest value over
+time is replaced by a smooth one that is never smaller (Kreisselmeier and Steinhauser, 1979).
+Sources: Mehra (1974); Goodwin and Payne (1977) for the criteria.
 """
 
 import math
@@ -19,18 +19,24 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.errors import nearest
+from heli_jax.identification.design.accuracy import DETERMINES, unstated_gusts
 from heli_jax.identification.design.information import Experiment, Feedback, planned
 from heli_jax.identification.design.library import manoeuvres
+from heli_jax.identification.estimation.data import data_of, start_vector
+from heli_jax.identification.estimation.noise_covariance import first_noise, likely_gusts
 from heli_jax.identification.problem import Free, Problem
-from heli_jax.identification.search import first_guess
 from heli_jax.identification.unknowns import transforms
+from heli_jax.identification.unknowns.layout import Solution, layout_of
 
-DETERMINED = 1.0
-"""Relative sd below which a parameter is determined."""
-_NODES = 160
+_NODES = 2000
 """Values of all inputs together that the search moves, at most."""
+_ROUNDS, _TOLERANCE = 12, 1e-3
+"""Rounds of the augmented Lagrangian, and change of the criterion (a logarithm) and excess of a
+limit (relative) at which they end."""
 _SHARP = 300.0
 """Sharpness of the smooth maximum: it exceeds the maximum by log(values near it) / 300."""
+_MOST_TIMES = 1e4
+"""Repetitions after which more do not help."""
 CRITERIA = ("D", "A", "E")
 
 
@@ -70,11 +76,13 @@ class Rated(NamedTuple):
     start), the largest of all vehicles; infinite if it is not determined."""
     margins: dict[str, float]
     """1 - largest value over limit, by limit."""
+    covariance: Float[np.ndarray, "v p p"]
+    """Of the parameters in relative coordinates, for each vehicle."""
 
     @property
     def undetermined(self) -> tuple[str, ...]:
         """Parameters that it does not determine."""
-        return tuple(n for n, sd in self.sd.items() if not sd < DETERMINED)
+        return tuple(n for n, sd in self.sd.items() if not sd < DETERMINES)
 
 
 class Design(NamedTuple):
@@ -86,27 +94,59 @@ class Design(NamedTuple):
     library: tuple[Rated, ...]
     """The best first."""
     optimum: Rated
+    motion: tuple[dict[str, np.ndarray], ...]
+    """Outputs and states (N,) of the optimum in calm air, by flight, SI."""
     own: Rated | None
-    """The inputs of the problem's flights, if they move."""
+    """The user's inputs, if any."""
     converged: bool
     """True if the optimiser met its tolerance."""
     steps: int
 
+    priors: Float[np.ndarray, "v p p"]
+    """Information of the priors, for each vehicle."""
+
+    def sd_of(self, rated: Rated, product: str, times: float = 1.0) -> float:
+        """Return the relative sd of a product such as `a/Ixx`, the largest of all vehicles.
+
+        Args:
+            product: free parameters with `*` and `/`.
+            times: repetitions of the flights.
+
+        Raises:
+            ValueError: a factor is no free parameter.
+        """
+        powers = exponents(product, tuple(rated.sd))
+        if powers is None:
+            raise ValueError(f"expected a parameter or a product, got criterion {product}")
+        if not np.isfinite(rated.value):
+            return math.inf
+        # Repeated flights are independent, so their information adds up.
+        data = np.linalg.inv(rated.covariance) - self.priors
+        C = np.linalg.inv(times * data + self.priors)
+        return float(np.sqrt(np.max(powers @ C @ powers)))
+
     def needed(self, rated: Rated, wanted: Mapping[str, float]) -> float:
         """Return the duration [s] after which a manoeuvre, repeated, gives the wanted sds.
 
+        It is infinite if no duration does, as for a parameter that only its prior determines.
+
         Args:
-            wanted: relative sds by parameter.
+            wanted: relative sds by parameter or product.
 
         Raises:
             ValueError: a parameter that is not free.
         """
-        for name in wanted:
-            if name not in rated.sd:
-                raise ValueError(f"for {name}: it is not free{nearest(name, list(rated.sd))}")
-        ratios = [rated.sd[n] / sd for n, sd in wanted.items()]
-        # Repeated flights are independent: variances fall with their number.
-        return self.duration * max(ratios) ** 2 if ratios else self.duration
+
+        def enough(times: float) -> bool:
+            return all(self.sd_of(rated, n, times) <= sd for n, sd in wanted.items())
+
+        if not enough(_MOST_TIMES):
+            return math.inf
+        low, high = -math.log(_MOST_TIMES), math.log(_MOST_TIMES)
+        for _ in range(40):
+            middle = 0.5 * (low + high)
+            low, high = (low, middle) if enough(math.exp(middle)) else (middle, high)
+        return self.duration * math.exp(high)
 
 
 def design(
@@ -114,7 +154,9 @@ def design(
     limits: Limits,
     *,
     criterion: str = "D",
-    differences: Mapping[str, tuple[float, float]] | None = None,
+    own: Sequence[Mapping[str, np.ndarray]] | None = None,
+    rest: Mapping[str, float] | None = None,
+    differences: Sequence[Mapping[str, tuple[float, float]]] | None = None,
     feedback: Feedback | None = None,
     vehicles: int = 1,
     seed: int = 0,
@@ -125,12 +167,15 @@ def design(
 
     Args:
         problem: output error or filter error. Its flights state the durations, the sample time, the
-            measured outputs and their sd; their outputs may be zeros. Their inputs are rated too.
+            measured outputs and their sd.
         limits: inputs to excite, and limits of the motion in calm air.
         criterion: "D", "A" or "E"; or a parameter, or a product such as "a/Ixx", whose sd is
             minimised.
-        differences: known parameters of flights that the design chooses, with their lowest and
-            highest values; for each flight that has the name in `known`.
+        own: excitations (N,) of the user by flight and input, SI, which are rated too.
+        rest: values of the inputs about which the excitations move, SI; default: zero for a linear
+            model, else the first sample.
+        differences: for each flight, known parameters that the design chooses, with their lowest
+            and highest values.
         feedback: the loop that flies the vehicle, as in `simulate`. It receives the excitation as
             its inputs. The recorded inputs are those that act.
         vehicles: vehicles drawn from the priors or bounds of the free parameters; the design is for
@@ -142,24 +187,36 @@ def design(
         ValueError: an unknown name, a limit that is not positive, or a method in frequency.
     """
     report = progress or (lambda _: None)
-    _check(problem, limits, criterion, differences or {})
-    guess = first_guess(problem)
-    points = _points(problem, np.asarray(guess.z), vehicles, seed)
-    experiment = planned(problem, guess.layout, guess.data, guess.noise, points, feedback)
-    search = _Search(experiment, limits, criterion, differences or {})
+    if problem.noise_model == "spectrum" or problem.window is not None:
+        raise ValueError(
+            "method: expected output-error or filter-error without windows, got "
+            f"{problem.method}{' with windows' if problem.window else ''}"
+        )
+    chosen = differences or [{} for _ in problem.training]
+    _check(problem, limits, criterion, chosen)
+    layout = layout_of(problem, problem.training)
+    data = data_of(problem, problem.training, layout)
+    noise = first_noise(problem, problem.training)
+    z = start_vector(layout, data, problem)
+    if unstated_gusts(problem):
+        z, _ = likely_gusts(Solution(layout, data, noise, z))
+    points = _points(problem, np.asarray(z), vehicles, seed)
+    experiment = planned(problem, layout, data, noise, points, feedback)
+    search = _Search(experiment, limits, criterion, chosen, rest or {})
     report("rating the library of inputs")
     rated = sorted(search.library(), key=lambda r: r.value)
     report(f"optimising {search.size} values from {rated[0].words}")
     optimum, converged, steps = search.optimise(rated[0], max_steps)
-    moves = any(np.ptp(u) > 0 for f in problem.training for u in f.inputs.values())
     return Design(
         criterion=criterion,
         duration=sum(f.duration for f in problem.training),
         library=tuple(rated),
         optimum=optimum,
-        own=search.own() if moves else None,
+        motion=search.motion(optimum),
+        own=None if own is None else search.own(own),
         converged=converged,
         steps=steps,
+        priors=search.priors,
     )
 
 
@@ -167,7 +224,7 @@ def _check(
     problem: Problem,
     limits: Limits,
     criterion: str,
-    differences: Mapping[str, tuple[float, float]],
+    differences: Sequence[Mapping[str, tuple[float, float]]],
 ) -> None:
     model = problem.model
     known = {
@@ -186,12 +243,23 @@ def _check(
     for name, value in (*sizes.items(), *limits.motion.items()):
         if not value > 0:
             raise ValueError(f"limits: {name}: expected more than zero, got {value:g}")
-    exponents(criterion, tuple(problem.free))
-    for name, (low, high) in differences.items():
-        if not any(name in f.known for f in problem.training):
-            raise ValueError(f"differences: expected {name} among a flight's known, got none")
-        if not low < high:
-            raise ValueError(f"differences.{name}: expected low below high, got {low:g}, {high:g}")
+    try:
+        exponents(criterion, tuple(problem.free))
+    except ValueError as e:
+        raise ValueError(f"criterion: expected D, A, E, or a product; {e}") from e
+    if len(differences) != len(problem.training):
+        raise ValueError(
+            f"differences: expected one for each of {len(problem.training)} flights, got "
+            f"{len(differences)}"
+        )
+    for own, flight in zip(differences, problem.training, strict=True):
+        for name, (low, high) in own.items():
+            if name not in flight.known:
+                raise ValueError(f"differences: expected {name} among the flight's known, got none")
+            if not low < high:
+                raise ValueError(
+                    f"differences: {name}: expected the lowest value first, got {low:g}, {high:g}"
+                )
 
 
 def exponents(criterion: str, free: Sequence[str]) -> Float[np.ndarray, " p"] | None:
@@ -209,8 +277,8 @@ def exponents(criterion: str, free: Sequence[str]) -> Float[np.ndarray, " p"] | 
                 continue
             if name.strip() not in free:
                 raise ValueError(
-                    f"criterion: expected D, A, E or a product of {', '.join(free)}, such as "
-                    f"{'/'.join(free[:2])}, got {criterion!r}"
+                    f"expected {', '.join(free)} or a product such as {'/'.join(free[:2])}, got "
+                    f"{criterion!r}"
                 )
             powers[free.index(name.strip())] += -1.0 if i else 1.0
     return powers
@@ -248,22 +316,23 @@ class _Search:
         experiment: Experiment,
         limits: Limits,
         criterion: str,
-        differences: Mapping[str, tuple[float, float]],
+        differences: Sequence[Mapping[str, tuple[float, float]]],
+        rest: Mapping[str, float],
     ) -> None:
         self.experiment, self.limits, self.criterion = experiment, limits, criterion
         problem = experiment.problem
         self.powers = exponents(criterion, experiment.parameters)
+        p = len(experiment.parameters)
+        self.priors = np.square(np.asarray(experiment.vehicles.rows)[:, :p, :p])
         self.flights = problem.training
         # A linear model begins at rest with neutral inputs, a nonlinear one as the flight does.
         linear = problem.model.linear
         self.base = [
-            {n: 0.0 if linear else float(u[0]) for n, u in f.inputs.items()} for f in self.flights
+            {n: rest.get(n, 0.0 if linear else float(u[0])) for n, u in f.inputs.items()}
+            for f in self.flights
         ]
         self.varied = [
-            (i, n, low, high)
-            for i, f in enumerate(self.flights)
-            for n, (low, high) in differences.items()
-            if n in f.known
+            (i, n, low, high) for i, own in enumerate(differences) for n, (low, high) in own.items()
         ]
         inputs = len(self.flights) * len(limits.inputs)
         self.places, at = [], 0
@@ -272,17 +341,16 @@ class _Search:
             for name, limit in limits.inputs.items():
                 # With this spacing no ramp between two nodes exceeds the rate.
                 least = max(flight.dt, 2.0 * limit.amplitude / limit.rate)
-                spacing = max(least, flight.duration * inputs / _NODES)
+                spacing = max(least, 0.1, flight.duration * inputs / _NODES)
                 per_node = math.ceil(spacing / flight.dt - 1e-9)
                 count = -(-flight.n_samples // per_node) + (limit.rate < math.inf)
                 by_input[name] = (slice(at, at + count), per_node)
                 at += count
             self.places.append(by_input)
         self.nodes, self.size = at, at + len(self.varied)
-        self.value = jax.jit(jax.value_and_grad(self._value))
         self.rated = jax.jit(self._rated)
         self.smooth = jax.jit(self._smooth_ratios)
-        self.slopes = jax.jit(jax.jacrev(self._smooth_ratios))
+        self.augmented = jax.jit(jax.value_and_grad(self._augmented))
 
     def excitations(self, x: Any) -> tuple[dict[str, Any], ...]:
         """Return the excitations (N,) by flight and input, SI."""
@@ -335,11 +403,10 @@ class _Search:
         return jnp.mean(jax.vmap(self._of_covariance)(self.experiment.covariances(inputs, known)))
 
     def _rated(self, inputs: Any, known: Any) -> tuple[Array, Array, dict[str, Array]]:
-        """Return the criterion, the largest sd of all vehicles, and the largest motion."""
+        """Return the criterion, the covariances, and the largest motion."""
         C = self.experiment.covariances(inputs, known)
         value = jnp.mean(jax.vmap(self._of_covariance)(C))
-        sd = jnp.sqrt(jnp.max(jax.vmap(jnp.diagonal)(C), axis=0))
-        return value, sd, self._largest(inputs, known, jnp.max)
+        return value, C, self._largest(inputs, known, jnp.max)
 
     def _largest(
         self, inputs: Any, known: Any, largest: Callable[[Array], Array]
@@ -365,24 +432,46 @@ class _Search:
 
         return jnp.stack(list(self._largest(inputs, known, smooth).values()))
 
-    def rate(
-        self, words: str, excitations: tuple[dict[str, np.ndarray], ...], known: Any
-    ) -> Rated:
+    def _augmented(self, x: Array, multipliers: Array, penalty: Array) -> Array:
+        """Return the criterion with an augmented Lagrangian of the limits."""
+        if not self.limits.motion:
+            return self._value(x)
+        excess = self._smooth_ratios(x) - 1.0
+        active = jnp.maximum(multipliers + penalty * excess, 0.0)
+        return self._value(x) + jnp.sum(jnp.square(active) - jnp.square(multipliers)) / (
+            2.0 * penalty
+        )
+
+    def rate(self, words: str, excitations: tuple[dict[str, np.ndarray], ...], known: Any) -> Rated:
         """Return a manoeuvre, made smaller until its motion is within the limits."""
         for _ in range(30):
-            value, sd, ratios = jax.device_get(self.rated(self.inputs(excitations), known))
-            worst = max(ratios.values(), default=0.0)
+            rated = self._as_rated(words, excitations, known)
+            worst = 1.0 - min((rated.margins[n] for n in self.limits.motion), default=1.0)
             if worst <= 1.0:
                 break
             # A diverged motion has no size.
             factor = 0.999999 / worst if np.isfinite(worst) else 0.1
             excitations = tuple({n: factor * u for n, u in own.items()} for own in excitations)
-        if not np.isfinite(value):
-            value, sd = np.inf, np.full(len(sd), np.inf)
+        return rated
+
+    def _as_rated(
+        self, words: str, excitations: tuple[dict[str, np.ndarray], ...], known: Any
+    ) -> Rated:
+        """Return excitations with the accuracy they give, and their margins."""
+        value, C, ratios = jax.device_get(self.rated(self.inputs(excitations), known))
+        if not np.isfinite(C).all():
+            value, C = np.inf, np.full(C.shape, np.inf)
+        sd = np.sqrt(np.max(C.diagonal(axis1=1, axis2=2), axis=0))
         sd = {n: float(v) for n, v in zip(self.experiment.parameters, sd, strict=True)}
         margins = {n: 1.0 - float(v) for n, v in ratios.items()} | self._input_margins(excitations)
         known = tuple({n: float(v) for n, v in own.items()} for own in known)
-        return Rated(words, excitations, known, float(value), sd, margins)
+        return Rated(words, excitations, known, float(value), sd, margins, C)
+
+    def motion(self, rated: Rated) -> tuple[dict[str, np.ndarray], ...]:
+        """Return the outputs and states of the first vehicle."""
+        first = jax.tree.map(lambda v: v[0], self.experiment.vehicles)
+        flown = self.experiment.flown(first, self.inputs(rated.inputs), rated.known)
+        return jax.device_get(flown.motion)
 
     def _input_margins(self, excitations: tuple[dict[str, np.ndarray], ...]) -> dict[str, float]:
         margins = {}
@@ -405,9 +494,7 @@ class _Search:
         dt = max(f.dt for f in self.flights)
         rates = [limit.rate / limit.amplitude for limit in self.limits.inputs.values()]
         for manoeuvre in manoeuvres(len(names), least, dt):
-            each = [
-                manoeuvre.samples(f.n_samples, f.dt, rates) for f in self.flights
-            ]
+            each = [manoeuvre.samples(f.n_samples, f.dt, rates) for f in self.flights]
             by_flight = tuple(
                 {n: self.limits.inputs[n].amplitude * row for n, row in zip(names, u, strict=True)}
                 for u in each
@@ -415,18 +502,11 @@ class _Search:
             found.append(self.rate(manoeuvre.words, by_flight, middle))
         return found
 
-    def own(self) -> Rated:
-        """Return the inputs of the problem's flights, as they are."""
-        inputs = tuple(
-            {n: u - base[n] for n, u in f.inputs.items()}
-            for f, base in zip(self.flights, self.base, strict=True)
-        )
-        known = tuple({n: f.known[n] for n in own} for f, own in zip(
-            self.flights, self.known(np.full(self.size, 0.5)), strict=True))
-        value, sd, ratios = jax.device_get(self.rated(self.inputs(inputs), known))
-        sd = {n: float(v) for n, v in zip(self.experiment.parameters, sd, strict=True)}
-        margins = {n: 1.0 - float(v) for n, v in ratios.items()} | self._input_margins(inputs)
-        return Rated("the flight's own inputs", inputs, known, float(value), sd, margins)
+    def own(self, excitations: Sequence[Mapping[str, np.ndarray]]) -> Rated:
+        """Return the user's excitations, as they are."""
+        given = tuple(dict(own) for own in excitations)
+        known = self.known(np.full(self.size, 0.5))
+        return self._as_rated("your own inputs", given, known)
 
     def optimise(self, start: Rated, max_steps: int) -> tuple[Rated, bool, int]:
         """Return the optimum, whether the search converged, and its steps."""
@@ -438,32 +518,34 @@ class _Search:
                 k = np.minimum(np.arange(at.stop - at.start) * per_node, flight.n_samples - 1)
                 x[at] = own[name][k] / self.limits.inputs[name].amplitude
         bounds = [(-1.0, 1.0)] * self.nodes + [(0.0, 1.0)] * len(self.varied)
-        constraints = []
-        if self.limits.motion:
-            constraints.append(
-                {
-                    "type": "ineq",
-                    "fun": lambda x: 1.0 - np.asarray(self.smooth(x)),
-                    "jac": lambda x: -np.asarray(self.slopes(x)),
-                }
+        multipliers, penalty, steps, before = np.zeros(len(self.limits.motion)), 10.0, 0, np.inf
+        for _ in range(_ROUNDS):
+            found = minimize(
+                lambda x: tuple(
+                    np.asarray(v, float) for v in self.augmented(x, multipliers, penalty)
+                ),
+                x,
+                jac=True,
+                method="L-BFGS-B",
+                bounds=bounds,
+                options={"maxiter": max_steps - steps, "ftol": 1e-7, "gtol": 1e-6},
             )
-        # SLSQP begins with the unit matrix for the Hessian, so the gradient must be of order one.
-        unit = 1.0 / max(float(np.max(np.abs(self.value(x)[1]))), 1e-12)
-        found = minimize(
-            lambda x: tuple(unit * np.asarray(v, float) for v in self.value(x)),
-            x,
-            jac=True,
-            method="SLSQP",
-            bounds=bounds,
-            constraints=constraints,
-            options={"maxiter": max_steps, "ftol": 1e-4 * unit},
-        )
-        best = np.clip(found.x, *np.array(bounds).T)
-        inputs = tuple(
-            {n: np.asarray(u) for n, u in own.items()} for own in self.excitations(best)
-        )
+            x, steps = found.x, steps + int(found.nit)
+            if not multipliers.size:
+                break
+            excess = np.asarray(self.smooth(x)) - 1.0
+            value = float(found.fun)
+            if steps >= max_steps or (
+                np.all(excess < _TOLERANCE) and abs(before - value) < _TOLERANCE
+            ):
+                break
+            multipliers = np.maximum(multipliers + penalty * excess, 0.0)
+            penalty, before = 2.0 * penalty, value
+        converged = steps < max_steps
+        best = np.clip(x, *np.array(bounds).T)
+        inputs = tuple({n: np.asarray(u) for n, u in own.items()} for own in self.excitations(best))
         rated = self.rate("optimised input", inputs, self.known(best))
         # The library's best may be sharper than the nodes allow.
         if not rated.value <= start.value:
             rated = start
-        return rated, bool(found.success), int(found.nit)
+        return rated, converged, steps

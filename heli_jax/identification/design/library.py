@@ -47,9 +47,7 @@ class Manoeuvre(NamedTuple):
             rng = np.random.default_rng(i)
             shape = self.shape._replace(place=(i, number) if together else (0, 1))
             begin = 0 if together else i * length
-            u[i, begin : begin + length] = excitation(
-                self.kind, length, dt, rng, shape, rate=rate
-            )
+            u[i, begin : begin + length] = excitation(self.kind, length, dt, rng, shape, rate=rate)
         return u
 
 

@@ -67,7 +67,7 @@ def plan_next_flight(problem: Problem, at: Solution, e: Evaluation) -> Plan | No
     if not candidates:
         return None
     now = sensitivity_at(problem, layout, e)
-    unknowns, R, times = now.unknowns, triangle(now), flight.n_samples / m
+    unknowns, R = now.unknowns, triangle(now)
     lacking = verdict_of(problem, layout, e).not_identifiable
     absent = np.array([u.name in lacking for u in unknowns])
     before = expected_sd(unknowns, R)
