@@ -11,7 +11,7 @@ from heli_jax import config as configuration
 from heli_jax import generate, naming, run_directory, units
 from heli_jax.analysis.pilot import Pilot
 from heli_jax.config import Experiment
-from heli_jax.config.design_section import FlightDesignConfig
+from heli_jax.config.design_section import DesignedInputConfig, FlightDesignConfig
 from heli_jax.dynamics.model import require_constants, zeros
 from heli_jax.errors import InputError, located, require_known
 from heli_jax.flights.flight import Flight
@@ -156,7 +156,9 @@ def _limits(config: Experiment, settings: FlightDesignConfig, where: str) -> Lim
     for name, limit in settings.inputs.items():
         place = f"{where}.inputs.{name}"
         of = (model.Inputs, name) if limit.set_point is None else (model.State, limit.set_point)
-        factor = _factor(limit.unit, naming.unit(*of), place)
+        si = naming.unit(*of) or "1"
+        _check_autopilot(limit, si, place)
+        factor = _factor(limit.unit, si, place)
         rate = np.inf if limit.rate is None else factor * limit.rate
         inputs[name] = InputLimit(factor * limit.amplitude, rate)
     known = dict.fromkeys(naming.names(model.State), model.State)
@@ -168,6 +170,19 @@ def _limits(config: Experiment, settings: FlightDesignConfig, where: str) -> Lim
         for n, m in settings.motion.items()
     }
     return Limits(inputs, motion)
+
+
+def _check_autopilot(limit: DesignedInputConfig, si: str, where: str) -> None:
+    """Refuse a place of an autopilot that has another unit than the excitation."""
+    kinds = {"input": "rad", "rate": "rad/s", "mixer": "1"}
+    for key, needed in (
+        ("ardupilot", limit.ardupilot and kinds[limit.ardupilot.partition("-")[0]]),
+        ("betaflight", limit.betaflight and "rad/s"),
+    ):
+        if needed and needed != si:
+            raise InputError(
+                f"{where}.{key}: the excitation is in {si}, expected {needed}, as of a set_point"
+            )
 
 
 def _factor(unit: str | None, si: str | None, where: str) -> float:

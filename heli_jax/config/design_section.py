@@ -1,10 +1,11 @@
 """Section `design`: limits and criterion of a designed flight."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
 from heli_jax.config.section import Section
+from heli_jax.identification.design.autopilots import ARDUPILOT
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -22,6 +23,12 @@ class DesignedInputConfig(Section):
     set_point: str | None = None
     """state of `feedback` to whose set point the excitation is added, in the state's unit; default:
     it is added to the input itself"""
+    ardupilot: Literal[tuple(ARDUPILOT)] | None = None  # pyright: ignore[reportInvalidTypeForm]
+    """where ArduPilot adds a chirp: writes its SID_* parameters"""
+    betaflight: Literal["roll", "pitch", "yaw"] | None = None
+    """axis of Betaflight's chirp: writes its commands"""
+    full_stick: Positive | None = None
+    """deflection at full stick, in `unit`: writes a script for transmitters with EdgeTX"""
 
 
 class MotionConfig(Section):
@@ -60,8 +67,8 @@ class FlightDesignConfig(Section):
     """relative sd of parameters that is enough: {a: 0.02}"""
     seed: Annotated[int, Field(ge=0)] = 0
     """seed of the vehicles"""
-    max_steps: Annotated[int, Field(ge=1)] = 400
-    """most steps of the optimiser"""
+    max_steps: Annotated[int, Field(ge=0)] = 400
+    """most steps of the optimiser; 0: only the library is rated"""
 
     @model_validator(mode="after")
     def _moves(self) -> "FlightDesignConfig":

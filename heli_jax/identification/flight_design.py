@@ -21,7 +21,7 @@ from heli_jax import naming
 from heli_jax.errors import nearest
 from heli_jax.identification.design.accuracy import DETERMINES, unstated_gusts
 from heli_jax.identification.design.information import Experiment, Feedback, planned
-from heli_jax.identification.design.library import manoeuvres
+from heli_jax.identification.design.library import Manoeuvre, manoeuvres
 from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.noise_covariance import first_noise, likely_gusts
 from heli_jax.identification.problem import Free, Problem
@@ -78,6 +78,8 @@ class Rated(NamedTuple):
     """1 - largest value over limit, by limit."""
     covariance: Float[np.ndarray, "v p p"]
     """Of the parameters in relative coordinates, for each vehicle."""
+    manoeuvre: Manoeuvre | None = None
+    """Of the library."""
 
     @property
     def undetermined(self) -> tuple[str, ...]:
@@ -160,7 +162,7 @@ def design(
     feedback: Feedback | None = None,
     vehicles: int = 1,
     seed: int = 0,
-    max_steps: int = 100,
+    max_steps: int = 400,
     progress: Callable[[str], None] | None = None,
 ) -> Design:
     """Design the inputs of a problem's flights.
@@ -181,7 +183,7 @@ def design(
         vehicles: vehicles drawn from the priors or bounds of the free parameters; the design is for
             all of them. 1: the start values.
         seed: seed of the draw.
-        max_steps: limit of the optimiser.
+        max_steps: limit of the optimiser; 0: only the library is rated.
 
     Raises:
         ValueError: an unknown name, a limit that is not positive, or a method in frequency.
@@ -205,8 +207,10 @@ def design(
     search = _Search(experiment, limits, criterion, chosen, rest or {})
     report("rating the library of inputs")
     rated = sorted(search.library(), key=lambda r: r.value)
-    report(f"optimising {search.size} values from {rated[0].words}")
-    optimum, converged, steps = search.optimise(rated[0], max_steps)
+    optimum, converged, steps = rated[0], True, 0
+    if max_steps:
+        report(f"optimising {search.size} values from {rated[0].words}")
+        optimum, converged, steps = search.optimise(rated[0], max_steps)
     return Design(
         criterion=criterion,
         duration=sum(f.duration for f in problem.training),
@@ -239,8 +243,8 @@ def _check(
                 )
     if not limits.inputs:
         raise ValueError("limits.inputs: expected an input to excite, got none")
-    sizes = {n: v for n, limit in limits.inputs.items() for v in limit}
-    for name, value in (*sizes.items(), *limits.motion.items()):
+    sizes = [(n, v) for n, limit in limits.inputs.items() for v in limit]
+    for name, value in (*sizes, *limits.motion.items()):
         if not value > 0:
             raise ValueError(f"limits: {name}: expected more than zero, got {value:g}")
     try:
@@ -499,7 +503,8 @@ class _Search:
                 {n: self.limits.inputs[n].amplitude * row for n, row in zip(names, u, strict=True)}
                 for u in each
             )
-            found.append(self.rate(manoeuvre.words, by_flight, middle))
+            rated = self.rate(manoeuvre.words, by_flight, middle)
+            found.append(rated._replace(manoeuvre=manoeuvre))
         return found
 
     def own(self, excitations: Sequence[Mapping[str, np.ndarray]]) -> Rated:
@@ -521,10 +526,9 @@ class _Search:
         multipliers, penalty, steps, before = np.zeros(len(self.limits.motion)), 10.0, 0, np.inf
         for _ in range(_ROUNDS):
             found = minimize(
-                lambda x: tuple(
-                    np.asarray(v, float) for v in self.augmented(x, multipliers, penalty)
-                ),
+                lambda x, *rest: tuple(np.asarray(v, float) for v in self.augmented(x, *rest)),
                 x,
+                args=(multipliers, penalty),
                 jac=True,
                 method="L-BFGS-B",
                 bounds=bounds,

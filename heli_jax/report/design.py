@@ -11,6 +11,11 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.flights.write import write_table
 from heli_jax.identification.design.accuracy import DETERMINES
+from heli_jax.identification.design.autopilots import (
+    ardupilot_parameters,
+    betaflight_commands,
+    transmitter_script,
+)
 from heli_jax.identification.flight_design import CRITERIA, Rated
 from heli_jax.numbers import number
 from heli_jax.report import style
@@ -85,6 +90,9 @@ def write_design(folder: Path, run: "DesignRun", config: str) -> None:
     columns = input_columns(run)
     write_table(folder / "input.csv", columns)
     (folder / "design.json").write_text(as_json(_content(run)) + "\n", encoding="utf-8")
+    played = autopilot_files(run)
+    for name, text in played.items():
+        (folder / name).write_text(text, encoding="utf-8")
     (folder / "figures").mkdir()
     numbers, pictures = Numbers(), []
     for i in range(len(run.problem.training)):
@@ -103,7 +111,7 @@ def write_design(folder: Path, run: "DesignRun", config: str) -> None:
         ],
         pictures=[p for p in pictures if p is not None],
         numbers=numbers.content(),
-        origin=origin(config, _FILES),
+        origin=origin(config, (*_FILES, *played)),
     )
     (folder / "report.html").write_text(page, encoding="utf-8")
 
@@ -142,6 +150,38 @@ def input_columns(run: "DesignRun") -> dict[str, np.ndarray]:
             part[name] = scale * own[name]
         parts.append(part)
     return {n: np.concatenate([p[n] for p in parts]) for n in parts[0]}
+
+
+def autopilot_files(run: "DesignRun") -> dict[str, str]:
+    """Return by name the files of the first run for autopilots and transmitters.
+
+    Autopilots play the best chirp of the library, a transmitter the optimised input.
+    """
+    settings, flight = run.config.config.design, run.problem.training[0]
+    assert settings is not None
+    files: dict[str, str] = {}
+    chirps = [r for r in run.design.library if r.manoeuvre and r.manoeuvre.kind == "chirp"]
+    duration = flight.n_samples * flight.dt / len(settings.inputs)
+    shares = []
+    for name, limit in settings.inputs.items():
+        scale = limit.amplitude / run.limits.inputs[name].amplitude
+        if limit.full_stick is not None:
+            own = run.design.optimum.inputs[0][name]
+            shares.append((name, scale * own / limit.full_stick))
+        if not chirps or chirps[0].manoeuvre is None:
+            continue
+        size, chirp = float(np.max(np.abs(chirps[0].inputs[0][name]))), chirps[0].manoeuvre
+        if limit.ardupilot is not None:
+            # Mixer axes take shares of full output, the others degrees.
+            size_there = size if limit.ardupilot.startswith("mixer") else math.degrees(size)
+            text = ardupilot_parameters(chirp, limit.ardupilot, size_there, duration)
+            files[f"ardupilot-{name}.param"] = text
+        if limit.betaflight is not None:
+            text = betaflight_commands(chirp, limit.betaflight, math.degrees(size), duration)
+            files[f"betaflight-{name}.txt"] = text
+    if shares:
+        files["input.lua"] = transmitter_script(flight.dt, shares)
+    return files
 
 
 def _content(run: "DesignRun") -> dict[str, Any]:
