@@ -194,7 +194,7 @@ def design(
             "method: expected output-error or filter-error without windows, got "
             f"{problem.method}{' with windows' if problem.window else ''}"
         )
-    chosen = differences or [{} for _ in problem.training]
+    chosen = [{} for _ in problem.training] if differences is None else differences
     _check(problem, limits, criterion, chosen)
     layout = layout_of(problem, problem.training)
     data = data_of(problem, problem.training, layout)

@@ -80,7 +80,7 @@ def transmitter_script(dt: float, shares: Sequence[tuple[str, np.ndarray]]) -> s
     returned = ", ".join(f"tables[{i + 1}][k]" for i in range(len(shares)))
     rest = ", ".join("0" for _ in shares)
     newline = ",\n  "
-    return f"""-- EdgeTX: copy to SCRIPTS/MIXES, choose a switch, add the outputs to the sticks' mixes.
+    return f"""-- EdgeTX: copy to SCRIPTS/MIXES, choose a switch, add the outputs to the mixes.
 local tables = {{
   {newline.join(tables)}
 }}
