@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from heli_jax.analysis.lti import c2d as c2d
     from heli_jax.analysis.lti import d2c as d2c
     from heli_jax.analysis.trim import trim as trim
+    from heli_jax.design_workflow import run_design as run_design
     from heli_jax.dynamics.model import Model as Model
     from heli_jax.flights import Flight as Flight
     from heli_jax.flights import Signal as Signal
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from heli_jax.identification.equation_error.rls import rls as rls
     from heli_jax.identification.fit import check as check
     from heli_jax.identification.fit import fit as fit
+    from heli_jax.identification.flight_design import InputLimit as InputLimit
+    from heli_jax.identification.flight_design import Limits as Limits
+    from heli_jax.identification.flight_design import design as design
     from heli_jax.identification.problem import Free as Free
     from heli_jax.identification.problem import Nuisance as Nuisance
     from heli_jax.identification.problem import Prior as Prior
@@ -64,6 +68,8 @@ _HOMES = {
         "sweeps.run": "sweep",
         "identification.problem": "Problem Free Prior Nuisance",
         "identification.fit": "check fit",
+        "identification.flight_design": "InputLimit Limits design",
+        "design_workflow": "run_design",
         "identification.equation_error.rls": "rls",
         "analysis.lti": "c2d d2c",
         "analysis.linear": "linearize",

@@ -104,11 +104,7 @@ def generate(experiment: Experiment) -> Simulated:
     # unchanged.
     rng = np.random.default_rng(settings.seed)
     n = round(settings.duration * settings.rate)
-    drawn = experiment.config.disturbance
-    disturbed(experiment)  # checks names before numbers: an unknown state needs no sigma_w
-    if drawn is not None and None in drawn.parameters.values():
-        needed = " and ".join(drawn.parameters)
-        raise InputError(f"{experiment.path}: disturbance: simulate needs its {needed}")
+    _check_disturbance(experiment)
     # All checks come before the run, which takes longest.
     known, words = (
         naming.names(experiment.model.Outputs),
@@ -179,6 +175,77 @@ def drive(experiment: Experiment) -> Made:
     if settings.hold_attitude:
         pilot = _pilot(flown, _begin(flown, settings, where), where)
     return Made(flown, flight, trimmed, pilot)
+
+
+class Planned(NamedTuple):
+    """A run of `simulate` before it is flown."""
+
+    sticks: dict[str, np.ndarray]
+    """Excitations (N,) of the inputs, SI."""
+    rest: dict[str, float]
+    """Inputs in trim, SI."""
+    sd: dict[str, float]
+    """Measurement noise of each measured output, SI, as `noise` or the first flight states it."""
+    start: Record | None
+    """State in trim; None for the model's own."""
+    pilot: Pilot | None
+
+
+def plan(experiment: Experiment) -> Planned:
+    """Return the run of `simulate` with the outputs that will be measured.
+
+    Raises:
+        InputError: as for `generate`; there is no `simulate`; an output has no stated noise; or
+            wind or a ground is given.
+    """
+    settings, where = experiment.config.simulate, f"{experiment.path}: simulate"
+    if settings is None:
+        raise InputError(f"{where}: missing, expected duration and rate of the designed run")
+    if settings.wind is not None or settings.ground is not None:
+        raise InputError(f"{where}: a design takes neither wind nor ground, expected none")
+    _check_disturbance(experiment)
+    n, rng = round(settings.duration * settings.rate), np.random.default_rng(settings.seed)
+    sticks = _stick_inputs(experiment, settings, n, rng, where)
+    _check_full_nonlinear(experiment, settings, where)
+    sd = _stated_noise(experiment, settings, where)
+    if not is_full_nonlinear(experiment.model):
+        return Planned(sticks, dict.fromkeys(sticks, 0.0), sd, None, None)
+    begin = _begin(experiment, settings, where)
+    rest = {k: float(v) for k, v in naming.asdict(begin.inputs).items()}
+    pilot = _pilot(experiment, begin, where) if settings.hold_attitude else None
+    return Planned(sticks, rest, sd, begin.state, pilot)
+
+
+def _check_disturbance(experiment: Experiment) -> None:
+    drawn = experiment.config.disturbance
+    disturbed(experiment)  # checks names before numbers: an unknown state needs no sigma_w
+    if drawn is not None and None in drawn.parameters.values():
+        needed = " and ".join(drawn.parameters)
+        raise InputError(f"{experiment.path}: disturbance: simulate needs its {needed}")
+
+
+def _stated_noise(experiment: Experiment, settings: SimulateConfig, where: str) -> dict[str, float]:
+    """Return the sd of each measured output [SI]: those of the first flight, else of `noise`."""
+    record, flights = experiment.model.Outputs, experiment.config.flights
+    known, words = naming.names(record), f"model {experiment.model.name} has no output"
+    require_known(settings.noise, known, f"{where}.noise", words)
+    stated: dict[str, Any] = dict.fromkeys(settings.noise)
+    if flights:
+        stated = {
+            n: None if o.sd is None else o for n, o in first_signals(experiment).outputs.items()
+        }
+    found = {}
+    for name, signal in stated.items():
+        noise = settings.noise.get(name, signal)
+        if noise is None:
+            raise InputError(
+                f"{where}.noise.{name}: missing, expected the sd of the output's noise"
+            )
+        si = naming.unit(record, name) or "1"
+        found[name] = noise.sd * _factor_to_si(noise.unit or si, si, f"{where}.noise.{name}.unit")
+    if not found:
+        raise InputError(f"{where}.noise: missing, expected the outputs that are measured")
+    return found
 
 
 def _run(

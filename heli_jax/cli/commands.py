@@ -113,6 +113,11 @@ _COMMANDS = {
         _arg("--length", type=_seconds, metavar="S",
              help="length of a window [s] (default: a twelfth)"),
     )),
+    "design": ("inputs that determine the parameters best, before any flight", (
+        *_CONFIG, _OUT, _VERBOSE,
+        _arg("--for", dest="wanted", action="append", default=[], metavar="NAME=PERCENT",
+             help="sd of a parameter that is enough: a=2%% (default: design.wanted)"),
+    )),
     "frf": ("frequency responses of a log, with coherence and intervals", (
         _OTHER_LOG, *_CONFIG, _OUT,
     )),
@@ -454,6 +459,23 @@ def _windows(options: argparse.Namespace) -> int:
     if windows.cannot_be_fitted(ranking) or windows.not_determined(ranking):
         return NOT_DETERMINED
     return DONE
+
+
+def _design(options: argparse.Namespace) -> int:
+    out = _new_directory(options)
+    from heli_jax.cli import designs
+
+    wanted = designs.wanted_sds(options.wanted)
+    _prepare_jax()
+    from heli_jax import workflow
+    from heli_jax.design_workflow import run_design
+
+    experiment = workflow.load_config(options.config, options.set)
+    run = run_design(experiment, out, wanted=wanted or None, progress=options.say)
+    designs.print_design(run, verbose=options.verbose)
+    if run.design.optimum.undetermined:
+        return NOT_DETERMINED
+    return DONE if run.design.converged else NOT_CONVERGED
 
 
 def _compatibility(options: argparse.Namespace) -> int:

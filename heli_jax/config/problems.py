@@ -31,8 +31,11 @@ if TYPE_CHECKING:
     from heli_jax.identification.select import Alternatives
 
 
-def problem(experiment: Experiment) -> Problem:
+def problem(experiment: Experiment, planned: Sequence[Flight] = ()) -> Problem:
     """Return the problem of a configuration's `fit`, with its logs read.
+
+    Args:
+        planned: flights in place of the logs, for a design.
 
     Raises:
         InputError: no fit or no flight, a log that cannot be read, or parts that do not match.
@@ -45,9 +48,9 @@ def problem(experiment: Experiment) -> Problem:
     # Before the logs are read, which may take minutes.
     _check_intervals(config.fit, path)
     nuisance = _nuisance(config.fit)
-    flights = read_flights(experiment, gain=nuisance.input_gain)
+    flights = planned or read_flights(experiment, gain=nuisance.input_gain)
     for flight in flights:
-        if not flight.hold_out:  # a hold-out flight is simulated, not fitted
+        if not (flight.hold_out or planned):  # a hold-out flight is simulated, not fitted
             require_some_time(flight)
             require_moving_outputs(flight)
     # By name: a field that only Free or only the configuration has is an error here.

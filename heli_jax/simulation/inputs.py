@@ -123,11 +123,7 @@ def prbs(n: int, dt: float, rng: np.random.Generator, step: float) -> Samples:
 
 
 def multisine(
-    n: int,
-    dt: float,
-    rng: np.random.Generator,
-    band: tuple[float, float],
-    place: tuple[int, int] = (0, 1),
+    n: int, dt: float, band: tuple[float, float], place: tuple[int, int] = (0, 1)
 ) -> Samples:
     """Return sines of equal amplitude at harmonics of the record, with a low crest factor.
 
@@ -152,18 +148,17 @@ def multisine(
             f"{n * dt:g} s, expected a wider band or a longer record"
         )
     spectrum = np.zeros(n // 2 + 1, complex)
-    spectrum[lines] = np.exp(1j * least_crest(lines, rng))
+    spectrum[lines] = np.exp(1j * least_crest(lines))
     u = np.fft.irfft(spectrum, n)
     return u / np.max(np.abs(u))
 
 
-_POWERS = (4, 8, 16, 32, 64, 128, 256)
-_TRIES, _STEPS = 3, 50
+_POWERS, _STEPS = (4, 16, 64, 256), 40
 _FINE = 16
 """Points in a period of the highest line."""
 
 
-def least_crest(lines: np.ndarray, rng: np.random.Generator) -> Float[np.ndarray, " k"]:
+def least_crest(lines: np.ndarray) -> Float[np.ndarray, " k"]:
     """Return phases (k,) [rad] of sines of equal amplitude with a low crest factor.
 
     The norms of growing power approach the largest value. Each begins where the last one ended
@@ -176,34 +171,24 @@ def least_crest(lines: np.ndarray, rng: np.random.Generator) -> Float[np.ndarray
 
     size = _FINE * int(lines[-1])
 
-    def wave(phases: np.ndarray) -> np.ndarray:
+    def norm(phases: np.ndarray, power: int) -> tuple[float, np.ndarray]:
+        """Return the norm of the wave and its derivatives by the phases."""
         spectrum = np.zeros(size // 2 + 1, complex)
         spectrum[lines] = 0.5 * size * np.exp(1j * phases)
-        return np.fft.irfft(spectrum, size)
-
-    def norm(phases: np.ndarray, power: int) -> tuple[float, np.ndarray]:
-        """Return the norm of a wave and its derivatives by the phases."""
-        u = wave(phases)
+        u = np.fft.irfft(spectrum, size)
         top = np.max(np.abs(u))
         mean = np.mean((u / top) ** power)
         by_wave = np.fft.rfft((u / top) ** (power - 1))[lines] / size
         slopes = -np.imag(np.exp(1j * phases) * np.conj(by_wave))
         return top * mean ** (1.0 / power), mean ** (1.0 / power - 1.0) * slopes
 
+    # Schroeder's phases are good for lines beside each other.
     k = np.arange(lines.size)
-    best, least = np.zeros(lines.size), np.inf
-    for attempt in range(_TRIES):
-        # First Schroeder's phases, which are good for lines beside each other.
-        phases = rng.uniform(0.0, 2.0 * np.pi, k.size) if attempt else -np.pi * k**2 / k.size
-        for power in _POWERS:
-            steps = {"maxiter": _STEPS}
-            found = minimize(
-                norm, phases, args=(power,), method="L-BFGS-B", jac=True, options=steps
-            )
-            phases = found.x
-        if (top := float(np.max(np.abs(wave(phases))))) < least:
-            best, least = phases, top
-    return best
+    phases, steps = -np.pi * k**2 / k.size, {"maxiter": _STEPS}
+    for power in _POWERS:
+        found = minimize(norm, phases, args=(power,), method="L-BFGS-B", jac=True, options=steps)
+        phases = found.x
+    return phases
 
 
 class Kind(NamedTuple):
@@ -222,7 +207,7 @@ KINDS = (
     Kind("3-2-1-1", lambda n, dt, rng, s: multistep(n, dt, rng, s.step, s.pause), smooth=False),
     Kind("prbs", lambda n, dt, rng, s: prbs(n, dt, rng, s.step), smooth=False),
     Kind("chirp", lambda n, dt, rng, s: chirp(n, dt, s.band[0], s.band[1], s.fade), smooth=True),
-    Kind("multisine", lambda n, dt, rng, s: multisine(n, dt, rng, s.band, s.place), smooth=True),
+    Kind("multisine", lambda n, dt, rng, s: multisine(n, dt, s.band, s.place), smooth=True),
     Kind("neutral", lambda n, dt, rng, s: np.zeros(n), smooth=False),
 )
 """All excitations. To add one: a function and its entry."""

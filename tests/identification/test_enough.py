@@ -12,7 +12,7 @@ from heli_jax.analysis.flight_responses import Settings, flight_responses
 from heli_jax.dynamics.onboard.filters import Filter
 from heli_jax.flights import Signal, read_flight
 from heli_jax.flights.signal_facts import quantum, signal_facts
-from heli_jax.identification.design.accuracy import plan_next_flight
+from heli_jax.identification.design.next_flight import plan_next_flight
 from heli_jax.identification.diagnostics.record import of_rates
 from heli_jax.identification.fit import check, fit
 from heli_jax.identification.validation.logging_rate import input_rate
@@ -246,7 +246,7 @@ def test_what_to_fly_next_does_what_is_promised():
     now = expected(check(slow).verdict)
     assert plan.before == pytest.approx(now.max(), rel=1e-6)
     assert plan.again == pytest.approx(plan.before / 2**0.5, rel=1e-3)
-    u = plan.best.values
+    u = plan.excitation
     phi, _ = response(u, np.zeros(u.size))
     flown = replace(slow.training[0], inputs={"u": u, "v": np.zeros(u.size)}, outputs={"phi": phi})
     after = expected(check(problem(slow.training[0], flown)).verdict)

@@ -13,7 +13,8 @@ from heli_jax.finding import Finding, Severity, found
 from heli_jax.flights.flight import labels
 from heli_jax.flights.marks import written_again
 from heli_jax.flights.signal_facts import DROP_SHARE, RAIL_SHARE, STUCK_SECONDS
-from heli_jax.identification.design.accuracy import plan_next_flight, unstated_gusts
+from heli_jax.identification.design.accuracy import unstated_gusts
+from heli_jax.identification.design.next_flight import plan_next_flight
 from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.diagnostics.outliers import outliers
 from heli_jax.identification.problem import Problem
@@ -295,7 +296,7 @@ def next_flight(c: Context) -> Iterator[Finding]:
     plan = None if c.fitted else plan_next_flight(c.problem, c.at, c.e)
     if plan is None or not plan.after < BETTER * plan.again:
         return
-    unit = naming.unit(c.problem.model.Inputs, plan.best.input) or ""
+    unit = naming.unit(c.problem.model.Inputs, plan.input) or ""
     determined = bool(np.isfinite(plan.before))
     yield found(
         "excitation.next-flight",
@@ -305,9 +306,9 @@ def next_flight(c: Context) -> Iterator[Finding]:
         before=f"{100.0 * plan.before:.2g} %" if determined else "",
         again=f"{100.0 * plan.again:.2g} %",
         after=100.0 * plan.after,
-        manoeuvre=plan.best.words,
-        input=plan.best.input,
-        amplitude=plan.amplitude,
+        manoeuvre=plan.manoeuvre,
+        input=plan.input,
+        amplitude=float(np.max(np.abs(plan.excitation))),
         unit="" if unit == "1" else f" {unit}",
         seconds=plan.duration,
         left_out=", ".join(plan.left_out),

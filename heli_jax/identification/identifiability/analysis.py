@@ -46,10 +46,16 @@ NO_EFFECT = 1e-6
 """norm of a nuisance's column [sds of the noise] below which it is left out"""
 
 
-def unknowns_of(problem: Problem, layout: Layout, e: Evaluation) -> tuple[Unknown, ...]:
-    """Return the parameters of interest with their size and prior in relative coordinates."""
+def unknowns_of(
+    problem: Problem, layout: Layout, values: Float[np.ndarray, " q"]
+) -> tuple[Unknown, ...]:
+    """Return the parameters of interest with their size and prior in relative coordinates.
+
+    Args:
+        values: their values, SI.
+    """
     unknowns = []
-    for name, value in zip(layout.of_interest, map(float, e.named), strict=True):
+    for name, value in zip(layout.of_interest, map(float, values), strict=True):
         if name in problem.free:
             u = _parameter(problem, name, value)
         elif name == "time_shift":
@@ -104,15 +110,26 @@ class Sensitivity(NamedTuple):
 
 def sensitivity_at(problem: Problem, layout: Layout, e: Evaluation) -> Sensitivity:
     """Return the rows of the data of an evaluation."""
-    unknowns, q = unknowns_of(problem, layout, e), len(layout.of_interest)
+    unknowns, q = unknowns_of(problem, layout, e.named), len(layout.of_interest)
     J, first = np.array(e.J, dtype=np.float64), layout.first_nuisance
     slopes = np.asarray(e.slopes, dtype=np.float64)
-    relative = np.array([u.reference * u.sign for u in unknowns])
-    J[:, :q] *= np.divide(relative, slopes, out=np.zeros_like(slopes), where=slopes != 0)
+    J[:, :q] *= relative_slopes(unknowns, slopes)
     # The last rows are the nuisances' weak priors, before them the parameters' priors; defects
     # between windows count as data.
     data = J[: J.shape[0] - (layout.size - first) - len(layout.free)]
     return Sensitivity(unknowns, data[:, :first], data[:, first:])
+
+
+def relative_slopes(
+    unknowns: tuple[Unknown, ...], slopes: Float[np.ndarray, " q"]
+) -> Float[np.ndarray, " q"]:
+    """Return the derivatives of the coordinates in z by the relative ones.
+
+    Args:
+        slopes: derivatives of the values by the coordinates in z.
+    """
+    relative = np.array([u.reference * u.sign for u in unknowns])
+    return np.divide(relative, slopes, out=np.zeros_like(slopes), where=slopes != 0)
 
 
 def projected(J: np.ndarray, nuisances: np.ndarray) -> np.ndarray:

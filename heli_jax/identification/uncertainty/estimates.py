@@ -210,7 +210,7 @@ def estimates_of(
     e = errors.by or e
     alone = _insensitivity(e)
     estimates = {}
-    for i, u in enumerate(unknowns_of(problem, at.layout, e)):
+    for i, u in enumerate(unknowns_of(problem, at.layout, e.named)):
         white = float(np.sqrt(errors.verdict.covariance[i, i]))
         relative = white * float(errors.wider[i])
         ends = errors.limits.get(u.name) or _interval95(u, relative, float(errors.quantiles[i]))

@@ -1,0 +1,104 @@
+"""Excitations as autopilots and transmitters play them.
+
+ArduPilot plays chirps in its mode SYSTEMID (parameters SID_*), Betaflight from 4.6 on in its mode
+CHIRP. Neither plays another signal, and PX4 and Rotorflight play none. A transmitter with EdgeTX
+plays any signal by a script in its mixer.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from heli_jax.identification.design.library import Manoeuvre
+
+_PLACES = {"input": 1, "rate": 7, "mixer": 10}
+ARDUPILOT = {
+    f"{place}-{axis}": first + i
+    for place, first in _PLACES.items()
+    for i, axis in enumerate(("roll", "pitch", "yaw"))
+} | {"mixer-thrust": 13}
+"""SID_AXIS by the place where the chirp is added."""
+_LEAST_DEADTIME = 0.02
+"""Time between two steps of a mixer script [s]."""
+_FULL = 1024
+"""Full deflection of EdgeTX."""
+
+
+def ardupilot_parameters(manoeuvre: Manoeuvre, axis: str, magnitude: float, duration: float) -> str:
+    """Return a parameter file for a chirp of ArduPilot's mode SYSTEMID.
+
+    Args:
+        axis: key of `ARDUPILOT`.
+        magnitude: deflection: degrees for input, degrees a second for rate, 0 to 1 for mixer axes.
+        duration: duration of the chirp [s].
+    """
+    low, high = manoeuvre.shape.band
+    fade = max(manoeuvre.shape.fade, 0.05 * duration)
+    lines = {
+        "SID_AXIS": ARDUPILOT[axis],
+        "SID_MAGNITUDE": f"{magnitude:.4g}",
+        "SID_F_START_HZ": f"{low:.4g}",
+        "SID_F_STOP_HZ": f"{high:.4g}",
+        "SID_T_FADE_IN": f"{fade:.4g}",
+        "SID_T_REC": f"{duration:.4g}",
+        "SID_T_FADE_OUT": f"{fade:.4g}",
+    }
+    return "".join(f"{name},{value}\n" for name, value in lines.items())
+
+
+def betaflight_commands(manoeuvre: Manoeuvre, axis: str, amplitude: float, duration: float) -> str:
+    """Return commands of Betaflight's command line for its mode CHIRP.
+
+    Args:
+        axis: roll, pitch or yaw.
+        amplitude: largest set point [deg/s].
+        duration: duration of the chirp [s].
+    """
+    low, high = manoeuvre.shape.band
+    lines = {
+        f"chirp_amplitude_{axis}": f"{amplitude:.0f}",
+        "chirp_frequency_start_deci_hz": f"{max(1.0, 10.0 * low):.0f}",
+        "chirp_frequency_end_deci_hz": f"{10.0 * high:.0f}",
+        "chirp_time_seconds": f"{duration:.0f}",
+    }
+    return "".join(f"set {name} = {value}\n" for name, value in lines.items()) + "save\n"
+
+
+def transmitter_script(dt: float, shares: Sequence[tuple[str, np.ndarray]]) -> str:
+    """Return a mixer script for EdgeTX that plays excitations while its switch is on.
+
+    Args:
+        dt: sample time [s].
+        shares: name and samples (N,) of each output, as shares of full deflection.
+    """
+    every = max(1, round(_LEAST_DEADTIME / dt))
+    tables = []
+    for _, share in shares:
+        steps = np.round(_FULL * np.clip(share[::every], -1.0, 1.0)).astype(int)
+        tables.append("{" + ",".join(map(str, steps)) + "}")
+    outputs = ", ".join(f'"{name[:4]}"' for name, _ in shares)
+    returned = ", ".join(f"tables[{i + 1}][k]" for i in range(len(shares)))
+    rest = ", ".join("0" for _ in shares)
+    newline = ",\n  "
+    return f"""-- EdgeTX: copy to SCRIPTS/MIXES, choose a switch, add the outputs to the mixes.
+local tables = {{
+  {newline.join(tables)}
+}}
+local step = {100.0 * dt * every:g} -- hundredths of a second
+local begin = nil
+
+local function run(switch)
+  if switch < 512 then
+    begin = nil
+    return {rest}
+  end
+  begin = begin or getTime()
+  local k = math.floor((getTime() - begin) / step) + 1
+  if k > #tables[1] then
+    return {rest}
+  end
+  return {returned}
+end
+
+return {{ input = {{ {{ "Switch", SOURCE }} }}, output = {{ {outputs} }}, run = run }}
+"""

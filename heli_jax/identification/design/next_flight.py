@@ -1,0 +1,136 @@
+"""The best manoeuvre of the library to add to a record (Mehra, 1974)."""
+
+import math
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heli_jax.identification.design.accuracy import (
+    DETERMINES,
+    expected_sd,
+    together,
+    triangle,
+)
+from heli_jax.identification.design.information import planned
+from heli_jax.identification.design.library import QUICK, manoeuvres
+from heli_jax.identification.estimation.evaluation import Evaluation
+from heli_jax.identification.identifiability.analysis import sensitivity_at, verdict_of
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.layout import Solution, flight_places, layout_of
+
+_LONGEST = 20.0
+"""Longest candidate [s]; it is repeated for a longer record."""
+
+
+class Plan(NamedTuple):
+    """The effect of the best manoeuvre on the parameter with the widest interval."""
+
+    parameter: str
+    before: float
+    """Its expected relative sd; infinite if it is not determined."""
+    again: float
+    """With the same record once more."""
+    after: float
+    """With the best manoeuvre, as long as the record."""
+    input: str
+    manoeuvre: str
+    """In words, such as `3-2-1-1 steps of 0.5 s`."""
+    excitation: np.ndarray
+    """(m,), added to the input, SI."""
+    duration: float
+    """Of the record [s]."""
+    left_out: tuple[str, ...]
+    """Inputs that do not move in the record."""
+
+
+def plan_next_flight(problem: Problem, at: Solution, e: Evaluation) -> Plan | None:
+    """Compare manoeuvres of one input, as large as it moves in the record; None without any."""
+    layout = at.layout
+    # A filter of a nonlinear model would be compiled for every candidate. Rows at frequencies weigh
+    # all flights together.
+    comparable = layout.noise_model == "white" or layout.model.linear
+    if not comparable or layout.noise_model == "spectrum" or not np.isfinite(e.J).all():
+        return None
+    flight = max(problem.training, key=lambda f: f.n_samples)
+    i = problem.training.index(flight)
+    # With multiple shooting a candidate is one window.
+    m = min(at.layout.windows[i][1], max(round(_LONGEST / flight.dt), 3 * len(problem.free)))
+    moving = [n for n, u in flight.inputs.items() if np.ptp(u) > 0]
+    candidates = [
+        (n, c.words, 0.5 * float(np.ptp(flight.inputs[n])) * c.samples(m, flight.dt)[0])
+        for n in moving
+        for c in manoeuvres(1, m * flight.dt, flight.dt, QUICK)
+    ]
+    if not candidates:
+        return None
+    now = sensitivity_at(problem, layout, e)
+    unknowns, R = now.unknowns, triangle(now)
+    lacking = verdict_of(problem, layout, e).not_identifiable
+    absent = np.array([u.name in lacking for u in unknowns])
+    before = expected_sd(unknowns, R)
+    widest = int(np.argmax(np.where(absent, before, 0.0) if lacking else before))
+    flights = layout.objective.tags(layout, at.data, len(now.shared)).flight
+    again = expected_sd(unknowns, together(R, triangle(now.part(flights == i))))
+    sds = _sds_after(problem, at, i, R, [(n, u) for n, _, u in candidates], m)
+    lost = np.any(sds[:, absent] >= DETERMINES, axis=1)
+    after = np.where(lost, np.inf, sds[:, widest])
+    best = int(np.argmin(after))
+    name, words, u = candidates[best]
+    return Plan(
+        unknowns[widest].name,
+        np.inf if lacking else float(before[widest]),
+        np.inf if lacking else float(again[widest]),
+        float(after[best]),
+        name,
+        words,
+        u,
+        flight.n_samples * flight.dt,
+        tuple(n for n in flight.inputs if n not in moving),
+    )
+
+
+def _sds_after(
+    problem: Problem,
+    at: Solution,
+    i: int,
+    R: np.ndarray,
+    candidates: list[tuple[str, np.ndarray]],
+    m: int,
+) -> np.ndarray:
+    """Return the sds (candidates, p) with a flight of m samples that begins as the i-th one does.
+
+    Args:
+        R: factor of the information of the record.
+        candidates: input and excitation (m,).
+    """
+    flight, model = problem.training[i], problem.model
+    signals = (dict.fromkeys(s, np.zeros(m)) for s in (flight.inputs, flight.outputs))
+    names = ("inputs", "outputs", "instruments", "hold", "hold_reason")
+    alone = replace(flight, **dict(zip(names, (*signals, {}, {}, {}), strict=True)))
+    layout = replace(layout_of(problem, (alone,)), windows=((1, m),), continuity=None)
+    # A linear model begins at rest with neutral sticks, a nonlinear one as the record does.
+    whole, dtype = np.asarray(at.z), at.z.dtype
+    moves, places = 0.0 if model.linear else 1.0, flight_places(at.layout)[i]
+    shared, begin = whole[: at.layout.first_nuisance], moves * whole[places.states[0]]
+    z = np.concatenate([shared, begin, np.zeros(places.constants.size)])
+    rest = {k: np.full(m, moves * float(u[0]), dtype) for k, u in flight.inputs.items()}
+    part = at.data.flights[i]._replace(
+        inputs=model.Inputs(**rest), outputs=dict.fromkeys(layout.outputs[0], np.zeros(m, dtype))
+    )
+    data, noise = at.data._replace(flights=(part,)), at.noise._replace(sd=(at.noise.sd[i],))
+    experiment = planned(problem, layout, data, noise, z[None], flown=R)
+    # The candidate is repeated until it is as long as the record; priors and record count once.
+    times, vehicles = math.sqrt(flight.n_samples / m), experiment.vehicles
+    experiment = experiment._replace(vehicles=vehicles._replace(rows=vehicles.rows / times))
+
+    @jax.jit
+    def sds(inputs: Any) -> Any:
+        return jnp.sqrt(jnp.diagonal(experiment.covariances((inputs,), ({},))[0]))
+
+    each = [
+        sds(model.Inputs(**{**rest, name: rest[name] + u.astype(dtype)})) for name, u in candidates
+    ]
+    return np.array(each) / times

@@ -1,0 +1,255 @@
+"""Files and page of a designed flight."""
+
+import functools
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from heli_jax import naming
+from heli_jax.flights.write import write_table
+from heli_jax.identification.design.accuracy import DETERMINES
+from heli_jax.identification.design.autopilots import (
+    ardupilot_parameters,
+    betaflight_commands,
+    transmitter_script,
+)
+from heli_jax.identification.flight_design import CRITERIA, Rated
+from heli_jax.numbers import number
+from heli_jax.report import style
+from heli_jax.report.charts import Chart, Numbers, Series, panel, samples, time_limits
+from heli_jax.report.files import as_json
+from heli_jax.report.origin import origin
+from heli_jax.report.page import filled, picture
+from heli_jax.report.style import label
+from heli_jax.report.tables import Table
+
+if TYPE_CHECKING:
+    from heli_jax.design_workflow import DesignRun
+
+_FILES = ("design.json", "input.csv")
+_ROWS = 12
+"""Manoeuvres of the library in a table."""
+
+
+def verdict(rated: Rated) -> str:
+    """Return in words which parameters a manoeuvre determines."""
+    lost = rated.undetermined
+    return f"not determined: {', '.join(lost)}" if lost else "all determined"
+
+
+def manoeuvres_table(run: "DesignRun", most: int = _ROWS) -> Table:
+    """Return the optimum, the user's inputs and the best of the library, a row each."""
+    design = run.design
+    names = list(dict.fromkeys([*products(run), *design.optimum.sd]))
+    rows = []
+    for rated in (design.optimum, *([design.own] if design.own else []), *design.library[:most]):
+        tight = min(rated.margins, key=lambda n: rated.margins[n])
+        sds = [design.sd_of(rated, n) for n in names]
+        cells = [_percent(sd) if sd < DETERMINES else "not determined" for sd in sds]
+        if run.wanted:
+            needed = design.needed(rated, run.wanted)
+            cells.append(f"{needed:.3g} s" if math.isfinite(needed) else "never")
+        margin = (
+            max(rated.margins[tight], 0.0)
+            if abs(rated.margins[tight]) < 1e-5
+            else rated.margins[tight]
+        )
+        rows.append((rated.words, *cells, f"{_percent(margin)} ({tight})"))
+    head = ("input", *(f"sd {n}" for n in names), *(("enough after",) if run.wanted else ()))
+    return Table((*head, "least margin"), rows)
+
+
+def products(run: "DesignRun") -> list[str]:
+    """Return the criterion and the wanted products, if they are products."""
+    asked = [] if run.design.criterion in CRITERIA else [run.design.criterion]
+    return [*asked, *run.wanted]
+
+
+def _percent(share: float) -> str:
+    return f"{number(100.0 * share, 2)} %"
+
+
+def summary(run: "DesignRun") -> str:
+    """Return what the design gains, in a sentence."""
+    design = run.design
+    best, optimum = design.library[0], design.optimum
+    gain = 1.0 - math.exp(optimum.value - best.value)
+    words = {"D": "the mean sd (criterion D)", "A": "the rms sd (criterion A)"}
+    words |= {"E": "the largest sd (criterion E)"}
+    what = words.get(design.criterion, f"the sd of {design.criterion}")
+    if optimum.words == best.words:
+        return f"No input was found that is better than {best.words}."
+    return f"The optimised input lowers {what} by {_percent(gain)} against {best.words}."
+
+
+def write_design(folder: Path, run: "DesignRun", config: str) -> None:
+    """Write design.json, input.csv, report.html and figures/ of a design."""
+    columns = input_columns(run)
+    write_table(folder / "input.csv", columns)
+    (folder / "design.json").write_text(as_json(_content(run)) + "\n", encoding="utf-8")
+    played = autopilot_files(run)
+    for name, text in played.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    (folder / "figures").mkdir()
+    numbers, pictures = Numbers(), []
+    for i in range(len(run.problem.training)):
+        draw = functools.partial(_draw, run, i)
+        name = f"run-{i + 1}" if len(run.problem.training) > 1 else "run"
+        pictures.append(picture(name, draw, numbers, folder=folder / "figures"))
+    page = filled(
+        "design.html.j2",
+        title=run.config.path.stem,
+        summary=summary(run),
+        doubts=doubts(run),
+        table_of=manoeuvres_table(run),
+        known=[
+            ", ".join(f"{n} = {number(v)}" for n, v in own.items())
+            for own in run.design.optimum.known
+        ],
+        pictures=[p for p in pictures if p is not None],
+        numbers=numbers.content(),
+        origin=origin(config, (*_FILES, *played)),
+    )
+    (folder / "report.html").write_text(page, encoding="utf-8")
+
+
+def doubts(run: "DesignRun") -> list[str]:
+    """Return what limits the trust in a design."""
+    design, found = run.design, []
+    if not design.converged:
+        found.append(
+            f"The optimiser stopped after {design.steps} steps before it converged: a larger "
+            "design.max_steps may give a better input."
+        )
+    if lost := design.optimum.undetermined:
+        found.append(
+            f"The optimised input does not determine {', '.join(lost)}: a prior, another output or "
+            "a second run with a known difference is needed."
+        )
+    if design.own and (over := [n for n, m in design.own.margins.items() if m < -1e-9]):
+        found.append(f"Your own inputs exceed the limits of {', '.join(over)}.")
+    return found
+
+
+def input_columns(run: "DesignRun") -> dict[str, np.ndarray]:
+    """Return time and excitations in the units of `design.inputs`, one run after another."""
+    settings = run.config.config.design
+    assert settings is not None
+    parts: list[dict[str, Any]] = []
+    for i, (flight, own) in enumerate(
+        zip(run.problem.training, run.design.optimum.inputs, strict=True)
+    ):
+        part = {"time": np.arange(flight.n_samples) * flight.dt}
+        if len(run.problem.training) > 1:
+            part = {"run": np.full(flight.n_samples, i + 1)} | part
+        for name, limit in run.limits.inputs.items():
+            scale = settings.inputs[name].amplitude / limit.amplitude
+            part[name] = scale * own[name]
+        parts.append(part)
+    return {n: np.concatenate([p[n] for p in parts]) for n in parts[0]}
+
+
+def autopilot_files(run: "DesignRun") -> dict[str, str]:
+    """Return by name the files of the first run for autopilots and transmitters.
+
+    Autopilots play the best chirp of the library, a transmitter the optimised input.
+    """
+    settings, flight = run.config.config.design, run.problem.training[0]
+    assert settings is not None
+    files: dict[str, str] = {}
+    chirps = [r for r in run.design.library if r.manoeuvre and r.manoeuvre.kind == "chirp"]
+    duration = flight.n_samples * flight.dt / len(settings.inputs)
+    shares = []
+    for name, limit in settings.inputs.items():
+        scale = limit.amplitude / run.limits.inputs[name].amplitude
+        if limit.full_stick is not None:
+            own = run.design.optimum.inputs[0][name]
+            shares.append((name, scale * own / limit.full_stick))
+        if not chirps or chirps[0].manoeuvre is None:
+            continue
+        size, chirp = float(np.max(np.abs(chirps[0].inputs[0][name]))), chirps[0].manoeuvre
+        if limit.ardupilot is not None:
+            # Mixer axes take shares of full output, the others degrees.
+            size_there = size if limit.ardupilot.startswith("mixer") else math.degrees(size)
+            text = ardupilot_parameters(chirp, limit.ardupilot, size_there, duration)
+            files[f"ardupilot-{name}.param"] = text
+        if limit.betaflight is not None:
+            text = betaflight_commands(chirp, limit.betaflight, math.degrees(size), duration)
+            files[f"betaflight-{name}.txt"] = text
+    if shares:
+        files["input.lua"] = transmitter_script(flight.dt, shares)
+    return files
+
+
+def _content(run: "DesignRun") -> dict[str, Any]:
+    design = run.design
+
+    def of(rated: Rated) -> dict[str, Any]:
+        content = {
+            "input": rated.words,
+            "criterion": _finite(rated.value),
+            "sd": {n: _finite(v) for n, v in rated.sd.items()},
+            "undetermined": list(rated.undetermined),
+            "margins": {n: _finite(v) for n, v in rated.margins.items()},
+            "known": [dict(own) for own in rated.known],
+        }
+        if run.wanted:
+            content["seconds_needed"] = _finite(design.needed(rated, run.wanted))
+        return content
+
+    return {
+        "criterion": design.criterion,
+        "duration": design.duration,
+        "wanted": dict(run.wanted),
+        "converged": design.converged,
+        "steps": design.steps,
+        "optimum": of(design.optimum),
+        "own": None if design.own is None else of(design.own),
+        "library": [of(rated) for rated in design.library],
+    }
+
+
+def _finite(value: float) -> float | None:
+    """Return a number, or None for infinity, which JSON lacks."""
+    return value if math.isfinite(value) else None
+
+
+def _draw(run: "DesignRun", i: int) -> Chart:
+    """Draw the excitations and the limited motion of a run."""
+    flight, model = run.problem.training[i], run.problem.model
+    t, motion = np.arange(flight.n_samples) * flight.dt, run.design.motion[i]
+    settings = run.config.config.design
+    assert settings is not None
+    panels = []
+    for name, limit in run.limits.inputs.items():
+        own, point = run.design.optimum.inputs[i][name], settings.inputs[name].set_point
+        unit = naming.unit(model.Inputs, name) if point is None else naming.unit(model.State, point)
+        panels.append(
+            panel(
+                label(name, unit),
+                [Series("", t, own, style.BLACK, "step", width=0.9)],
+                1.0,
+                levels=(-limit.amplitude, limit.amplitude),
+            )
+        )
+    units = naming_units(run)
+    for name, most in run.limits.motion.items():
+        series = [samples("", t, motion[name], style.BLUE, 0.9)]
+        panels.append(panel(label(name, units[name]), series, 1.0, levels=(-most, most)))
+    title = f"Optimised input and motion, {flight.name}"
+    return Chart(
+        title, "time [s]", time_limits(t), tuple(panels), "Lines: the limits.", of=flight.name
+    )
+
+
+def naming_units(run: "DesignRun") -> Mapping[str, str | None]:
+    """Return the units of states and outputs."""
+    model = run.problem.model
+    return {
+        n: naming.unit(record, n)
+        for record in (model.State, model.Outputs)
+        for n in naming.names(record)
+    }
