@@ -175,6 +175,8 @@ _COMMANDS = {
              help="roll-on-stand, linear:roll or mine.yaml: states, parameters, sources, modes "
              "(default: all models, a line each)"),
         _JSON,
+        _arg("--config", metavar="FILE",
+             help="write a configuration for heli-jax design with this linear model"),
     )),
     "new-model": ("write the files of a model of your own", (
         _arg("name", metavar="NAME", help="name of the model and its module"),
@@ -754,6 +756,14 @@ def _models(options: argparse.Namespace) -> int:
     from heli_jax import models, summaries
     from heli_jax.cli.described import described
 
+    if options.config is not None:
+        from heli_jax.new_config.design_start import write_design_config
+
+        if options.name is None:
+            raise InputError("--config: expected the NAME of a linear model too, got none")
+        write_design_config(options.name, Path(options.config))
+        options.say(f"wrote {options.config}; next: heli-jax design {options.config}")
+        return DONE
     if options.name is None:
         listed = models.listed()
         width = max(map(len, listed))

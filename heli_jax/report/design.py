@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from heli_jax.design_workflow import DesignRun
 
 _FILES = ("design.json", "input.csv")
+_GAIN = 1e-3
+"""Share of the sd below which an optimum is no better than the library."""
 _ROWS = 12
 """Manoeuvres of the library in a table."""
 
@@ -80,7 +82,7 @@ def summary(run: "DesignRun") -> str:
     words = {"D": "the mean sd (criterion D)", "A": "the rms sd (criterion A)"}
     words |= {"E": "the largest sd (criterion E)"}
     what = words.get(design.criterion, f"the sd of {design.criterion}")
-    if optimum.words == best.words:
+    if gain < _GAIN:
         return f"No input was found that is better than {best.words}."
     return f"The optimised input lowers {what} by {_percent(gain)} against {best.words}."
 
