@@ -521,7 +521,8 @@ class _Search:
         for flight, places, own in zip(self.flights, self.places, start.inputs, strict=True):
             for name, (at, per_node) in places.items():
                 k = np.minimum(np.arange(at.stop - at.start) * per_node, flight.n_samples - 1)
-                x[at] = own[name][k] / self.limits.inputs[name].amplitude
+                # All values at their bounds may be a corner from which no step leads.
+                x[at] = 0.5 * own[name][k] / self.limits.inputs[name].amplitude
         bounds = [(-1.0, 1.0)] * self.nodes + [(0.0, 1.0)] * len(self.varied)
         multipliers, penalty, steps, before = np.zeros(len(self.limits.motion)), 10.0, 0, np.inf
         for _ in range(_ROUNDS):
