@@ -104,10 +104,10 @@ def determined(fit: Fit) -> Sequence[Combination]:
 
 
 def unit_of(fit: Fit, c: Combination) -> str:
-    """Return the SI unit of a combination; empty if an unknown of it has none."""
+    """Return the SI unit of a combination; empty if an unknown of it has no known unit."""
     every = {**fit.estimates, **fit.nuisance}
     members = {name: every[name].unit for name in c.exponents}
-    if not all(members.values()):
+    if not all(unit and units.is_unit(unit) for unit in members.values()):
         return ""
     if c.kind == "sum":
         return next(iter(members.values()))
