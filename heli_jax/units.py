@@ -274,6 +274,21 @@ def as_text(exponents: Mapping[str, int]) -> str:
     return f"{above or '1'}{below}"
 
 
+def of_product(units: Mapping[str, str], powers: Mapping[str, float]) -> str:
+    """Return the SI unit of a product of powers, by name; empty if it has fractional powers.
+
+    Raises:
+        ValueError: a unit is unknown.
+    """
+    exponents: dict[str, float] = {}
+    for name, power in powers.items():
+        for base, n in base_of(units[name]).items():
+            exponents[base] = exponents.get(base, 0.0) + power * n
+    if any(n % 1 for n in exponents.values()):
+        return ""
+    return as_text({base: round(n) for base, n in exponents.items() if n})
+
+
 def _shortest(exponents: Mapping[str, int]) -> dict[str, int]:
     """Return the exponents with volt for ampere and newton for kg, if fewer remain."""
     spellings = [dict(exponents)]

@@ -105,6 +105,18 @@ def test_every_unit_that_the_docs_list_is_known():
     assert units.si_of("mV") == "V"
 
 
+def test_unit_of_a_product_of_powers():
+    si = {"a": "1/rad", "Ixx": "kg m^2", "Lb": "1/s^2", "tau": "s"}
+    assert units.base_of(units.of_product(si, {"a": 1.0, "Ixx": -1.0})) == {
+        "kg": -1,
+        "m": -2,
+        "rad": -1,
+    }
+    assert units.of_product(si, {"Lb": 1.0, "tau": 2.0}) == "1"
+    assert units.of_product(si, {"Lb": 0.5, "tau": 2.0}) == "s"
+    assert units.of_product(si, {"tau": 0.3}) == ""
+
+
 HOSTILE = [
     "9**9**9**9",
     "m**9**9**9**9",

@@ -1,12 +1,13 @@
-"""What the site takes from the code when it is built, so that no page can lag behind it.
+"""Content that the site takes from the code when it is built, so that pages are never outdated.
 
-A page asks for it by a line `<!-- generated: NAME -->`; NAME is an entry of `_PARTS`, or
-`console`, which runs the block of commands below it and shows what each prints; exit codes have to
-be 0, unless `$ echo $?` follows. A block with a title is a file that these commands find. Beside
-them stand the figures and the report of the demo, of which nothing is kept in the repository.
+A line `<!-- generated: NAME (WORDS) -->` is replaced by that content. NAME is an entry of `_PARTS`,
+or `console`, which runs the block of commands below it and adds their output; exit codes have to
+be 0, unless `$ echo $?` follows. WORDS are for readers of the file: where the content comes from.
+The commands find a block with a title as a file. The demo's figures and report are added too; the
+repository does not contain them.
 
-Where HELI_JAX_SITE is `links` nothing is simulated, fitted or run: blocks stay as they are, and
-empty files stand for the demo's, so that tests can follow every link within seconds.
+With HELI_JAX_SITE=links nothing is simulated, fitted or run: blocks stay as they are, and empty
+files replace the demo's, so that tests can follow every link within seconds.
 """
 
 import contextlib
@@ -28,7 +29,10 @@ from mkdocs.structure.files import File, Files
 
 _ROOT = Path(__file__).parents[2]
 _LINKS_ALONE = os.environ.get("HELI_JAX_SITE") == "links"
-_MARK = re.compile(r"^<!-- generated: (\S+) -->$(?:\n```console\n((?:.*\n)*?)```$)?", re.MULTILINE)
+_MARK = re.compile(
+    r"^<!-- generated: (\S+)(?: \(.*\))? -->$(?:\n```console\n((?:.*\n)*?)```$)?", re.MULTILINE
+)
+_CONSOLE = re.compile(r"^<!-- generated: console .*-->$", re.MULTILINE)
 _TITLED = re.compile(r'^```\w+ title="([\w.-]+)"\n(.*?)^```$', re.MULTILINE | re.DOTALL)
 _ENDS = re.compile(r"([|<>])")
 _PAGE = re.compile(r"docs/([\w-]+)\.md")
@@ -52,11 +56,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """The page with what it asks for."""
+    """Return the page with its generated content."""
     if _LINKS_ALONE:
-        markdown = markdown.replace("<!-- generated: console -->", "")
+        markdown = _CONSOLE.sub("", markdown)
         markdown = re.sub(r"^```python exec=.*$", "```python", markdown, flags=re.MULTILINE)
-    if "<!-- generated: console -->" not in markdown:
+    if not _CONSOLE.search(markdown):
         return _MARK.sub(lambda mark: _PARTS[mark[1]](), markdown)
     # A folder for each page, as `make demo` leaves it: its commands build on one another.
     with tempfile.TemporaryDirectory(prefix="heli_jax-page-") as folder:

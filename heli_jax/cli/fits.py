@@ -37,7 +37,10 @@ def print_fit(run: FitRun, *, verbose: bool = False) -> None:
         print_text(f"{line.word}: {line.text}")
     stopped = fit.status == "not-converged"
     head, rows = of_estimates({**fit.estimates, **_shown_nuisances(fit.nuisance)}, stopped=stopped)
-    determined = [(c.name, *cells_of(c), "", "") for c in report_tables.determined(fit)]
+    determined = [
+        (c.name, *cells_of(c), report_tables.unit_of(fit, c), "")
+        for c in report_tables.determined(fit)
+    ]
     print_page_table(
         report_tables.Table((*head[:3], fit.interval, *head[4:]), [*rows, *determined])
     )

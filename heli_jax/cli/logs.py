@@ -14,6 +14,7 @@ from heli_jax.cli.terminal import print_table, print_text
 from heli_jax.finding import as_data
 from heli_jax.flights.clock import ROWS
 from heli_jax.flights.describe import ColumnInfo, LogInfo, TimeInfo, TopicInfo
+from heli_jax.flights.name_units import without_unit
 from heli_jax.flights.preset import fitting_presets
 from heli_jax.numbers import terse
 
@@ -211,7 +212,8 @@ def _print_channels(columns: Sequence[ColumnInfo], pattern: str | None) -> None:
         cells = (*map(terse, (c.min, c.max, c.mean)), _share(c))
         if c.kind == "text":
             cells = (_cut(c.strays or f"text in {c.count} rows"), "", "", "")
-        rows.append((_squeezed(c.name), c.unit[:8], *cells))
+        unit = c.unit or without_unit(c.name)[1]
+        rows.append((_squeezed(c.name), unit[:8], *cells))
     print_table(("channel", "unit", "min", "max", "mean", "NaN %"), rows)
 
 

@@ -19,8 +19,8 @@ class Section(BaseModel):
     def checked(cls, content: Mapping[str, Any]) -> Self:
         """Return the section of a file's content.
 
-        As in the JSON schema, by which an editor checks the file, true is no number, 1 is not true,
-        and a text is none of both.
+        Types are strict, as in the JSON schema for editors: true is not the number 1, and text is
+        neither.
 
         Raises:
             pydantic.ValidationError: something in it is wrong.

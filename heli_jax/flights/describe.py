@@ -85,12 +85,12 @@ class Gap:
 class TimeInfo:
     """Clock of a log or of one of its topics.
 
-    `rate` [Hz] is that of the usual step. `jitter` is the largest error of a step in steps, or its
-    95 % quantile without gaps if the stamps are no uniform grid. `problem` is the reason why the
-    stamps are no clock, otherwise empty. `guessed` is True if nothing states the unit. `counted`
-    [Hz] is the number of samples a second if `column` counts samples, or if the rows do
-    (`heli_jax.flights.clock.ROWS`). If the time begins anew, the table holds several `runs`, put
-    one after another.
+    `rate` [Hz] is that of the usual step. `jitter` is the largest error of a step, relative to the
+    step; without a uniform grid the 95 % quantile of these errors, gaps excluded. `problem` is the
+    reason why the stamps are no clock, otherwise empty. `guessed` is True if nothing states the
+    unit. `counted` [Hz] is the number of samples a second if `column` counts samples, or if the
+    rows do (`heli_jax.flights.clock.ROWS`). If the time begins anew, the table holds several
+    `runs`, put one after another.
     """
 
     column: str

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from heli_jax import naming
+from heli_jax import naming, units
 from heli_jax.analysis.attitude_responses import Handling
 from heli_jax.analysis.handling_qualities import NUMBERS, UNITS, HandlingQualities, Number
 from heli_jax.analysis.response_agreement import USUAL_J, ResponseAgreement
@@ -80,7 +80,7 @@ def bars(fit: Fit) -> Bars:
     """Return free parameters and determined combinations with their relative intervals."""
     stopped = fit.status == "not-converged"
     rows = [(n, e, pretty(e.unit)) for n, e in fit.estimates.items()]
-    rows += [(c.name, c, "") for c in determined(fit)]
+    rows += [(c.name, c, pretty(unit_of(fit, c))) for c in determined(fit)]
     parts = []
     for _, e, _ in rows:
         known = not stopped and e.sd is not None and e.value
@@ -101,6 +101,17 @@ def bars(fit: Fit) -> Bars:
 def determined(fit: Fit) -> Sequence[Combination]:
     """Return the combinations that the data determine; none without an optimum."""
     return () if fit.status == "not-converged" else fit.verdict.combinations
+
+
+def unit_of(fit: Fit, c: Combination) -> str:
+    """Return the SI unit of a combination; empty if an unknown of it has no known unit."""
+    every = {**fit.estimates, **fit.nuisance}
+    members = {name: every[name].unit for name in c.exponents}
+    if not all(unit and units.is_unit(unit) for unit in members.values()):
+        return ""
+    if c.kind == "sum":
+        return next(iter(members.values()))
+    return units.of_product(members, c.exponents)
 
 
 def correlation(fit: Fit) -> list[tuple[str, list[tuple[str, float]]]]:
@@ -154,8 +165,8 @@ def nuisances(fit: Fit) -> tuple[Table, Table]:
 
 def combinations(fit: Fit) -> Table:
     """Return the table of combinations that the data determine."""
-    rows = [(c.name, *_cells(c)) for c in determined(fit)]
-    return Table(("combination", "estimate", "sd", "sd / value", "95 % interval"), rows)
+    rows = [(c.name, *_cells(c), pretty(unit_of(fit, c))) for c in determined(fit)]
+    return Table(("combination", "estimate", "sd", "sd / value", "95 % interval", "unit"), rows)
 
 
 _METHODS = {

@@ -230,7 +230,11 @@ def _sentences(v: Verdict) -> list[str]:
     if pairs := [p for p in v.pairs if not {p.first, p.second} <= named]:
         words = [f"{p.first} with {p.second} ({p.correlation:+.5f})" for p in pairs]
         names = dict.fromkeys(n for p in pairs for n in (p.first, p.second))
-        lines.append(sentence("verdict.correlated", pairs=words, way_out=_way_out([*names])))
+        # The sd of one given the other is sqrt(1 - r^2) times as large; rounding may give r = 1.
+        largest = max(abs(p.correlation) for p in pairs)
+        factor = 1.0 / math.sqrt(max(1.0 - largest**2, 1e-12))
+        way_out = _way_out([*names])
+        lines.append(sentence("verdict.correlated", pairs=words, factor=factor, way_out=way_out))
     return lines
 
 

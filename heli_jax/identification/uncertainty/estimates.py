@@ -1,13 +1,14 @@
 """Estimates with standard errors and intervals, by name and in their units.
 
-The standard errors at an optimum are those of Cramér-Rao's bound, or of the sandwich for
-autocorrelated residuals. The innovations of a filter have information on the vehicle's parameters
-by the response, and by their correlation, since the gain depends on the parameters too. The second
-part holds only if the model of disturbance and noise is right. If the innovations are not white it
-is not, and then the standard errors are those of the response alone.
+The standard errors at an optimum are the Cramér-Rao bound, or the sandwich estimate if residuals
+are autocorrelated.
 
-The innovations of the record that the model itself simulates are zero, so the Jacobian there is
-that of the response, weighed as the filter weighs it.
+Innovations of a filter depend on the vehicle's parameters by the response and by the gain. The
+information by the gain is valid only if the innovations are white, so that the model of disturbance
+and noise is right. Otherwise the response alone gives the standard errors.
+
+The information of the response is the Jacobian on a record that the model simulates: its
+innovations are zero there, and the gain has no effect.
 """
 
 from collections.abc import Collection, Mapping

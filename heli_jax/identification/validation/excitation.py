@@ -147,9 +147,9 @@ def _sums_over_bands(
 ) -> Float[np.ndarray, "p c+3"]:
     """Regress signals on an excitation in each band.
 
-    Return sums over the bands by output: the likelihood ratio of models of the first signal with
-    and without the excitation, its degrees of freedom, the power of each signal that follows the
-    excitation, less that expected by chance, and the variance of this power of the first signal.
+    Return sums over the bands by output, in this order: the likelihood ratio of the first signal
+    with and without the excitation; its degrees of freedom; for each signal the power that follows
+    the excitation, less the power expected by chance; the variance of that of the first signal.
 
     Args:
         size: divisors of each output, or (s = 1) of all.

@@ -202,8 +202,8 @@ def unmodelled(
 ) -> tuple[list[Unmodelled], tuple[float, dict[str, float]]]:
     """Return the drives that the residuals follow beyond chance, at most one per output.
 
-    The second result is the probability that the response to the inputs prefers other values by
-    chance, and the step to these values [SI]. Output error fits slow drift by slow modes. Filter
+    The second result tests whether the response to the inputs alone gives other values: the p
+    value, and the step to these values [SI]. Output error fits slow drift by slow modes. Filter
     error also fits the vehicle's response to its disturbance, which biases it if the disturbance
     acts elsewhere or has another spectrum.
 
