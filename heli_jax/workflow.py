@@ -76,10 +76,9 @@ class FitRun:
 
         shown = _with_responses(self) if name.startswith(("match", "held")) else self.supplementary
         draw = drawings(Analysis(self.fit, self.problem, self.baseline, shown))
-        figure = styled(draw[name]) if name in draw else None
-        if figure is None:
+        if name not in draw:
             raise ValueError(f"figure: expected one of {', '.join(draw)}, got {name!r}")
-        return figure
+        return styled(draw[name])
 
     def __repr__(self) -> str:
         where = "" if self.directory is None else f"\n  report: {self.directory / 'report.html'}"
