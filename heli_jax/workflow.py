@@ -84,9 +84,6 @@ class FitRun:
         where = "" if self.directory is None else f"\n  report: {self.directory / 'report.html'}"
         return f"FitRun of {self.config.path}: {self.fit!r}{where}"
 
-    def _repr_html_(self) -> str:
-        return self.fit._repr_html_()
-
 
 def load_config(path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = ()) -> Experiment:
     """Read and validate a configuration, its model and its vehicle; no log is opened yet.

@@ -84,7 +84,7 @@ def test_a_saved_fit_is_read_back(run):
     assert lower < saved.estimates["Ixx"].value < upper
     assert saved.to_dataframe().equals(run.fit.to_dataframe())
     assert str(run.directory) in repr(saved)
-    assert "kg m^2" in saved._repr_html_()
+    assert "kg m^2" in repr(saved)
 
 
 def test_a_directory_without_a_fit_is_refused_in_a_sentence(tmp_path):

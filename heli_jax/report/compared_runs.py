@@ -18,7 +18,7 @@ from heli_jax.report.page import filled
 from heli_jax.report.saved_fit import SavedFit, load_fit
 from heli_jax.report.style import pretty
 from heli_jax.report.tables import NOT_DETERMINED, Table, combination, product
-from heli_jax.summaries import Summary, as_html, as_text
+from heli_jax.summaries import as_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -153,16 +153,10 @@ class ComparedRuns(NamedTuple):
         """Return `to_dataframe` as CSV."""
         return self.to_dataframe().to_csv(index=False, lineterminator="\n")
 
-    def _summary(self) -> Summary:
+    def __repr__(self) -> str:
         head, rows = self.estimates
         title = f"{len(self.runs)} runs: {', '.join(self.labels)}"
-        return Summary(title, head, tuple(rows), tuple(sentences(self.notes)))
-
-    def __repr__(self) -> str:
-        return as_text(self._summary())
-
-    def _repr_html_(self) -> str:
-        return as_html(self._summary())
+        return as_text(title, head, rows, sentences(self.notes))
 
 
 def compare_runs(runs: Sequence[str | Path | SavedFit]) -> ComparedRuns:
