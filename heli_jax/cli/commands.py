@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from heli_jax import import_path, run_directory
-from heli_jax.cli import interrupts, terminal
-from heli_jax.cli.interrupts import resumable
+from heli_jax.cli import terminal
 from heli_jax.cli.terminal import print_page_table, print_table, print_text
 from heli_jax.errors import InputError, located
 from heli_jax.numbers import adequacy_of
@@ -30,8 +29,7 @@ if TYPE_CHECKING:
     from heli_jax.flights.convert import Selection
 
 # argparse itself exits with 2.
-DONE, WRONG_INPUT, NOT_DETERMINED, NOT_CONVERGED = 0, 2, 3, 4
-INTERRUPTED = interrupts.INTERRUPTED
+DONE, WRONG_INPUT, NOT_DETERMINED, NOT_CONVERGED, INTERRUPTED = 0, 2, 3, 4, 130
 _EXIT_CODES = (
     "Exit codes: 0 done; 2 wrong input, in one sentence; 3 the data cannot determine what was "
     "asked, or an interval is not trusted; 4 an optimiser did not converge, the model is not "
@@ -200,54 +198,47 @@ def main(arguments: Sequence[str] | None = None) -> int:
     converge, or the model is not adequate and explains less than the mean of the measurements; 130
     interrupted.
     """
-    # Tests and other programs pass arguments. An interrupt must not end their process.
+    # Tests and other programs pass arguments.
     if arguments is None:
         import_path.ignore_folder_style()
         # These warnings concern numbers of a log or a configuration, which the message explains.
         warnings.filterwarnings(
             "ignore", category=RuntimeWarning, module=r"(heli_jax|numpy|scipy)\b"
         )
-    with interrupts.as_program() if arguments is None else interrupts.as_function() as seen:
-        for text in sys.argv[1:] if arguments is None else arguments:
-            if any("\ud800" <= c <= "\udfff" for c in text):
-                _refuse("heli-jax", f"expected arguments and names of files in UTF-8, got {text!r}")
-        options, unknown = _parser().parse_known_args(arguments)
-        if unknown:
-            # argparse no longer knows the command here.
-            message = f"unrecognized arguments: {' '.join(unknown)}"
-            _refuse(f"heli-jax {options.command}", message)
-        options.interrupts, code = seen, DONE
-        try:
-            options.say = terminal.say_notes if options.quiet else terminal.say
-            with terminal.progress_shown(options.quiet):
-                code = globals()[f"_{options.command.replace('-', '_')}"](options)
-            # Flush here, so that a full disk ends in a message.
-            if sys.stdout is not None:
-                sys.stdout.flush()
-            return code
-        except KeyboardInterrupt:
-            terminal.say(seen.words())
-            return 128 + seen.seen[0] if seen.seen else INTERRUPTED
-        except BrokenPipeError:
-            # `heli-jax simulate ... | head` is no failure and keeps its exit code. Python would
-            # flush standard output again at exit and complain.
-            _discard_output()
-            return code
-        except Exception as e:
-            # A library may have turned an interrupt into an error of its own.
-            if seen.seen:
-                terminal.say("interrupted")
-                return INTERRUPTED
-            # Any other error is a bug, and its report needs the traceback.
-            if not isinstance(e, InputError | OSError):
-                raise
-            if isinstance(e, OSError):
-                # Unprinted output is still buffered and would be flushed again at exit.
-                with contextlib.suppress(OSError, AttributeError, ValueError):
-                    _discard_output()
-                e = InputError(f"{e.filename or 'standard output'}: {e.strerror or e}")
-            terminal.say(" ".join(str(e).split()))
-            return WRONG_INPUT
+    for text in sys.argv[1:] if arguments is None else arguments:
+        if any("\ud800" <= c <= "\udfff" for c in text):
+            _refuse("heli-jax", f"expected arguments and names of files in UTF-8, got {text!r}")
+    options, unknown = _parser().parse_known_args(arguments)
+    if unknown:
+        # argparse no longer knows the command here.
+        message = f"unrecognized arguments: {' '.join(unknown)}"
+        _refuse(f"heli-jax {options.command}", message)
+    code = DONE
+    try:
+        options.say = terminal.say_notes if options.quiet else terminal.say
+        with terminal.progress_shown(options.quiet):
+            code = globals()[f"_{options.command.replace('-', '_')}"](options)
+        # Flush here, so that a full disk ends in a message.
+        if sys.stdout is not None:
+            sys.stdout.flush()
+        return code
+    except KeyboardInterrupt:
+        terminal.say("interrupted")
+        return INTERRUPTED
+    except BrokenPipeError:
+        # `heli-jax simulate ... | head` is no failure and keeps its exit code. Python would
+        # flush standard output again at exit and complain.
+        _discard_output()
+        return code
+    # Any other error is a bug, and its report needs the traceback.
+    except (InputError, OSError) as e:
+        if isinstance(e, OSError):
+            # Unprinted output is still buffered and would be flushed again at exit.
+            with contextlib.suppress(OSError, AttributeError, ValueError):
+                _discard_output()
+            e = InputError(f"{e.filename or 'standard output'}: {e.strerror or e}")
+        terminal.say(" ".join(str(e).split()))
+        return WRONG_INPUT
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -357,34 +348,23 @@ def _fit(options: argparse.Namespace) -> int:
     from heli_jax.cli import fits
 
     experiment = workflow.load_config(options.config, options.set)
-    failure = None
-    try:
-        run = workflow.run_fit(experiment, out, progress=options.say, began=began)
-    except workflow.NotWritten as e:
-        # Print at least the fit, which may have taken hours.
-        run, failure = e.run, e
-    if options.json and run.directory is not None:
-        print((run.directory / "fit.json").read_text(encoding="utf-8"), end="")
+    run = workflow.run_fit(experiment, out, progress=options.say, began=began)
+    if options.json:
+        print((out / "fit.json").read_text(encoding="utf-8"), end="")
     else:
         fits.print_fit(run, verbose=options.verbose)
-    if failure is not None:
-        raise failure
     return run.fit.exit_code
 
 
 def _fit_study(options: argparse.Namespace, study: "Study") -> int:
     """Run a study, print it, and return the exit code of the worst fit."""
     from heli_jax.cli import simulations
-    from heli_jax.studies import directory
     from heli_jax.studies import run as studies
 
     if options.json:
         raise InputError("--json: prints the fit.json of one fit, and a study has many")
     _require_out(options)
     out = _directory(options)
-    options.interrupts.words = lambda: resumable(out, directory.FINISHED)
-    # Workers of dask must be stopped. Our own processes end with this one.
-    options.interrupts.unwinds = bool(options.scheduler)
     # Without a scheduler, --workers starts our own processes, which do not need dask.
     with _dask_client(options) if options.scheduler else contextlib.nullcontext() as client:
         how = {"workers": options.workers, "client": client, "reports": options.reports}
@@ -514,12 +494,8 @@ def _sweep(options: argparse.Namespace) -> int:
     from heli_jax import config as configuration
     from heli_jax import sweep_workflow
     from heli_jax.cli import simulations
-    from heli_jax.sweeps.store import FINISHED
 
     experiment = configuration.load(options.config, options.set)
-    options.interrupts.words = lambda: resumable(out, FINISHED)
-    # Processes of a cluster must be stopped.
-    options.interrupts.unwinds = bool(options.workers or options.scheduler)
     with _dask_client(options) as client:
         sweep_workflow.run_sweep(
             experiment,
