@@ -317,7 +317,7 @@ def on_workers(flight: Flight, n: int, workers: int) -> float:
             seen: list[tuple[float, int]] = []
             ours(
                 flight, n, "rk4", client=client, chunk=CHUNK["dask"],
-                progress=lambda p, seen=seen: seen.append((time.perf_counter(), p.done)),
+                progress=lambda done, _, seen=seen: seen.append((time.perf_counter(), done)),
             )  # fmt: skip
             t0, n0 = next(s for s in seen if s[1] >= n / 4)
             t1, n1 = seen[-1]

@@ -129,7 +129,7 @@ _COMMANDS = {
         _arg("--channels", metavar="PATTERN", help="list these: 'vehicle_attitude*'"),
     )),
     "convert": ("signals of a log on one clock, as a table", (
-        _LOG, _arg("out", metavar="OUT", help=".csv, .parquet or .nc"),
+        _LOG, _arg("out", metavar="OUT", help=".csv or .parquet"),
         *_CLOCK, _TIME_RATE, _FLIGHT,
         _arg("--signals", nargs="+", default=[], metavar="NAME",
              help="'vehicle_attitude.*', 'euler(vehicle_attitude.q).roll' (default all)"),

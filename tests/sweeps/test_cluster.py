@@ -45,8 +45,8 @@ def test_a_worker_that_dies_costs_nothing(bench30, record):
                 Client(f"tcp://{at.ip}:{at.port}", timeout=1)
         killed = []
 
-        def kill(progress):
-            if progress.done > 100 and not killed:
+        def kill(done, _):
+            if done > 100 and not killed:
                 killed.append(pids(client)[0])
                 os.kill(killed[0], signal.SIGKILL)
 
