@@ -265,9 +265,8 @@ def test_usage_and_places_to_write(bench, capsys):
         ["fit", bench, "--out", bench.parent / "there"],
         ["simulate", bench, "--out", bench.parent / "x.doc"],
         ["info", bench.parent / "none.csv"],
-        ["sweep", bench, "--workers", "0"],
+        ["fit", bench, "--workers", "0"],
         ["sweep", bench, "--devices", "two"],
-        ["sweep", bench, "--workers", "1", "--scheduler", "tcp://x:1"],
     ):
         refused(capsys, arguments)
 

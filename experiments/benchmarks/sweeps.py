@@ -309,10 +309,13 @@ def by_length(N: int) -> float:
 
 def on_workers(flight: Flight, n: int, workers: int) -> float:
     """Return microseconds per vehicle on a local dask cluster: slope, best of three sweeps."""
+    from distributed import LocalCluster
+
     from heli_jax.sweeps.cluster import connected
 
     best = np.inf
-    with connected(workers=workers) as client:
+    local = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None)
+    with local, connected(local.scheduler_address) as client:
         for _ in range(3):
             seen: list[tuple[float, int]] = []
             ours(

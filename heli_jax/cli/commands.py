@@ -59,7 +59,7 @@ def _seconds(text: str) -> float:
 
 # Any: keywords of argparse.
 def _arg(*names: str, **keywords: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """Return one argument of a command; arguments marked `either` exclude one another."""
+    """Return one argument of a command."""
     if names[0].startswith("--") and not keywords.keys() & {"action", "metavar"}:
         keywords["action"] = "store_true"
     return names, keywords
@@ -86,15 +86,13 @@ _TIME_RATE = _arg("--time-rate", type=float, metavar="HZ",
 _FLIGHT = _arg("--flight", type=_count, metavar="N",
                help="number of the flight in a log of several (from 1)")
 _RESUME = _arg("--resume", help="continue the study or sweep in --out")
-_WORKERS = (
-    _arg("--workers", type=_count, metavar="N", either=True,
-         help="processes on this machine (default for a study: one a core)"),
-    _arg("--scheduler", metavar="tcp://HOST:8786", either=True,
-         help="compute on the workers of this dask scheduler"),
-)
+_SCHEDULER = _arg("--scheduler", metavar="tcp://HOST:8786",
+                  help="compute on the workers of this dask scheduler")
 _COMMANDS = {
     "fit": ("estimate parameters; write a run directory with a report", (
-        *_CONFIG, _OUT, _JSON, _VERBOSE, _RESUME, *_WORKERS,
+        *_CONFIG, _OUT, _JSON, _VERBOSE, _RESUME, _SCHEDULER,
+        _arg("--workers", type=_count, metavar="N",
+             help="processes on this machine for a study (default: one a core)"),
         _arg("--over", action="append", default=[], metavar="KEY=VALUE,VALUE",
              help="a study (docs/studies.md): fit with each value, with several keys each "
              "combination; or study in CONFIG"),
@@ -119,7 +117,7 @@ _COMMANDS = {
         _arg("--out", metavar="FILE", help=".csv or .parquet (default: CSV on stdout)"),
     )),
     "sweep": ("run a design of many vehicles; results in a Zarr store", (
-        *_CONFIG, _OUT, _RESUME, *_WORKERS,
+        *_CONFIG, _OUT, _RESUME, _SCHEDULER,
         _arg("--devices", type=_count, metavar="N",
              help="processor cores or GPUs to use (default: all)"),
         _arg("--no-figures", help="draw no figures"),
@@ -255,12 +253,8 @@ def _parser() -> argparse.ArgumentParser:
         added.add_argument(
             "--quiet", action="store_true", help="print results, doubts and errors only"
         )
-        either = None
         for names, keywords in arguments:
-            group = added
-            if "either" in keywords:
-                group = either = either or added.add_mutually_exclusive_group()
-            group.add_argument(*names, **{k: v for k, v in keywords.items() if k != "either"})
+            added.add_argument(*names, **keywords)
     return parser
 
 
@@ -365,8 +359,7 @@ def _fit_study(options: argparse.Namespace, study: "Study") -> int:
         raise InputError("--json: prints the fit.json of one fit, and a study has many")
     _require_out(options)
     out = _directory(options)
-    # Without a scheduler, --workers starts our own processes, which do not need dask.
-    with _dask_client(options) if options.scheduler else contextlib.nullcontext() as client:
+    with _dask_client(options.scheduler) as client:
         how = {"workers": options.workers, "client": client, "reports": options.reports}
         result = studies.run(study, out, studies.Options(options.resume, **how, say=options.say))
     simulations.print_study(result)
@@ -380,19 +373,18 @@ def _require_out(options: argparse.Namespace) -> None:
 
 
 # Any: dask.distributed is an extra, and only `sweeps.cluster` names its classes.
-def _dask_client(options: argparse.Namespace) -> contextlib.AbstractContextManager[Any]:
-    """Return a dask client if --scheduler or --workers asks for one."""
-    if options.scheduler is None and options.workers is None:
+def _dask_client(scheduler: str | None) -> contextlib.AbstractContextManager[Any]:
+    """Return a dask client of --scheduler, if it is stated."""
+    if scheduler is None:
         return contextlib.nullcontext()
     try:
         from heli_jax.sweeps.cluster import connected
     except ImportError as e:
-        option = "--workers" if options.scheduler is None else "--scheduler"
         raise InputError(
-            f"{option}: dask.distributed is not installed, expected the extra distributed: "
+            "--scheduler: dask.distributed is not installed, expected the extra distributed: "
             "pip install 'heli_jax[distributed]'"
         ) from e
-    return connected(options.scheduler, options.workers)
+    return connected(scheduler)
 
 
 def _discard_output() -> None:
@@ -496,7 +488,7 @@ def _sweep(options: argparse.Namespace) -> int:
     from heli_jax.cli import simulations
 
     experiment = configuration.load(options.config, options.set)
-    with _dask_client(options) as client:
+    with _dask_client(options.scheduler) as client:
         sweep_workflow.run_sweep(
             experiment,
             out,
