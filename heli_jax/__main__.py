@@ -81,7 +81,7 @@ def _watch(pipe: int) -> None:
         pass
     # Without an import, which may be what was interrupted.
     files = sys.modules.get("heli_jax.run_directory")
-    if hasattr(files, "remove_unfinished"):
+    if files is not None and hasattr(files, "remove_unfinished"):
         files.remove_unfinished()
     # Bypass Python's buffers, whose locks the interrupted code may hold. Restore the cursor that a
     # progress line hides.
