@@ -16,7 +16,6 @@ from heli_jax.regular_file import obstacle_at
 
 # Paths are added before they are created, so that no interrupt can leave one behind.
 _unfinished: set[Path] = set()
-_finished: list[Path] = []
 
 
 def default_directory(config: Path) -> Path:
@@ -88,12 +87,8 @@ def require_writable(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def whole(path: Path, *, replaces: bool = False, or_beside: bool = False) -> Iterator[Path]:
+def whole(path: Path) -> Iterator[Path]:
     """Yield a temporary directory beside `path`, renamed to it at the end, or removed on failure.
-
-    Args:
-        or_beside: True if it becomes `path-2` and so on when another process has made `path`
-            meanwhile; see `written`.
 
     Raises:
         InputError: it cannot be written.
@@ -106,35 +101,14 @@ def whole(path: Path, *, replaces: bool = False, or_beside: bool = False) -> Ite
         temporary.mkdir(mode=0o700)
         yield temporary
         temporary.chmod(0o755)  # so far only its owner had access
-        if replaces:
-            _remove_own(path)
-        _finished.append(_renamed(temporary, path, or_beside))
+        # rename replaces an empty directory, and nothing else.
+        os.rename(temporary, path)
     except OSError as e:
         raise InputError(f"--out {path}: cannot be written ({e.strerror or e})") from e
     finally:
         # Clean up after failures and interrupts.
         shutil.rmtree(temporary, ignore_errors=True)
         _unfinished.discard(temporary)
-
-
-def _renamed(temporary: Path, path: Path, or_beside: bool) -> Path:
-    """Rename the directory, to the next free name if `path` is taken; return the name."""
-    candidates = (path.with_name(f"{path.name}-{number}") for number in itertools.count(2))
-    place = path
-    while or_beside and os.path.lexists(place):
-        place = next(candidates)
-    # rename replaces an empty directory, and nothing else.
-    os.rename(temporary, place)
-    return place
-
-
-def _remove_own(path: Path) -> None:
-    """Remove a directory of this process."""
-    aside = path.absolute().parent / f".{path.name}-{secrets.token_hex(4)}"
-    _unfinished.add(aside)
-    os.rename(path, aside)
-    shutil.rmtree(aside, ignore_errors=True)
-    _unfinished.discard(aside)
 
 
 def require_place(path: Path, where: str) -> None:
@@ -166,7 +140,6 @@ def whole_file(path: Path, where: str) -> Iterator[Path]:
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         yield temporary
         temporary.replace(path)
-        _finished.append(path)
     except OSError as e:
         raise InputError(f"{where}: cannot be written ({e.strerror or e})") from e
     finally:
@@ -181,8 +154,3 @@ def remove_unfinished() -> None:
         shutil.rmtree(temporary, ignore_errors=True)
         with contextlib.suppress(OSError):
             temporary.unlink()
-
-
-def written() -> tuple[Path, ...]:
-    """Return the directories that this process has completed."""
-    return tuple(_finished)

@@ -1,15 +1,11 @@
-"""Summaries of flights, problems, fits, runs and vehicles: text in a session, a table in a
-notebook.
+"""Summaries of flights, problems, fits and vehicles as text, for their `__repr__`.
 
-Each `of_...` function makes a `Summary` of one object; `as_text` and `as_html` format it. The
-classes call these functions from `__repr__` and `_repr_html_`. They import this module, so it
-imports none of them, and its arguments are `Any`.
+The classes import this module, so it imports none of them, and its arguments are `Any`.
 """
 
-import html
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -20,43 +16,18 @@ from heli_jax.numbers import NOTHING, measured, number, percent, vaf_percent
 type Row = tuple[str, ...]
 
 
-# Text and HTML share this content, so they cannot differ.
-class Summary(NamedTuple):
-    """Content of a summary."""
-
-    title: str
-    head: Row = ()
-    rows: tuple[Row, ...] = ()
-    notes: tuple[str, ...] = ()
-
-
-def as_text(summary: Summary) -> str:
+def as_text(title: str, head: Row = (), rows: Sequence[Row] = (), notes: Sequence[str] = ()) -> str:
     """Return a summary as lines of text with aligned columns."""
-    rows = [row for row in (summary.head, *summary.rows) if row]
+    cells = [row for row in (head, *rows) if row]
     # Without rows and head there are no columns, and zip returns none.
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     lines = [
-        "  " + "  ".join(map(str.ljust, row, widths)).rstrip() if any(row) else "" for row in rows
+        "  " + "  ".join(map(str.ljust, row, widths)).rstrip() if any(row) else "" for row in cells
     ]
-    return "\n".join([summary.title, *lines, *(f"  {note}" for note in summary.notes)])
+    return "\n".join([title, *lines, *(f"  {note}" for note in notes)])
 
 
-def as_html(summary: Summary) -> str:
-    """Return a summary as HTML. All text is escaped, since names and notes come from logs and
-    files.
-    """
-
-    def cells(row: Row, tag: str) -> str:
-        return "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in row)
-
-    head = f"<thead><tr>{cells(summary.head, 'th')}</tr></thead>" if summary.head else ""
-    body = "".join(f"<tr>{cells(row, 'td')}</tr>" for row in summary.rows)
-    table = f"<table>{head}<tbody>{body}</tbody></table>" if head or body else ""
-    notes = "".join(f"<p>{html.escape(note)}</p>" for note in summary.notes)
-    return f"<p><b>{html.escape(summary.title)}</b></p>{table}{notes}"
-
-
-def of_flight(flight: Any) -> Summary:
+def of_flight(flight: Any) -> str:
     """Summarise the signals with ranges in SI, the hold of inputs, and the reader's notes."""
     rows = []
     for role in ("inputs", "outputs"):
@@ -67,16 +38,16 @@ def of_flight(flight: Any) -> Summary:
     used = ", held out" if flight.hold_out else ""
     known = [f"differs in {n} = {number(v, 6)}" for n, v in flight.known.items()]
     name = f" {flight.name!r}" if flight.name else ""
-    return Summary(
+    return as_text(
         f"Flight{name}: {flight.n_samples} samples at {1 / flight.dt:g} Hz, "
         f"{flight.duration:.6g} s{used}",
         ("", "signal", "lowest", "highest", "hold"),
-        tuple(rows),
+        rows,
         (*known, *(sentences(flight.source.notes) if flight.source else ())),
     )
 
 
-def of_problem(problem: Any) -> Summary:
+def of_problem(problem: Any) -> str:
     """Summarise the free parameters with bounds and priors, and the fitted flights."""
     # Values as configured, without the transforms of the search.
     rows = []
@@ -87,11 +58,11 @@ def of_problem(problem: Any) -> Summary:
         rows.append((name, *bounds, prior, unit))
     held_out = len(problem.flights) - len(problem.training)
     flights = f"{len(problem.training)} flights" if len(problem.training) > 1 else "1 flight"
-    return Summary(
+    return as_text(
         f"Problem: {problem.model.name} by {problem.method}, {flights}"
         + (f" and {held_out} held out" if held_out else ""),
         ("free", "start", "lower", "upper", "prior", "unit"),
-        tuple(rows),
+        rows,
     )
 
 
@@ -134,12 +105,12 @@ def cells_of(e: Any, *, stopped: bool = False) -> tuple[str, str, str]:
     return value, sd, "not trusted" if untrusted else f"{low} to {high}"
 
 
-def of_fit(fit: Any) -> Summary:
+def of_fit(fit: Any) -> str:
     """Summarise status, verdict, estimates with intervals, and agreement by output."""
     head, rows = of_estimates(fit.estimates)
     agreement = [f"{name}: VAF {vaf_percent(m.vaf)}" for name, m in fit.metrics.items()]
     by = f" by instrument ({', '.join(fit.instruments)})" if fit.instruments else ""
-    return Summary(
+    return as_text(
         f"Fit of {fit.model} by {fit.method}{by}: {fit.status}",
         # This name states whether the interval allows for autocorrelated residuals.
         (*head[:3], fit.interval, *head[4:]),
@@ -148,63 +119,20 @@ def of_fit(fit: Any) -> Summary:
     )
 
 
-def of_trajectory(run: Any, statuses: Sequence[str]) -> Summary:
-    """Summarise the signals with ranges in SI and the end of a run.
-
-    For batches, and within jit, only shapes are shown. `statuses` are the words for the status
-    codes.
-    """
-    signals = [
-        (role, name, values)
-        for role, record in (("state", run.states), ("output", run.outputs), ("input", run.inputs))
-        for name, values in naming.asdict(record).items()
-    ]
-    # A repr must never fail. Within jit only shapes are known.
-    if np.ndim(run.times) != 1 or not _concrete([run.times, run.finite, *(v for *_, v in signals)]):
-        shape = tuple(np.shape(run.times))
-        rows = tuple((role, name, str(tuple(np.shape(v)))) for role, name, v in signals)
-        head = ("", "signal", "shape")
-        return Summary(f"Trajectory, times of shape {shape}", head, rows)
-    times = np.asarray(run.times)
-    # The key includes the role, since an output and a state of the same name may differ in unit.
-    units = {
-        (role, name): naming.unit(type(record), name) or ""
-        for role, record in (("state", run.states), ("output", run.outputs), ("input", run.inputs))
-        for name in naming.names(type(record))
-    }
-    return Summary(
-        f"Trajectory: {times.size} samples, {float(times[-1]):.6g} s, "
-        f"{statuses[int(np.asarray(run.status))]}",
-        ("", "signal", "lowest", "highest", "unit"),
-        tuple((role, n, *_range(np.asarray(v)), units[role, n]) for role, n, v in signals),
-        tuple(f"outside: {n}" for n, where in run.outside.items() if np.any(np.asarray(where))),
-    )
-
-
-def of_vehicle(vehicle: Any) -> Summary:
+def of_vehicle(vehicle: Any) -> str:
     """Summarise the given constants with unit and meaning; `vehicle` is any record of numbers."""
     record, rows, missing = type(vehicle), [], []
     for name, value in naming.asdict(vehicle).items():
-        if not _concrete([value]) or np.ndim(value) != 0:
-            shown = f"shape {tuple(np.shape(value))}" if hasattr(value, "shape") else repr(value)
-        elif np.isnan(float(value)):  # NaN marks a constant that the file does not give
+        try:
+            shown = number(float(value), 6)
+        except Exception:  # an array, or a tracer of JAX within jit and vmap
+            shown = repr(value)
+        if shown == NOTHING:  # NaN marks a constant that the file does not give
             missing.append(name)
             continue
-        else:
-            shown = number(float(value), 6)
         rows.append((name, shown, naming.unit(record, name) or "", naming.meaning(record, name)))
     notes = (f"not given: {', '.join(missing)}",) if missing else ()
-    return Summary(record.__name__, ("constant", "value", "unit", "meaning"), tuple(rows), notes)
-
-
-def _concrete(values: Iterable[Any]) -> bool:
-    """True if all values are numbers and none is a tracer of JAX."""
-    try:
-        for value in values:
-            np.asarray(value, dtype=float)
-    except Exception:  # JAX's tracers raise various errors within jit and vmap
-        return False
-    return True
+    return as_text(record.__name__, ("constant", "value", "unit", "meaning"), rows, notes)
 
 
 def _range(values: np.ndarray) -> tuple[str, str]:

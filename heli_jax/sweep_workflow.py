@@ -32,7 +32,7 @@ def run_sweep(
             memory, without figures.
         figures: True to draw figures, which takes seconds.
         **options: fields of `heli_jax.sweeps.run.Options`, as for `heli_jax.sweep`: resume, chunk,
-            lanes, devices, client, memory, progress, say.
+            lanes, devices, client, progress, say.
 
     Returns:
         A Dataset over `element`, with axes and `status` as coordinates.

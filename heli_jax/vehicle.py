@@ -110,14 +110,9 @@ class Helicopter(eqx.Module):
 
     # Local imports, since summaries imports this module.
     def __repr__(self) -> str:
-        from heli_jax.summaries import as_text, of_vehicle
+        from heli_jax.summaries import of_vehicle
 
-        return as_text(of_vehicle(self))
-
-    def _repr_html_(self) -> str:
-        from heli_jax.summaries import as_html, of_vehicle
-
-        return as_html(of_vehicle(self))
+        return of_vehicle(self)
 
 
 # A vehicle may lack constants that its model does not read; given constants must be possible. The

@@ -4,7 +4,6 @@
 `heli-jax check` does. `load_fit` reads an earlier fit.
 """
 
-import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,7 +18,7 @@ from heli_jax.config.frequency import missing_handling, requested_handling
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.logs import log_notes
 from heli_jax.errors import InputError, located, require_kind
-from heli_jax.finding import Finding, note, without_repeats
+from heli_jax.finding import Finding, without_repeats
 from heli_jax.identification.equation_error.rls import Baseline, baseline
 from heli_jax.identification.fit import check, fit, rates
 from heli_jax.identification.problem import Problem
@@ -76,17 +75,13 @@ class FitRun:
 
         shown = _with_responses(self) if name.startswith(("match", "held")) else self.supplementary
         draw = drawings(Analysis(self.fit, self.problem, self.baseline, shown))
-        figure = styled(draw[name]) if name in draw else None
-        if figure is None:
+        if name not in draw:
             raise ValueError(f"figure: expected one of {', '.join(draw)}, got {name!r}")
-        return figure
+        return styled(draw[name])
 
     def __repr__(self) -> str:
         where = "" if self.directory is None else f"\n  report: {self.directory / 'report.html'}"
         return f"FitRun of {self.config.path}: {self.fit!r}{where}"
-
-    def _repr_html_(self) -> str:
-        return self.fit._repr_html_()
 
 
 def load_config(path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = ()) -> Experiment:
@@ -127,42 +122,17 @@ def run_fit(
         out = run_directory.free_directory(Path(out))  # fails before the work, not after it
     with recorded() as seconds:
         seconds["loading"] = time.perf_counter() - began
-        run = _fit_run(config, progress, began, out)
+        run = _fit_run(config, progress, began)
         run.fit.timing.update(seconds)
     if out is None:
         return run
     progress("writing the report")
     with stage("writing the report"):
-        return _written(run, Path(out), progress)
+        return _write(run, Path(out))
 
 
-class NotWritten(InputError):
-    """Error of a run directory that cannot be written; `run` holds the complete fit."""
-
-    run: FitRun
-
-
-def _written(run: FitRun, out: Path, progress: Say) -> FitRun:
-    """Return the run with its directory written: the existing one, or a new one."""
-    before = run.directory
-    try:
-        written = _write(run, before or out, replaces=before is not None)
-    except InputError as e:
-        failure = NotWritten(f"{e}; the fit stands above, in {before}" if before else str(e))
-        failure.run = run
-        raise failure from e
-    if written.directory not in (out, before):
-        words = f"{out}: another process created it; written to {written.directory}"
-        progress(Note(words))
-    return written
-
-
-def _fit_run(
-    config: Experiment | str | Path, progress: Say, began: float, out: str | Path | None
-) -> FitRun:
-    """Run `run_fit` without its final report. Before slow intervals, write a report of the fit
-    alone.
-    """
+def _fit_run(config: Experiment | str | Path, progress: Say, began: float) -> FitRun:
+    """Run `run_fit` without its report."""
     with stage("reading the log", name="reading"):
         config = config if isinstance(config, Experiment) else load_config(config)
         # A fit that ignores the study would look like the study's result.
@@ -193,33 +163,8 @@ def _fit_run(
             )
     with stage("recursive least squares", name="rls"):
         rls = _baseline(config, problem, fitted, progress)
-    kept = None
-    requested = options.intervals
-    if out is not None and (requested.profile or requested.bootstrap or requested.nuts):
-        kept = _keep(FitRun(config, problem, fitted, rls, began=began), Path(out), progress)
-    try:
-        further = _supplementary(config, problem, fitted, progress)
-    except InputError:
-        if kept is not None:
-            shutil.rmtree(kept, ignore_errors=True)
-        raise
-    return FitRun(config, problem, fitted, rls, further, directory=kept, began=began)
-
-
-def _keep(run: FitRun, out: Path, progress: Say) -> Path | None:
-    """Write a fit before slow intervals, so that an interrupt does not lose it; return its
-    directory.
-    """
-    words = (
-        "The run was interrupted: the requested profile, bootstrap or NUTS intervals are missing."
-    )
-    # The copy has its own times, since those of the run continue.
-    findings = (*run.fit.findings, note("uncertainty.interrupted", words))
-    fitted = replace(run.fit, findings=findings, timing=dict(run.fit.timing))
-    with stage("writing the fit", name="report before further intervals"):
-        directory = _written(replace(run, fit=fitted), out, progress).directory
-    progress(f"the fit is in {directory}; further intervals will be added to it")
-    return directory
+    further = _supplementary(config, problem, fitted, progress)
+    return FitRun(config, problem, fitted, rls, further, began=began)
 
 
 def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Check:
@@ -342,8 +287,8 @@ def write_report(run: FitRun, out: str | Path, *, page: bool = True) -> FitRun:
     return _write(run, run_directory.free_directory(Path(out)), page=page)
 
 
-def _write(run: FitRun, out: Path, *, replaces: bool = False, page: bool = True) -> FitRun:
-    """Write the run directory; `replaces` overwrites the earlier one of this run."""
+def _write(run: FitRun, out: Path, *, page: bool = True) -> FitRun:
+    """Write the run directory."""
     from heli_jax.report.fit_page import Analysis
     from heli_jax.report.fit_page import write_report as write_page
     from heli_jax.report.origin import origin
@@ -353,7 +298,7 @@ def _write(run: FitRun, out: Path, *, replaces: bool = False, page: bool = True)
     # Before the figures, since a configuration that cannot be written fails at once.
     text = as_yaml(configuration.resolved(run.config))
     vehicle, extra = run.config.vehicle, _with_responses(run) if page else run.supplementary
-    with run_directory.whole(out, replaces=replaces, or_beside=not replaces) as folder:
+    with run_directory.whole(out) as folder:
         (folder / "config.yaml").write_text(text, encoding="utf-8")
         files.write_signals(folder / "signals.csv", run.fit.signals)
         title = run.config.path.stem
@@ -370,7 +315,7 @@ def _write(run: FitRun, out: Path, *, replaces: bool = False, page: bool = True)
         run.fit.timing["total"] = time.perf_counter() - run.began
         content = files.fit_json(run.fit, run.problem, run.baseline, extra)
         files.write_json(folder / "fit.json", content)
-    return replace(run, directory=run_directory.written()[-1], supplementary=extra)
+    return replace(run, directory=out, supplementary=extra)
 
 
 def _with_responses(run: FitRun) -> SupplementaryAnalyses:

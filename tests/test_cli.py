@@ -1,9 +1,7 @@
 """Command line: exit codes, sentences and files."""
 
-import errno
 import json
 import os
-import signal
 import subprocess
 import sys
 import textwrap
@@ -283,9 +281,8 @@ def test_usage_and_places_to_write(bench, capsys):
         ["fit", bench, "--out", bench.parent / "there"],
         ["simulate", bench, "--out", bench.parent / "x.doc"],
         ["info", bench.parent / "none.csv"],
-        ["sweep", bench, "--workers", "0"],
+        ["fit", bench, "--workers", "0"],
         ["sweep", bench, "--devices", "two"],
-        ["sweep", bench, "--workers", "1", "--scheduler", "tcp://x:1"],
     ):
         refused(capsys, arguments)
 
@@ -300,23 +297,6 @@ def test_a_device_that_is_not_there(bench, capsys, monkeypatch):
     monkeypatch.setattr(jax, "devices", none)
     for command in (["fit", bench], ["sweep", bench], ["check", bench]):
         refused(capsys, command)
-
-
-def test_an_interrupt_is_one_whatever_a_library_makes_of_it(monkeypatch, capsys):
-    def lowered(options):
-        try:
-            signal.raise_signal(signal.SIGINT)
-        except KeyboardInterrupt as e:
-            raise InputError("bench.yaml: fit: cannot be lowered") from e
-
-    monkeypatch.setattr(commands, "_info", lowered)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        assert main(["info", "log.csv"]) == 130
-        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert capsys.readouterr().err == "heli-jax: interrupted\n"
 
 
 # Each interrupts itself at a moment when an exception would be lost, printed or late.
@@ -363,12 +343,12 @@ def as_program(script, arguments, folder):
     head = (
         "import hashlib, pathlib, signal, sys, threading, time\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "from heli_jax import run_directory\nfrom heli_jax.cli import commands\n"
+        "from heli_jax import __main__, run_directory\nfrom heli_jax.cli import commands\n"
     )
     command = [
         sys.executable,
         "-c",
-        f"{head}{script}\nsys.exit(commands.main())",
+        f"{head}{script}\nsys.exit(__main__.main())",
         *map(str, arguments),
     ]
     return subprocess.Popen(
@@ -383,8 +363,7 @@ def test_an_interrupt_ends_a_command_at_any_moment(tmp_path, moment):
     process = as_program(script, ["info", "log.csv"], tmp_path)
     out, err = process.communicate(timeout=30)
     done = moment == "after the work"
-    words = "wrote done.csv" if done else "nothing was written"
-    assert (out, err) == ("", f"heli-jax: interrupted; {words}\n")
+    assert (out, err) == ("", "heli-jax: interrupted\n")
     assert process.returncode == (143 if moment.startswith("ended") else 130)
     assert [path.name for path in tmp_path.iterdir()] == (["done.csv"] if done else [])
 
@@ -401,7 +380,7 @@ def test_an_interrupt_while_the_command_is_imported(tmp_path):
         [sys.executable, "-c", program, "--help"], cwd=tmp_path, capture_output=True, text=True
     )
     assert (ended.returncode, ended.stdout) == (130, "")
-    assert ended.stderr == "heli-jax: interrupted; nothing was written\n"
+    assert ended.stderr == "heli-jax: interrupted\n"
 
 
 def test_interrupts_after_the_end_are_nothing(tmp_path):
@@ -444,17 +423,6 @@ def test_the_style_of_the_working_folder_is_passed_over(tmp_path):
     assert process.communicate(timeout=60)[1] == ""
 
 
-def test_a_finished_fit_is_shown_where_its_directory_cannot_be_written(bench, capsys, monkeypatch):
-    def full(*_, **__):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr("heli_jax.report.files.write_signals", full)
-    out = bench.parent / "run"
-    assert main(["fit", str(bench), "--out", str(out)]) == 2
-    assert "Ixx" in capsys.readouterr().out
-    assert [p.name for p in bench.parent.iterdir() if "run" in p.name] == []
-
-
 def test_what_was_compiled_is_kept_for_its_owner_alone(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     (tmp_path / "heli_jax").mkdir(mode=0o777)
@@ -464,13 +432,10 @@ def test_what_was_compiled_is_kept_for_its_owner_alone(tmp_path, monkeypatch):
     assert commands._private_cache() is None
 
 
-def test_two_fits_of_one_directory_are_both_kept(tmp_path):
+def test_a_place_that_is_taken_meanwhile_is_refused(tmp_path):
     out = tmp_path / "run"
-    for number in range(3):
-        with run_directory.whole(out, or_beside=True) as folder:
-            (folder / "fit.json").write_text(str(number))
-    kept = {p.name: (p / "fit.json").read_text() for p in tmp_path.iterdir()}
-    assert kept == {"run": "0", "run-2": "1", "run-3": "2"}
+    with run_directory.whole(out) as folder:
+        (folder / "fit.json").write_text("0")
     with pytest.raises(InputError), run_directory.whole(out) as folder:
         (folder / "fit.json").write_text("lost")
     # A regular file cannot contain a folder.
@@ -479,7 +444,8 @@ def test_two_fits_of_one_directory_are_both_kept(tmp_path):
         pass
     with pytest.raises(InputError), run_directory.whole(below):
         pass
-    assert {p.name for p in tmp_path.iterdir()} == {"run", "run-2", "run-3"}
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]
+    assert (out / "fit.json").read_text() == "0"
 
 
 def test_arguments_that_are_no_text_are_refused(capsys):

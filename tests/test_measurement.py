@@ -1,4 +1,4 @@
-"""Filters, delays and vibration between motion and log in a configuration."""
+"""Filters and delays between motion and log in a configuration."""
 
 import re
 
@@ -12,7 +12,6 @@ from heli_jax.config.firmware_filters import logged_filters
 from heli_jax.config.logs import read_flights
 from heli_jax.dynamics.onboard.filters import Filter
 from heli_jax.errors import InputError
-from heli_jax.flights.vibration import lines
 from heli_jax.linear_models.read import linear_model
 from heli_jax.models import with_filters
 
@@ -145,24 +144,6 @@ def test_settings_of_firmwares():
     logged = logged_filters("Rotorflight 4.6.0", newer, "gyroADC[0]")
     assert logged.unknown == ("gyro_lpf1_static_hz = 150 of type 7",)
     assert len(logged.filters) == 2
-
-
-def test_lines_are_found():
-    rng = np.random.default_rng(3)
-    slow = np.sin(2 * np.pi * 0.4 * TIMES) + 0.05 * rng.standard_normal(TIMES.size)
-    shaken = slow + 0.3 * np.sin(2 * np.pi * 24.2 * TIMES) + 0.2 * np.sin(2 * np.pi * 55 * TIMES)
-    first, second = lines(shaken, DT)
-    np.testing.assert_allclose([first.hz, second.hz], [24.2, 55.0], atol=0.13)
-    np.testing.assert_allclose(first.share, 0.045 / np.var(shaken), rtol=0.2)
-    assert lines(slow, DT) == ()
-    assert lines(np.full(300, np.nan), DT) == ()
-
-
-def test_lines_are_a_caution(load, tmp_path):
-    p = 0.1 * stick(TIMES) + 0.05 * np.sin(2 * np.pi * 24.2 * TIMES)
-    write_log(tmp_path / "flight.log", p)
-    (noisy,) = read_flights(load(flight()))
-    assert noisy.source.cautions[-1].code == "vibration.lines"
 
 
 def test_raw_pulse_widths_are_doubted(load, tmp_path):

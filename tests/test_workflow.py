@@ -84,7 +84,7 @@ def test_a_saved_fit_is_read_back(run):
     assert lower < saved.estimates["Ixx"].value < upper
     assert saved.to_dataframe().equals(run.fit.to_dataframe())
     assert str(run.directory) in repr(saved)
-    assert "kg m^2" in saved._repr_html_()
+    assert "kg m^2" in repr(saved)
 
 
 def test_a_directory_without_a_fit_is_refused_in_a_sentence(tmp_path):
@@ -197,9 +197,7 @@ def test_the_time_of_a_run_is_told_part_by_part(config):
     out = config.parent / "told"
     heli_jax.run_fit(heli_jax.load_config(config, asked), out)
     seconds = json.loads((out / "fit.json").read_text())["timing_s"]
-    kept = {"profile likelihood", "report before further intervals"}
-    assert kept < seconds.keys()
-    assert min(seconds[name] for name in kept) > 0
+    assert seconds["profile likelihood"] > 0
     total = seconds.pop("total")
     del seconds["compilation (of these)"]
     assert sum(seconds.values()) == pytest.approx(total, rel=0.03)

@@ -309,15 +309,18 @@ def by_length(N: int) -> float:
 
 def on_workers(flight: Flight, n: int, workers: int) -> float:
     """Return microseconds per vehicle on a local dask cluster: slope, best of three sweeps."""
+    from distributed import LocalCluster
+
     from heli_jax.sweeps.cluster import connected
 
     best = np.inf
-    with connected(workers=workers) as client:
+    local = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None)
+    with local, connected(local.scheduler_address) as client:
         for _ in range(3):
             seen: list[tuple[float, int]] = []
             ours(
                 flight, n, "rk4", client=client, chunk=CHUNK["dask"],
-                progress=lambda p, seen=seen: seen.append((time.perf_counter(), p.done)),
+                progress=lambda done, _, seen=seen: seen.append((time.perf_counter(), done)),
             )  # fmt: skip
             t0, n0 = next(s for s in seen if s[1] >= n / 4)
             t1, n1 = seen[-1]

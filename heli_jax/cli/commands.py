@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from heli_jax import import_path, run_directory
-from heli_jax.cli import interrupts, terminal
-from heli_jax.cli.interrupts import resumable
+from heli_jax.cli import terminal
 from heli_jax.cli.terminal import print_page_table, print_table, print_text
 from heli_jax.errors import InputError, located
 from heli_jax.numbers import adequacy_of
@@ -30,8 +29,7 @@ if TYPE_CHECKING:
     from heli_jax.flights.convert import Selection
 
 # argparse itself exits with 2.
-DONE, WRONG_INPUT, NOT_DETERMINED, NOT_CONVERGED = 0, 2, 3, 4
-INTERRUPTED = interrupts.INTERRUPTED
+DONE, WRONG_INPUT, NOT_DETERMINED, NOT_CONVERGED, INTERRUPTED = 0, 2, 3, 4, 130
 _EXIT_CODES = (
     "Exit codes: 0 done; 2 wrong input, in one sentence; 3 the data cannot determine what was "
     "asked, or an interval is not trusted; 4 an optimiser did not converge, the model is not "
@@ -61,7 +59,7 @@ def _seconds(text: str) -> float:
 
 # Any: keywords of argparse.
 def _arg(*names: str, **keywords: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """Return one argument of a command; arguments marked `either` exclude one another."""
+    """Return one argument of a command."""
     if names[0].startswith("--") and not keywords.keys() & {"action", "metavar"}:
         keywords["action"] = "store_true"
     return names, keywords
@@ -88,15 +86,13 @@ _TIME_RATE = _arg("--time-rate", type=float, metavar="HZ",
 _FLIGHT = _arg("--flight", type=_count, metavar="N",
                help="number of the flight in a log of several (from 1)")
 _RESUME = _arg("--resume", help="continue the study or sweep in --out")
-_WORKERS = (
-    _arg("--workers", type=_count, metavar="N", either=True,
-         help="processes on this machine (default for a study: one a core)"),
-    _arg("--scheduler", metavar="tcp://HOST:8786", either=True,
-         help="compute on the workers of this dask scheduler"),
-)
+_SCHEDULER = _arg("--scheduler", metavar="tcp://HOST:8786",
+                  help="compute on the workers of this dask scheduler")
 _COMMANDS = {
     "fit": ("estimate parameters; write a run directory with a report", (
-        *_CONFIG, _OUT, _JSON, _VERBOSE, _RESUME, *_WORKERS,
+        *_CONFIG, _OUT, _JSON, _VERBOSE, _RESUME, _SCHEDULER,
+        _arg("--workers", type=_count, metavar="N",
+             help="processes on this machine for a study (default: one a core)"),
         _arg("--over", action="append", default=[], metavar="KEY=VALUE,VALUE",
              help="a study (docs/studies.md): fit with each value, with several keys each "
              "combination; or study in CONFIG"),
@@ -126,7 +122,7 @@ _COMMANDS = {
         _arg("--out", metavar="FILE", help=".csv or .parquet (default: CSV on stdout)"),
     )),
     "sweep": ("run a design of many vehicles; results in a Zarr store", (
-        *_CONFIG, _OUT, _RESUME, *_WORKERS,
+        *_CONFIG, _OUT, _RESUME, _SCHEDULER,
         _arg("--devices", type=_count, metavar="N",
              help="processor cores or GPUs to use (default: all)"),
         _arg("--no-figures", help="draw no figures"),
@@ -136,7 +132,7 @@ _COMMANDS = {
         _arg("--channels", metavar="PATTERN", help="list these: 'vehicle_attitude*'"),
     )),
     "convert": ("signals of a log on one clock, as a table", (
-        _LOG, _arg("out", metavar="OUT", help=".csv, .parquet or .nc"),
+        _LOG, _arg("out", metavar="OUT", help=".csv or .parquet"),
         *_CLOCK, _TIME_RATE, _FLIGHT,
         _arg("--signals", nargs="+", default=[], metavar="NAME",
              help="'vehicle_attitude.*', 'euler(vehicle_attitude.q).roll' (default all)"),
@@ -213,54 +209,47 @@ def main(arguments: Sequence[str] | None = None) -> int:
     converge, or the model is not adequate and explains less than the mean of the measurements; 130
     interrupted.
     """
-    # Tests and other programs pass arguments. An interrupt must not end their process.
+    # Tests and other programs pass arguments.
     if arguments is None:
         import_path.ignore_folder_style()
         # These warnings concern numbers of a log or a configuration, which the message explains.
         warnings.filterwarnings(
             "ignore", category=RuntimeWarning, module=r"(heli_jax|numpy|scipy)\b"
         )
-    with interrupts.as_program() if arguments is None else interrupts.as_function() as seen:
-        for text in sys.argv[1:] if arguments is None else arguments:
-            if any("\ud800" <= c <= "\udfff" for c in text):
-                _refuse("heli-jax", f"expected arguments and names of files in UTF-8, got {text!r}")
-        options, unknown = _parser().parse_known_args(arguments)
-        if unknown:
-            # argparse no longer knows the command here.
-            message = f"unrecognized arguments: {' '.join(unknown)}"
-            _refuse(f"heli-jax {options.command}", message)
-        options.interrupts, code = seen, DONE
-        try:
-            options.say = terminal.say_notes if options.quiet else terminal.say
-            with terminal.progress_shown(options.quiet):
-                code = globals()[f"_{options.command.replace('-', '_')}"](options)
-            # Flush here, so that a full disk ends in a message.
-            if sys.stdout is not None:
-                sys.stdout.flush()
-            return code
-        except KeyboardInterrupt:
-            terminal.say(seen.words())
-            return 128 + seen.seen[0] if seen.seen else INTERRUPTED
-        except BrokenPipeError:
-            # `heli-jax simulate ... | head` is no failure and keeps its exit code. Python would
-            # flush standard output again at exit and complain.
-            _discard_output()
-            return code
-        except Exception as e:
-            # A library may have turned an interrupt into an error of its own.
-            if seen.seen:
-                terminal.say("interrupted")
-                return INTERRUPTED
-            # Any other error is a bug, and its report needs the traceback.
-            if not isinstance(e, InputError | OSError):
-                raise
-            if isinstance(e, OSError):
-                # Unprinted output is still buffered and would be flushed again at exit.
-                with contextlib.suppress(OSError, AttributeError, ValueError):
-                    _discard_output()
-                e = InputError(f"{e.filename or 'standard output'}: {e.strerror or e}")
-            terminal.say(" ".join(str(e).split()))
-            return WRONG_INPUT
+    for text in sys.argv[1:] if arguments is None else arguments:
+        if any("\ud800" <= c <= "\udfff" for c in text):
+            _refuse("heli-jax", f"expected arguments and names of files in UTF-8, got {text!r}")
+    options, unknown = _parser().parse_known_args(arguments)
+    if unknown:
+        # argparse no longer knows the command here.
+        message = f"unrecognized arguments: {' '.join(unknown)}"
+        _refuse(f"heli-jax {options.command}", message)
+    code = DONE
+    try:
+        options.say = terminal.say_notes if options.quiet else terminal.say
+        with terminal.progress_shown(options.quiet):
+            code = globals()[f"_{options.command.replace('-', '_')}"](options)
+        # Flush here, so that a full disk ends in a message.
+        if sys.stdout is not None:
+            sys.stdout.flush()
+        return code
+    except KeyboardInterrupt:
+        terminal.say("interrupted")
+        return INTERRUPTED
+    except BrokenPipeError:
+        # `heli-jax simulate ... | head` is no failure and keeps its exit code. Python would
+        # flush standard output again at exit and complain.
+        _discard_output()
+        return code
+    # Any other error is a bug, and its report needs the traceback.
+    except (InputError, OSError) as e:
+        if isinstance(e, OSError):
+            # Unprinted output is still buffered and would be flushed again at exit.
+            with contextlib.suppress(OSError, AttributeError, ValueError):
+                _discard_output()
+            e = InputError(f"{e.filename or 'standard output'}: {e.strerror or e}")
+        terminal.say(" ".join(str(e).split()))
+        return WRONG_INPUT
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -277,12 +266,8 @@ def _parser() -> argparse.ArgumentParser:
         added.add_argument(
             "--quiet", action="store_true", help="print results, doubts and errors only"
         )
-        either = None
         for names, keywords in arguments:
-            group = added
-            if "either" in keywords:
-                group = either = either or added.add_mutually_exclusive_group()
-            group.add_argument(*names, **{k: v for k, v in keywords.items() if k != "either"})
+            added.add_argument(*names, **keywords)
     return parser
 
 
@@ -370,36 +355,24 @@ def _fit(options: argparse.Namespace) -> int:
     from heli_jax.cli import fits
 
     experiment = workflow.load_config(options.config, options.set)
-    failure = None
-    try:
-        run = workflow.run_fit(experiment, out, progress=options.say, began=began)
-    except workflow.NotWritten as e:
-        # Print at least the fit, which may have taken hours.
-        run, failure = e.run, e
-    if options.json and run.directory is not None:
-        print((run.directory / "fit.json").read_text(encoding="utf-8"), end="")
+    run = workflow.run_fit(experiment, out, progress=options.say, began=began)
+    if options.json:
+        print((out / "fit.json").read_text(encoding="utf-8"), end="")
     else:
         fits.print_fit(run, verbose=options.verbose)
-    if failure is not None:
-        raise failure
     return run.fit.exit_code
 
 
 def _fit_study(options: argparse.Namespace, study: "Study") -> int:
     """Run a study, print it, and return the exit code of the worst fit."""
     from heli_jax.cli import simulations
-    from heli_jax.studies import directory
     from heli_jax.studies import run as studies
 
     if options.json:
         raise InputError("--json: prints the fit.json of one fit, and a study has many")
     _require_out(options)
     out = _directory(options)
-    options.interrupts.words = lambda: resumable(out, directory.FINISHED)
-    # Workers of dask must be stopped. Our own processes end with this one.
-    options.interrupts.unwinds = bool(options.scheduler)
-    # Without a scheduler, --workers starts our own processes, which do not need dask.
-    with _dask_client(options) if options.scheduler else contextlib.nullcontext() as client:
+    with _dask_client(options.scheduler) as client:
         how = {"workers": options.workers, "client": client, "reports": options.reports}
         result = studies.run(study, out, studies.Options(options.resume, **how, say=options.say))
     simulations.print_study(result)
@@ -413,19 +386,18 @@ def _require_out(options: argparse.Namespace) -> None:
 
 
 # Any: dask.distributed is an extra, and only `sweeps.cluster` names its classes.
-def _dask_client(options: argparse.Namespace) -> contextlib.AbstractContextManager[Any]:
-    """Return a dask client if --scheduler or --workers asks for one."""
-    if options.scheduler is None and options.workers is None:
+def _dask_client(scheduler: str | None) -> contextlib.AbstractContextManager[Any]:
+    """Return a dask client of --scheduler, if it is stated."""
+    if scheduler is None:
         return contextlib.nullcontext()
     try:
         from heli_jax.sweeps.cluster import connected
     except ImportError as e:
-        option = "--workers" if options.scheduler is None else "--scheduler"
         raise InputError(
-            f"{option}: dask.distributed is not installed, expected the extra distributed: "
+            "--scheduler: dask.distributed is not installed, expected the extra distributed: "
             "pip install 'heli_jax[distributed]'"
         ) from e
-    return connected(options.scheduler, options.workers)
+    return connected(scheduler)
 
 
 def _discard_output() -> None:
@@ -544,13 +516,9 @@ def _sweep(options: argparse.Namespace) -> int:
     from heli_jax import config as configuration
     from heli_jax import sweep_workflow
     from heli_jax.cli import simulations
-    from heli_jax.sweeps.store import FINISHED
 
     experiment = configuration.load(options.config, options.set)
-    options.interrupts.words = lambda: resumable(out, FINISHED)
-    # Processes of a cluster must be stopped.
-    options.interrupts.unwinds = bool(options.workers or options.scheduler)
-    with _dask_client(options) as client:
+    with _dask_client(options.scheduler) as client:
         sweep_workflow.run_sweep(
             experiment,
             out,

@@ -23,7 +23,7 @@ from heli_jax.config.frequency import check_pairs, missing_handling, requested_h
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.logs import log_notes, read_flights, with_log
 from heli_jax.errors import InputError, located
-from heli_jax.finding import Finding, note, sentences
+from heli_jax.finding import Finding, sentences
 from heli_jax.flights.flight import Flight
 from heli_jax.numbers import plain_words
 from heli_jax.stages import Note
@@ -63,29 +63,8 @@ def responses_of_log(
             f"there (a sweep, doublets) for longer than a few windows of {estimate.window:.3g} s, "
             f"got {longest:.3g} s"
         )
-    notes = (
-        *log_notes(flights),
-        *_held_out(flights),
-        *_read_in_degrees(experiment, flights),
-    )
+    notes = (*log_notes(flights), *_read_in_degrees(experiment, flights))
     return estimate._replace(notes=(*estimate.notes, *notes))
-
-
-def _held_out(flights: Sequence[Flight]) -> tuple[Finding, ...]:
-    """Return a note if flights held out of a fit count here, so that its report shows other
-    responses.
-    """
-    from heli_jax.flights.flight import labels
-
-    named = zip(labels(tuple(flights)), flights, strict=True)
-    names = [label for label, flight in named if flight.hold_out]
-    if not names:
-        return ()
-    words = (
-        f"{', '.join(names)}: used here like the other flights, although held out from the fit "
-        "(hold_out: true) and from the responses in its report"
-    )
-    return (note("responses.held-out-used", words, *names),)
 
 
 def _read_in_degrees(experiment: Experiment, flights: Sequence[Flight]) -> tuple[Finding, ...]:

@@ -4,10 +4,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from heli_jax.config.section import Section
+from heli_jax.config.section import Positive, Section
 from heli_jax.errors import nearest
-
-_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class DisturbanceConfig(Section):
@@ -26,10 +24,10 @@ class DisturbanceConfig(Section):
     # constant.
     poles: Literal[1, 2] = 1
     """1: an Ornstein-Uhlenbeck process; 2: passed through a second lag"""
-    sigma_w: _Positive | dict[str, _Positive] | None = None
+    sigma_w: Positive | dict[str, Positive] | None = None
     """standard deviation, in the state's unit per second (SI), by name for several; required to
     simulate, an initial guess for filter error"""
-    tau_w: _Positive | dict[str, _Positive] | None = None
+    tau_w: Positive | dict[str, Positive] | None = None
     """correlation time [s], by name for several or one number for all, as sigma_w"""
     fixed: list[str] = []
     """parameters that filter error does not estimate: sigma_w, tau_w (for several sigma_w_p, ...),

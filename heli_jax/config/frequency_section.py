@@ -4,10 +4,9 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from heli_jax.config.section import Section
+from heli_jax.config.section import Positive, Section
 
 _Coherence = Annotated[float, Field(ge=0, lt=1)]
-_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 def _increasing(band: tuple[float, float]) -> tuple[float, float]:
@@ -16,7 +15,7 @@ def _increasing(band: tuple[float, float]) -> tuple[float, float]:
     return band
 
 
-_Band = Annotated[tuple[_Positive, _Positive], AfterValidator(_increasing)]
+_Band = Annotated[tuple[Positive, Positive], AfterValidator(_increasing)]
 
 
 class TransferConfig(Section):
@@ -85,7 +84,7 @@ class FrequencyConfig(Section):
 
     band: _Band | None = None
     """first and last frequency [Hz]; default two periods in a window to 0.4 of the rate"""
-    window: _Positive | None = None
+    window: Positive | None = None
     """length of a window [s]; default a fifth of the longest flight, at most 30 s"""
     points: Annotated[int, Field(ge=8, le=2000)] | None = None
     """number of frequencies, equally spaced in the logarithm; default 120, and for fit.method:

@@ -9,7 +9,6 @@ import numpy as np
 
 from heli_jax import naming, units
 from heli_jax.config.experiment import Experiment
-from heli_jax.config.feedthrough import follows
 from heli_jax.config.kinematics import between_samples, prepared
 from heli_jax.config.measurement import (
     filter_cautions,
@@ -31,13 +30,10 @@ from heli_jax.flights.clock import by_rate
 from heli_jax.flights.flight import Source
 from heli_jax.flights.log import ChannelLog, Table
 from heli_jax.flights.request import unit_note
-from heli_jax.flights.vibration import lines
 
 _PULSE = (800.0, 2200.0)
 """Pulse widths of receivers and servos [us]."""
 _OFFSET_AND_SCALE = "such as offset: 1500, scale: 0.002"
-_MOST_LINES = 3
-"""Most vibration lines in the note of an output."""
 
 
 def require_flights(experiment: Experiment) -> None:
@@ -119,7 +115,6 @@ def _read_flight(experiment: Experiment, i: int, f: FlightConfig, gain: bool) ->
             name=f.name or f"flight {i + 1}",
             number=f.flight,
             also=tuple(_also(experiment, a, inputs, outputs) for a in f.also),
-            follows=follows(experiment, f.rate, inputs),
             runs=runs,
             swashplate=swashplate,
         )
@@ -133,7 +128,6 @@ def _read_flight(experiment: Experiment, i: int, f: FlightConfig, gain: bool) ->
     cautions = (
         *filter_cautions(first.source, everything.outputs),
         *_pulse_width_doubts(first),
-        *_vibration_notes(first),
     )
     return (_with_notes(first, notes, cautions), *others)
 
@@ -276,20 +270,6 @@ def _with_notes(
     cautions = cautions or source.cautions
     source = dataclasses.replace(source, notes=(*source.notes, *notes), cautions=cautions)
     return dataclasses.replace(flight, source=source)
-
-
-def _vibration_notes(flight: Flight) -> tuple[Finding, ...]:
-    """Return a note for each output with strong lines in its spectrum."""
-    notes = []
-    for name, y in flight.outputs.items():
-        if vibration := lines(y, flight.dt):
-            each = "; ".join(
-                f"{line.hz:.3g} Hz has {100 * line.share:.2g} % of its variance"
-                for line in vibration[:_MOST_LINES]
-            )
-            words = f"{name} vibrates: {each}"
-            notes.append(note("vibration.lines", words, name, value=vibration[0].share))
-    return tuple(notes)
 
 
 def log_notes(flights: Sequence[Flight]) -> list[Finding]:

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, model_validator
 
-from heli_jax.config.section import Section
+from heli_jax.config.section import Positive, Section
 from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.onboard.delays import ORDER, with_delays
 from heli_jax.dynamics.onboard.filters import Filter, check_delay
@@ -95,7 +95,6 @@ class DelaysConfig(Section):
 
 FROM_LOG = "from log"
 """Kind of filter that the log's own settings state."""
-_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class FilterConfig(Section):
@@ -103,13 +102,13 @@ class FilterConfig(Section):
 
     kind: Literal["pt1", "pt2", "pt3", "biquad", "notch", "from log"]
     """kind of low-pass or notch; from log: from the settings in the log"""
-    hz: _Positive | None = None
+    hz: Positive | None = None
     """cut-off (3 dB) of a low-pass, or centre of a notch"""
-    q: _Positive | None = None
+    q: Positive | None = None
     """quality of a biquad or notch"""
-    bandwidth: _Positive | None = None
+    bandwidth: Positive | None = None
     """width of a notch [Hz], in place of q"""
-    attenuation: _Positive | None = None
+    attenuation: Positive | None = None
     """depth of a notch at its centre [dB]"""
 
     @model_validator(mode="after")

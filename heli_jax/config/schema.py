@@ -10,14 +10,10 @@ from heli_jax.config.disturbance_section import DisturbanceConfig
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.onboard import Delay, Filters, OnboardConfig
 from heli_jax.config.run_sections import SimulateConfig, SweepConfig
-from heli_jax.config.section import Section
+from heli_jax.config.section import Finite, Positive, Section
 from heli_jax.config.signal_section import LoggedInputConfig, Numbers, PresetConfig, ScaledConfig
 from heli_jax.identification.methods import METHODS
 from heli_jax.identification.problem import Sign
-
-# YAML reads .inf and .nan as numbers; a NaN would pass every comparison with a bound.
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 # The records for scripts (`Free`, `Prior`, `Nuisance`) have separate sections with the same fields,

@@ -4,20 +4,18 @@ from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
-from heli_jax.config.section import Section
+from heli_jax.config.section import Finite, Section
 from heli_jax.flights.derived import Swashplate
 from heli_jax.flights.flight import Signal, scale_problem
 from heli_jax.flights.preset import preset, presets
-
-_Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class ScaledConfig(Section):
     """(number in the log - offset) scale, in the stated unit, inverted or not."""
 
-    scale: _Finite = 1.0
+    scale: Finite = 1.0
     """factor of the number in the log, after offset"""
-    offset: _Finite = 0.0
+    offset: Finite = 0.0
     """offset in the log's own numbers"""
     invert: bool = False
     """true: change the sign"""
@@ -40,7 +38,7 @@ class LoggedInputConfig(ScaledConfig):
 
     signal: str | None = None
     """a channel's or column's name in the log"""
-    constant: _Finite | None = None
+    constant: Finite | None = None
     """value in the stated unit"""
 
     @model_validator(mode="after")
@@ -62,7 +60,7 @@ class CcpmConfig(Section):
 
     servos: list[str]
     """the channels of the servos"""
-    angles: list[_Finite]
+    angles: list[Finite]
     """angle of each servo [deg], clockwise from the nose, seen from above"""
     radius: Numbers = 1.0
     """distance of each servo from the mast, in any one unit"""
@@ -72,7 +70,7 @@ class CcpmConfig(Section):
     """lift per unit of the log"""
     invert: bool | list[bool] = False
     """true for a servo that moves the other way"""
-    phase: _Finite = 0.0
+    phase: Finite = 0.0
     """angle by which the plate leads the blades [deg]"""
 
     @model_validator(mode="after")

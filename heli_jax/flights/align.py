@@ -5,10 +5,7 @@ Then least squares refines it to a part of a sample,
 
     a(t) = g b(t - lag) + c + d t + e(t),
 
-where g, c and d allow for a scale, a bias and its drift. The standard deviation of the lag is that
-of least squares with autocorrelated errors. It follows from the curvature of the sum of squares and
-the spectrum of the residual (L. Ljung, System Identification, 1999, section 9.4). With white errors
-it is the Cramer-Rao bound of a delay.
+where g, c and d allow for a scale, a bias and its drift.
 """
 
 from typing import Any, NamedTuple
@@ -33,12 +30,10 @@ _REACH = 3.0
 
 
 class Lag(NamedTuple):
-    """Correction of the second clock, with its standard deviation."""
+    """Correction of the second clock."""
 
     lag: float
     """Correction [s]."""
-    sd: float
-    """Standard deviation [s]."""
     correlation: float
     overlap: float
     """Overlap [s]."""
@@ -69,8 +64,8 @@ def lag_between(a: Timed, b: Timed) -> Lag:
     lag = at_a - at_b + shift * step
     first, last = max(0, shift), min(even_a.size, even_b.size + shift)
     x, t = even_a[first:last], at_a + step * np.arange(first, last)
-    lag, sd = _refined(t, x, at_b, even_b, lag, step)
-    return Lag(lag + first_a - first_b, sd, correlation, (last - first - 1) * step)
+    lag = _refined(t, x, at_b, even_b, lag, step)
+    return Lag(lag + first_a - first_b, correlation, (last - first - 1) * step)
 
 
 def _even(signal: Timed, step: float) -> tuple[float, np.ndarray]:
@@ -175,8 +170,8 @@ def correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def _refined(
     t: np.ndarray, x: np.ndarray, first: float, samples: np.ndarray, near: float, step: float
-) -> tuple[float, float]:
-    """Return the least-squares lag and its standard deviation, both [s].
+) -> float:
+    """Return the least-squares lag [s].
 
     Args:
         t: times of x [s].
@@ -187,17 +182,14 @@ def _refined(
         step: step of `samples` [s].
     """
     from scipy.interpolate import CubicSpline
-    from scipy.optimize import least_squares
+    from scipy.optimize import minimize_scalar
 
     there = np.isfinite(samples)
     smooth = CubicSpline((first + step * np.arange(samples.size))[there], samples[there])
 
-    def linearised(lag: float) -> np.ndarray:
-        """Return the residual of x and its derivative by the lag (2, n).
-
-        They are zero where one of the two signals is missing. Scale, bias and drift are removed
-        from both.
-        """
+    def misfit(steps: float) -> float:
+        """Return the mean square of x without the scaled other signal, a bias and its drift."""
+        lag = near + steps * step
         i = np.floor((t - lag - first) / step + 1e-9).astype(np.int64)
         inside = (i >= 0) & (i < there.size - 1)
         i = np.clip(i, 0, there.size - 2)
@@ -205,46 +197,13 @@ def _refined(
         if seen.sum() < _FEWEST:
             raise NotAligned("they overlap by too little")
         at = t[seen] - lag
-        others = np.stack([smooth(at), np.ones(at.size), at - at.mean()], axis=1)
-        both = np.stack([x[seen], smooth(at, 1)], axis=1)
-        gains = np.linalg.lstsq(others, both, rcond=None)[0]
-        left, slope = (both - others @ gains).T
-        whole = np.zeros((2, t.size))
-        # Positive, because b(t - lag) has the derivative -b'(t - lag) by the lag.
-        whole[:, seen] = left, gains[0, 0] * slope
-        return whole
+        columns = np.stack([smooth(at), np.ones(at.size), at - at.mean()], axis=1)
+        gains = np.linalg.lstsq(columns, x[seen], rcond=None)[0]
+        return float(np.mean((x[seen] - columns @ gains) ** 2))
 
-    # The unknown is in steps from the near lag, because an epoch's digits would cost precision.
-    # Any: the stubs know no function here.
-    jacobian: Any = lambda z: step * linearised(near + z[0] * step)[1][:, None]  # noqa: E731
-    found = least_squares(
-        lambda z: linearised(near + z[0] * step)[0],
-        [0.0],
-        jac=jacobian,
-        bounds=([-_REACH], [_REACH]),
-    )
-    lag = near + float(found.x[0]) * step
-    left, slope = linearised(lag)
-    curvature = float(slope @ slope)
-    if abs(found.x[0]) > 0.999 * _REACH or not curvature > 0:
+    # Any: the stubs do not know the result.
+    bounds, options = (-_REACH, _REACH), {"xatol": 1e-5}
+    found: Any = minimize_scalar(misfit, bounds=bounds, method="bounded", options=options)
+    if abs(found.x) > 0.999 * _REACH:
         raise NotAligned("the sum of squares has no minimum near the best lag")
-    return lag, float(np.sqrt(t.size * _long_run(slope * left)) / curvature)
-
-
-def _long_run(v: np.ndarray) -> float:
-    """Return the variance of the sum of v (n,) over n: the sum of its autocovariances.
-
-    Parzen's window weights them; its length follows from the correlation time (Andrews, 1991).
-    """
-    n = v.size
-    size = 1 << (2 * n - 1).bit_length()
-    c = np.fft.irfft(np.abs(np.fft.rfft(v, size)) ** 2, size)[:n] / n
-    if not c[0] > 0:
-        return 0.0
-    rho = c[1 : max(n // 5, 2)] / c[0]
-    time = max(1.0, (1.0 + 2.0 * float(np.sum(rho**2))) / (1.0 + 2.0 * rho.size / n))
-    length = min(max(6.0 * time * (n / time) ** 0.2, 2.0), 0.5 * n)
-    lags = np.minimum(np.arange(n) / length, 1.0)
-    window = np.where(lags < 0.5, 1 - 6 * lags**2 * (1 - lags), 2 * (1 - lags) ** 3)
-    # Few windows fit into a short record, and the least-squares fit removes part of the residual.
-    return max(float(c[0] + 2.0 * np.sum(window[1:] * c[1:])), 0.1 * float(c[0]))
+    return near + float(found.x) * step

@@ -1,4 +1,4 @@
-"""Conversion of a log of any format to one table with a uniform clock: CSV, Parquet or NetCDF."""
+"""Conversion of a log of any format to one table with a uniform clock: CSV or Parquet."""
 
 import fnmatch
 import os
@@ -28,7 +28,7 @@ from heli_jax.flights.request import require_rate_and_window
 from heli_jax.flights.resample import hold, in_gaps, rate_notes, resampled
 from heli_jax.flights.write import write_table
 
-ENDINGS = (".csv", ".parquet", ".nc")
+ENDINGS = (".csv", ".parquet")
 TIME = "time"
 """Name of the first column, in seconds from the log's beginning."""
 _SHARE = 0.5
@@ -296,34 +296,11 @@ def require_output(out: Path, log: str | Path) -> None:
 
 
 def write_converted(out: Path, converted: Converted) -> None:
-    """Write the columns; a missing sample is an empty cell, or NaN in NetCDF.
+    """Write the columns; a missing sample is an empty cell.
 
     Raises:
-        InputError: a signal has a name that NetCDF does not allow.
         OSError: the place cannot be written to.
     """
-    if out.suffix.lower() == ".nc":
-        _write_netcdf(out, converted)
-    else:
-        # Missing cells are nulls: CSV would show a NaN as the word nan.
-        columns = {n: np.ma.masked_invalid(x) for n, x in converted.columns.items()}
-        write_table(out, columns, converted.units)
-
-
-def _write_netcdf(out: Path, converted: Converted) -> None:
-    import xarray
-
-    data = xarray.Dataset(
-        {
-            name: (TIME, values, {"units": converted.units[name]} if converted.units[name] else {})
-            for name, values in converted.columns.items()
-        }
-    )
-    try:
-        # SciPy's writer needs no HDF5 library. Its format with 64-bit positions has no limit of 2
-        # GB.
-        data.to_netcdf(out, engine="scipy", format="NETCDF3_64BIT")
-    except (ValueError, UnicodeError) as e:
-        names = ", ".join(shown(n) for n in converted.columns if "/" in n or not n.isascii())
-        problem = f"a name that NetCDF does not allow ({names or 'see the log'})"
-        raise wrong(str(out), f"{problem}, expected names without '/'; write CSV or Parquet") from e
+    # Missing cells are nulls: CSV would show a NaN as the word nan.
+    columns = {n: np.ma.masked_invalid(x) for n, x in converted.columns.items()}
+    write_table(out, columns, converted.units)

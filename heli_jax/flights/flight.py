@@ -296,16 +296,10 @@ class Flight:
         outputs = frozenset(key for key in signals if key[1] == "output")
         return {**facts_of_all(timed, outputs), **{k: known[k] for k in signals if k in known}}
 
-    # Imported inside: `summaries` is for notebooks, and flights do not need it.
     def __repr__(self) -> str:
-        from heli_jax.summaries import as_text, of_flight
+        from heli_jax.summaries import of_flight
 
-        return as_text(of_flight(self))
-
-    def _repr_html_(self) -> str:
-        from heli_jax.summaries import as_html, of_flight
-
-        return as_html(of_flight(self))
+        return of_flight(self)
 
 
 def _samples(name: str, values: np.ndarray, gaps: bool) -> np.ndarray:

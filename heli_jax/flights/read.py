@@ -361,8 +361,8 @@ def _aligned(
         what = f"{also.same} of {Path(request.path).name} and {shown(also.to)}"
         raise wrong(also.path, f"cannot be aligned by {what}: {e}") from e
     words = (
-        f"{name}: its times were shifted by {lag.lag:.6g} s (sd {1000.0 * lag.sd:.2g} ms), "
-        f"counted from its start, so that {shown(also.to)} agrees best with {also.same} "
+        f"{name}: its times were shifted by {lag.lag:.6g} s, counted from its "
+        f"start, so that {shown(also.to)} agrees best with {also.same} "
         f"(correlation {lag.correlation:.3f} over {lag.overlap:.4g} s)"
     )
     return lag.lag, Finding(

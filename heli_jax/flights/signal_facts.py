@@ -19,8 +19,6 @@ _VISITS = 2
 """Fewest visits to a rail."""
 RAIL_SHARE = 0.005
 """Smallest share of samples at a rail that is reported."""
-_LATTICE = 1e-3
-"""Tolerance of multiples of a step [steps], for converted units."""
 _STUCK, STUCK_SECONDS = 20.0, 0.5
 """Length of a stuck part: ratio to the usual number of equal samples, and time [s]."""
 _AT_REST = 1e-3
@@ -241,19 +239,3 @@ def _at_top(x: np.ndarray, counts: np.ndarray) -> np.ndarray:
     edges = np.flatnonzero(np.diff(np.r_[0, at.astype(int), 0])).reshape(-1, 2)
     visits = len(edges) >= _VISITS and np.diff(edges).max() >= _RUN and not (at[0] and at[-1])
     return at & (piled and visits)
-
-
-def quantum(x: np.ndarray) -> float:
-    """Return the step of which all differences of values (N,) are multiples; 0 if there is none."""
-    levels = np.unique(x[np.isfinite(x)])
-    if levels.size < 2:
-        return 0.0
-    steps = np.diff(levels)
-    # Smaller differences are rounding of one value.
-    steps = steps[steps > 1e-9 * (levels[-1] - levels[0])]
-    if not steps.size or not np.isfinite(steps).all():  # huge values
-        return 0.0
-    step = float(steps.min())
-    multiples = steps / step
-    whole = np.abs(multiples - np.round(multiples)) <= _LATTICE * multiples
-    return step if bool(np.all(whole)) else 0.0

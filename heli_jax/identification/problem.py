@@ -258,14 +258,9 @@ class Problem:
         return naming.Varied(self.vehicle, dict.fromkeys((*self.free, *known)))
 
     def __repr__(self) -> str:
-        from heli_jax.summaries import as_text, of_problem
+        from heli_jax.summaries import of_problem
 
-        return as_text(of_problem(self))
-
-    def _repr_html_(self) -> str:
-        from heli_jax.summaries import as_html, of_problem
-
-        return as_html(of_problem(self))
+        return of_problem(self)
 
 
 def _check_method(problem: Problem) -> None:

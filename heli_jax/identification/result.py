@@ -247,14 +247,9 @@ class Fit:
     # The modules that print and export import this one, so they are imported inside.
 
     def __repr__(self) -> str:
-        from heli_jax.summaries import as_text, of_fit
+        from heli_jax.summaries import of_fit
 
-        return as_text(of_fit(self))
-
-    def _repr_html_(self) -> str:
-        from heli_jax.summaries import as_html, of_fit
-
-        return as_html(of_fit(self))
+        return of_fit(self)
 
     def to_dataframe(self, *, nuisance: bool = False) -> "pd.DataFrame":
         """Return the estimates as a pandas data frame, one row each.

@@ -17,8 +17,8 @@ from heli_jax.report.origin import origin
 from heli_jax.report.page import filled
 from heli_jax.report.saved_fit import SavedFit, load_fit
 from heli_jax.report.style import pretty
-from heli_jax.report.tables import NOT_DETERMINED, Table, combination, product
-from heli_jax.summaries import Summary, as_html, as_text
+from heli_jax.report.tables import NOT_DETERMINED, Table
+from heli_jax.summaries import as_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -56,14 +56,13 @@ class ComparedRuns(NamedTuple):
     def _by_run(self) -> list[dict[str, Estimate]]:
         """Return each run's estimates, combinations and shared nuisances.
 
-        Combinations are those determined in any run. Gains, the time shift and the disturbance
-        follow.
+        The nuisances are gains, the time shift and the disturbance.
         """
         by_run = []
-        for run, combined in zip(self.runs, _combinations(self.runs), strict=True):
+        for run in self.runs:
             # A nuisance of one flight is named FLIGHT/NAME.
             shared = {n: e for n, e in run.nuisance.items() if "/" not in n}
-            by_run.append({**run.estimates, **combined, **shared})
+            by_run.append({**run.estimates, **_combinations(run), **shared})
         return by_run
 
     @property
@@ -153,16 +152,10 @@ class ComparedRuns(NamedTuple):
         """Return `to_dataframe` as CSV."""
         return self.to_dataframe().to_csv(index=False, lineterminator="\n")
 
-    def _summary(self) -> Summary:
+    def __repr__(self) -> str:
         head, rows = self.estimates
         title = f"{len(self.runs)} runs: {', '.join(self.labels)}"
-        return Summary(title, head, tuple(rows), tuple(sentences(self.notes)))
-
-    def __repr__(self) -> str:
-        return as_text(self._summary())
-
-    def _repr_html_(self) -> str:
-        return as_html(self._summary())
+        return as_text(title, head, rows, sentences(self.notes))
 
 
 def compare_runs(runs: Sequence[str | Path | SavedFit]) -> ComparedRuns:
@@ -202,38 +195,18 @@ def _samples(run: SavedFit) -> tuple[Any, ...]:
     return run.content.get("n_samples"), *facts
 
 
-def _combinations(runs: Sequence[SavedFit]) -> list[dict[str, Estimate]]:
-    """Return for each run the combinations that any run determines.
-
-    If a run determines the parameters, its estimates, correlations and constants give the
-    combinations.
-    """
-    stated = [_stated(run) for run in runs]
-    every = {n: c for of in stated for n, c in of.items()}
-    by_run: list[dict[str, Estimate]] = [{} for _ in runs]
-    for run, of, found in zip(runs, stated, by_run, strict=True):
-        constants, verdict = run.content.get("constants") or {}, run.content["verdict"]
-        among = verdict.get("names") or [], verdict.get("correlation") or []
-        for name, c in every.items():
-            made = None
-            if name in of:
-                made = combination(*(of[name][key] for key in _NUMBERS))
-            elif c.get("kind", "product") == "product":
-                made = product(c["exponents"], run.estimates, constants, *among)
-            if made is not None:
-                found[name] = made
-    return by_run
-
-
 _NUMBERS = ("value", "sd", "lower95", "upper95")
 
 
-# Any: content of fit.json.
-def _stated(run: SavedFit) -> dict[str, dict[str, Any]]:
-    """Return the determined combinations of a fit; none if it did not converge."""
+def _combinations(run: SavedFit) -> dict[str, Estimate]:
+    """Return the combinations that a fit determines; none if it did not converge."""
     every = run.content.get("determined_combinations") or ()
     known = (c for c in every if all(c.get(key) is not None for key in _NUMBERS))
-    return {c["name"]: c for c in known if _converged(run)}
+    return {
+        c["name"]: Estimate(*(c[key] for key in _NUMBERS), "SI", math.nan, 0.0, False)
+        for c in known
+        if _converged(run)
+    }
 
 
 # Any: mappings of estimates or of metrics by name.

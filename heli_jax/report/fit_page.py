@@ -57,11 +57,11 @@ def write_report(
     folder.mkdir(parents=True, exist_ok=True)
     numbers = Numbers()
     # Figures are drawn one by one to save memory.
-    drawn = (
+    pictures = [
         picture(name, draw, numbers, folder=folder, png=png)
         for name, draw in drawings(analysis).items()
-    )
-    pictures, first = [p for p in drawn if p is not None], None
+    ]
+    first = None
     if (worst := worst_output(fit)) is not None:
         first = picture("overview", lambda: figures.overview(*worst, problem.model), numbers)
     page = filled(
@@ -110,9 +110,6 @@ GROUPS = {
     "held": "The same for all held-out flights together: gain and phase of model and data with "
     "95 % intervals, partial coherence of the data, and data over model.",
     "rls": "Each coefficient over the record: a trustworthy one becomes constant.",
-    "pairs": "Dots and bars: the samples. Blue: the fit's Gaussian approximation with its sd; "
-    "each curve encloses 95 % of it. Where the dots deviate from it, intervals and "
-    "correlations are wrong.",
 }
 """Caption after a figure's title, by the beginning of its name."""
 
@@ -137,11 +134,6 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
     later = functools.partial
     fit, problem, baseline, supplementary = analysis
     model, drawings = problem.model, dict[str, Draw]()
-    if (comparison := supplementary.intervals) is not None:
-        if comparison.posterior is not None:
-            drawings["pairs_posterior"] = later(figures.posterior_pairs, comparison.posterior, fit)
-        if comparison.bootstrap is not None:
-            drawings["pairs_bootstrap"] = later(figures.bootstrap_pairs, comparison.bootstrap, fit)
     parts = _parts([s.flight for s in fit.signals])
     for i in _drawn([s.hold_out for s in fit.signals]):
         s, part = fit.signals[i], parts[i]

@@ -3,12 +3,11 @@
 A line figure is stored as numbers, which the page draws, and as words for screen readers.
 """
 
-import contextlib
 import functools
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jinja2
 import markupsafe
@@ -17,11 +16,8 @@ from heli_jax.numbers import page_sentence
 from heli_jax.report import style
 from heli_jax.report.charts import Chart, Numbers, as_base64, described
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-type Draw = "Callable[[], Chart | Figure | None]"
-"""Function that draws a figure, or returns None if there is nothing to draw."""
+type Draw = Callable[[], Chart]
+"""Function that draws a figure."""
 
 MOST_FLIGHTS = 6
 """Most flights with their own figures; signals.csv has all flights."""
@@ -72,7 +68,7 @@ class Picture(NamedTuple):
     chart: int | None = None
     """Number of the chart on the page; None for an image."""
     image: str = ""
-    """data: address; empty for a chart, and for a file alone."""
+    """data: address; empty for a chart."""
     size: tuple[int, int] = (0, 0)
     """Width and height of the image [pixel]."""
     file: str = ""
@@ -85,7 +81,8 @@ def of_file(png: Path, title: str, alt: str) -> Picture:
 
     with Image.open(png) as image:
         size = image.size
-    return Picture(png.stem, title, alt, None, _address("png", png.read_bytes()), size)
+    address = f"data:image/png;base64,{as_base64(png.read_bytes())}"
+    return Picture(png.stem, title, alt, None, address, size)
 
 
 def picture(
@@ -95,27 +92,14 @@ def picture(
     *,
     folder: Path | None = None,
     png: bool = False,
-) -> Picture | None:
-    """Draw a figure for a page; return None if there is nothing to draw.
+) -> Picture:
+    """Draw a figure for a page.
 
     Args:
         folder: directory for NAME.svg, and NAME.png if requested; default no files.
     """
-    # Charts alone need no Matplotlib, which takes a second to load.
-    with style.in_style() if folder else contextlib.nullcontext():
-        made = draw()
-        svg = style.save(lambda: made, folder / name, png=png) if folder else None
-    if made is None:
-        return None
-    file = f"{folder.name}/{name}.svg" if folder else ""
-    if isinstance(made, Chart):
-        number = numbers.add_chart(made)
-        return Picture(name, made.title, described(made), number, file=file)
-    title, _, note = made.get_suptitle().partition("\n")
-    width, height = (round(96 * v) for v in made.get_size_inches())
-    image = _address("svg+xml", svg) if svg else ""
-    return Picture(name, title, f"{title}. {note}", None, image, (width, height), file)
-
-
-def _address(kind: str, data: bytes) -> str:
-    return f"data:image/{kind};base64,{as_base64(data)}"
+    made, file = draw(), ""
+    if folder is not None:
+        style.save(lambda: made, folder / name, png=png)
+        file = f"{folder.name}/{name}.svg"
+    return Picture(name, made.title, described(made), numbers.add_chart(made), file=file)

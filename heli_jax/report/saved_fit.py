@@ -14,7 +14,7 @@ from heli_jax.identification.validation.metrics import Metrics
 from heli_jax.numbers import adequacy_of
 from heli_jax.regular_file import read_regular
 from heli_jax.report.document import checked
-from heli_jax.summaries import Summary, as_html, as_text, of_estimates
+from heli_jax.summaries import as_text, of_estimates
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -76,16 +76,10 @@ class SavedFit(NamedTuple):
 
         return estimates_frame({**self.estimates, **(self.nuisance if nuisance else {})})
 
-    def _summary(self) -> Summary:
+    def __repr__(self) -> str:
         head, rows = of_estimates(self.estimates)
         title = f"SavedFit of {self.model} by {self.method}: {self.status}, in {self.directory}"
-        return Summary(title, head, rows, (self.verdict, *self.notes))
-
-    def __repr__(self) -> str:
-        return as_text(self._summary())
-
-    def _repr_html_(self) -> str:
-        return as_html(self._summary())
+        return as_text(title, head, rows, (self.verdict, *self.notes))
 
 
 def load_fit(directory: str | Path) -> SavedFit:

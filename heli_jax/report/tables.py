@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from heli_jax.finding import sentences
 from heli_jax.flights.flight import in_words
 from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.equation_error.start import EquationErrorStart
-from heli_jax.identification.identifiability.verdict import Z95, Combination
+from heli_jax.identification.identifiability.verdict import Combination
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Fit
 from heli_jax.identification.select import Choice, MethodComparison, MethodResult
@@ -384,72 +384,35 @@ def baseline_ratios(fit: Fit, baseline: Baseline) -> Table:
     """Return the ratios of RLS, such as a/Ixx, beside those of the fit."""
     rows = []
     for name, value in baseline.combinations.items():
-        of = next((c for c in fit.verdict.combinations if c.name == name), None) or _ratio(
-            fit, name
-        )
         cells = (NOT_DETERMINED, NOTHING)
-        if of is not None and of.sd is not None:
-            off = percent(value / of.value - 1.0, 1) if of.value else NOTHING
-            cells = (with_sd(of.value, of.sd) if of.sd > 0 else number(of.value, 6), off)
+        if (found := _ratio(fit, name)) is not None:
+            ratio, sd = found
+            off = percent(value / ratio - 1.0, 1) if ratio else NOTHING
+            cells = (with_sd(ratio, sd) if sd > 0 else number(ratio, 6), off)
         rows.append((name, number(value), *cells))
     return Table(("ratio", "RLS", "fit", "RLS against fit"), rows)
 
 
-def _ratio(fit: Fit, name: str) -> Estimate | None:
-    """Return the ratio `x/y` of estimates; None if it is not determined or unknown."""
+def _ratio(fit: Fit, name: str) -> tuple[float, float] | None:
+    """Return the ratio `x/y` of parameters and its sd; None if it is not determined or unknown."""
+    v, params = fit.verdict, naming.asdict(fit.params)
+    if (stated := next((c for c in v.combinations if c.name == name), None)) is not None:
+        return stated.value, stated.sd
     over, _, under = name.partition("/")
-    v, powers = fit.verdict, {over: 1.0, under: -1.0}
-    params = naming.asdict(fit.params)
-    if not powers.keys() <= params.keys() or powers.keys() & {*v.undetermined, *v.without_effect}:
+    if not {over, under} <= params.keys() or {over, under} & {*v.undetermined, *v.without_effect}:
         return None
-    return product(powers, fit.estimates, params, v.names, v.correlation)
-
-
-def product(
-    powers: Mapping[str, float],
-    estimates: Mapping[str, Estimate],
-    constants: Mapping[str, float],
-    names: Sequence[str],
-    correlation: Any,
-) -> Estimate | None:
-    """Return a product of powers of estimates and constants.
-
-    Args:
-        powers: exponents by estimate or constant.
-        names: order of `correlation`.
-        correlation: correlation of the estimates, (q, q).
-
-    Returns:
-        The product; `sd` is None if an estimate is not determined. None if a factor is missing or
-        not positive.
-    """
-    free = [n for n in powers if n in estimates]
-    if not free or any(n not in estimates and n not in constants for n in powers):
+    free = {n: fit.estimates[n] for n in (over, under) if n in fit.estimates}
+    if not free or any(e.sd is None for e in free.values()):
         return None
-    if any(estimates[n].sd is None for n in free):
-        return combination(math.nan, None, None, None)
-    values = {n: float(estimates[n].value if n in free else constants[n]) for n in powers}
-    if not all(v > 0.0 for v in values.values()):
+    values = {n: free[n].value if n in free else float(params[n]) for n in (over, under)}
+    if not all(value > 0.0 for value in values.values()):
         return None
-    among = np.eye(1)
-    if len(free) > 1:
-        if not set(free) <= set(names):
-            return None
-        at = [list(names).index(n) for n in free]
-        among = np.asarray(correlation, float)[np.ix_(at, at)]
-    # The sd of the logarithm includes the correlations.
-    logs = np.array([powers[n] * (estimates[n].sd or 0.0) / values[n] for n in free])
-    sd = math.sqrt(max(float(logs @ among @ logs), 0.0))
-    value = math.prod(values[n] ** power for n, power in powers.items())
-    ends = value * math.exp(-Z95 * sd), value * math.exp(Z95 * sd)
-    return combination(value, value * sd, *ends)
-
-
-def combination(
-    value: float, sd: float | None, lower: float | None, upper: float | None
-) -> Estimate:
-    """Return a combination as an estimate."""
-    return Estimate(value, sd, lower, upper, "SI", math.nan, 0.0, False)
+    # The sd of the logarithm includes the correlation.
+    at = [v.names.index(n) for n in free]
+    signs = np.array([1.0 if n == over else -1.0 for n in free])
+    logs = signs * [(e.sd or 0.0) / values[n] for n, e in free.items()]
+    ratio = values[over] / values[under]
+    return ratio, ratio * math.sqrt(max(float(logs @ v.correlation[np.ix_(at, at)] @ logs), 0.0))
 
 
 def baseline_facts(b: Baseline) -> Table:

@@ -74,16 +74,6 @@ class Trajectory(NamedTuple):
             times=times, states=states, outputs=outputs, inputs=inputs, outside=outside
         )
 
-    def __repr__(self) -> str:
-        from heli_jax.summaries import as_text, of_trajectory
-
-        return as_text(of_trajectory(self, STATUS))
-
-    def _repr_html_(self) -> str:
-        from heli_jax.summaries import as_html, of_trajectory
-
-        return as_html(of_trajectory(self, STATUS))
-
     def to_xarray(self) -> "xr.Dataset":
         """Return the run as an xarray Dataset over `time` [s], with states, outputs and inputs by
         name.

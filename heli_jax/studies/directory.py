@@ -15,9 +15,6 @@ from heli_jax.sweeps import description
 from heli_jax.yaml_file import as_yaml
 
 FITS = "fits"
-# Without unfinished files, whose names begin with a dot.
-FINISHED = f"{FITS}/[!.]*/fit.json"
-"""Files that exist for every finished fit."""
 _DESCRIPTION = "study.json"
 _LONGEST_NAME = 80
 _LIMIT_BYTES = 1_000_000_000

@@ -18,7 +18,6 @@ from heli_jax.stages import Note
 from heli_jax.studies import directory
 from heli_jax.studies.dataset import dataset
 from heli_jax.studies.point import Outcome, Task, fit_point
-from heli_jax.sweeps.run import Pace, Progress
 from heli_jax.sweeps.store import only_writer
 from heli_jax.versions import changed_since, versions
 
@@ -37,7 +36,8 @@ class Options(NamedTuple):
     """A dask.distributed Client whose workers fit, instead of processes."""
     reports: bool = False
     """Also write each fit's page and figures, which takes seconds per fit."""
-    progress: Callable[[Progress], None] = lambda _: None
+    progress: Callable[[int, int], None] = lambda done, total: None
+    """Called with the finished fits and their total."""
     say: Callable[[str], None] = lambda _: None
 
 
@@ -125,7 +125,7 @@ def _compute(tasks: Sequence[Task], places: Sequence[Path], options: Options) ->
     todo = [k for k, place in enumerate(places) if not (place / "fit.json").is_file()]
     if not todo:
         return
-    done, pace = len(tasks) - len(todo), Pace(len(tasks), options.progress)
+    done = len(tasks) - len(todo)
     notices: set[str] = set()
     for number, outcome in _outcomes([tasks[k] for k in todo], options):
         place = places[todo[number]]
@@ -138,7 +138,8 @@ def _compute(tasks: Sequence[Task], places: Sequence[Path], options: Options) ->
         if outcome.sentence is not None:
             options.say(Note(f"{place.name}: no fit: {outcome.sentence}"))
         done += 1
-        pace(done)
+        stages.reach(done)
+        options.progress(done, len(tasks))
 
 
 def _outcomes(tasks: Sequence[Task], options: Options) -> Iterator[tuple[int, Outcome]]:

@@ -1,4 +1,4 @@
-"""Chunks of a sweep, or fits of a study, by dask.distributed: in more processes or on more hosts.
+"""Chunks of a sweep, or fits of a study, on the workers of a dask scheduler.
 
 Workers return their results, and the main process writes them, so no common disk is needed. If a
 worker dies, another one does its tasks.
@@ -7,17 +7,15 @@ worker dies, another one does its tasks.
 import contextlib
 import functools
 import logging
-import signal
 import threading
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-import dask
 import distributed
 import jax
 import numpy as np
-from distributed import CancelledError, Client, LocalCluster, Security, WorkerPlugin, as_completed
+from distributed import CancelledError, Client, WorkerPlugin, as_completed
 from distributed.comm.core import CommClosedError
 from distributed.scheduler import KilledWorker
 
@@ -65,102 +63,32 @@ class Prepared(WorkerPlugin):
 
 _SETTINGS = (
     "jax_enable_x64",
-    "jax_compilation_cache_dir",
     "jax_persistent_cache_min_compile_time_secs",
     "jax_persistent_cache_min_entry_size_bytes",
 )
 
 
 @contextlib.contextmanager
-def connected(
-    scheduler: str | None = None,
-    workers: int | None = None,
-) -> Iterator[Client]:
-    """Yield a client of a scheduler at an address, or of a local cluster that ends with it.
-
-    Args:
-        scheduler: address, as tcp://HOST:8786; by default a local cluster.
-        workers: processes of that cluster; by default dask's choice.
+def connected(scheduler: str) -> Iterator[Client]:
+    """Yield a client of the scheduler at an address, as tcp://HOST:8786.
 
     Raises:
-        InputError: nothing replies there, workers have other versions than this process, or a local
-            cluster cannot be protected.
+        InputError: nothing replies there, or workers have other versions than this process.
     """
     # pyright knows none of JAX's settings by their names.
     settings: dict[str, Any] = {name: getattr(jax.config, name) for name in _SETTINGS}
     with contextlib.ExitStack() as stack:
         stack.enter_context(_quiet())
-        if scheduler is not None:
-            try:
-                client = stack.enter_context(Client(scheduler, timeout=_CONNECT_S))
-            except (OSError, ValueError) as e:
-                raise InputError(
-                    f"--scheduler {scheduler}: no scheduler answers there ({e or type(e).__name__})"
-                    ", expected the address that `dask scheduler` printed, as tcp://HOST:8786"
-                ) from e
-            # A folder on this computer, which others may lack.
-            del settings["jax_compilation_cache_dir"]
-        else:
-            client = stack.enter_context(Client(stack.enter_context(_local_cluster(workers))))
-        _check_versions(client, scheduler or "--workers")
+        try:
+            client = stack.enter_context(Client(scheduler, timeout=_CONNECT_S))
+        except (OSError, ValueError) as e:
+            raise InputError(
+                f"--scheduler {scheduler}: no scheduler answers there ({e or type(e).__name__})"
+                ", expected the address that `dask scheduler` printed, as tcp://HOST:8786"
+            ) from e
+        _check_versions(client, scheduler)
         client.register_plugin(Prepared(settings, import_path.searched()))
         yield client
-
-
-def _local_cluster(workers: int | None) -> LocalCluster:
-    """Make a local cluster that only this process can use.
-
-    Its ports are open to every local user, and anyone connected to dask can run code. Therefore it
-    requires a certificate made here, which stays in memory.
-    """
-    local: Any = LocalCluster  # its annotations forbid None for workers
-    # dask always starts its HTTP servers. They have no pages here, and are stopped.
-    try:
-        security = Security.temporary()
-    except ImportError as e:
-        raise InputError(
-            "--workers: cryptography is not installed, which secures the connection to the "
-            "workers, expected the extra distributed: pip install 'heli_jax[distributed]'"
-        ) from e
-    no_pages = {f"distributed.{who}.http.routes": [] for who in ("scheduler", "worker")}
-    # pyright knows no `dask.config`, which dask documents.
-    settings: Any = dask
-    with _ignore_sigint(), settings.config.set(no_pages):
-        # One thread per process: a chunk uses all devices of its process already.
-        cluster = local(
-            n_workers=workers,
-            threads_per_worker=1,
-            processes=True,
-            dashboard_address=None,
-            silence_logs=logging.CRITICAL,
-            security=security,
-            plugins=(_NoHttp(),),
-        )
-    cluster.scheduler.http_server.stop()
-    return cluster
-
-
-class _NoHttp(WorkerPlugin):
-    """Worker without dask's HTTP server."""
-
-    def setup(self, worker: distributed.Worker) -> None:
-        """Stop the server; dask calls this when the worker begins."""
-        worker.http_server.stop()
-
-
-@contextlib.contextmanager
-def _ignore_sigint() -> Iterator[None]:
-    """Let processes started meanwhile ignore Ctrl-C; they end with this one."""
-    # A terminal sends it to all of them, and each would print its own traceback. They inherit
-    # ignored signals. Python allows this only in its main thread.
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 @contextlib.contextmanager

@@ -1,15 +1,13 @@
 """Designs of experiments: values of a sweep's axes for each element.
 
-A design yields its values in slices, so a sweep of any size takes little memory. A grid and a Sobol
-sequence are computed on demand; a Latin hypercube and a table are held whole. Values are in SI; a
-configuration's units are converted beforehand.
+A design yields its values in slices. A grid is computed on demand, so it takes little memory; other
+designs are held whole. Values are in SI; a configuration's units are converted beforehand.
 """
 
 import dataclasses
 import functools
 import hashlib
 import math
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -17,7 +15,6 @@ import numpy as np
 
 _MOST_SOBOL = 2**30
 """Most points: SciPy's sequence then repeats."""
-_engines = threading.Lock()
 Columns = dict[str, np.ndarray]
 
 
@@ -143,29 +140,6 @@ class Design:
     """Axes with logarithmic spacing."""
 
 
-@functools.lru_cache(maxsize=8)
-def _sobol_engine(axes: int, seed: int) -> Any:
-    import scipy.stats.qmc  # imported on demand: slow
-
-    return scipy.stats.qmc.Sobol(axes, rng=np.random.default_rng(seed))
-
-
-def _sobol_points(axes: int, seed: int, start: int, stop: int) -> np.ndarray:
-    """Return points start to stop (stop - start, axes) of a scrambled sequence in the unit cube."""
-    # One engine advances with the slices, because reaching a point takes as long as drawing all
-    # before it.
-    with _engines:
-        engine = _sobol_engine(axes, seed)
-        if engine.num_generated > start:
-            engine.reset()
-        if start > engine.num_generated:
-            engine.fast_forward(start - engine.num_generated)
-        # SciPy warns if a count is no power of two, which matters for a sequence but not for a
-        # slice. The first point is drawn alone.
-        first = [engine.random(1)] if start == 0 < stop else []
-        return np.concatenate([*first, engine.random(stop - start - len(first))])
-
-
 def grid(axes: Mapping[str, Range | Sequence[float]]) -> Design:
     """Return every combination of the axes' values, the last axis fastest.
 
@@ -243,7 +217,7 @@ def lhs(axes: Mapping[str, Range], n: int, seed: int = 0) -> Design:
     Raises:
         ValueError: no axis, invalid ends, or no points.
     """
-    return _sampled(axes, n, seed, "lhs", functools.partial(_hypercube, len(axes), n, seed))
+    return _sampled(axes, n, seed, "lhs")
 
 
 def sobol(axes: Mapping[str, Range], n: int, seed: int = 0) -> Design:
@@ -259,17 +233,11 @@ def sobol(axes: Mapping[str, Range], n: int, seed: int = 0) -> Design:
     """
     if n > _MOST_SOBOL:
         raise ValueError(f"n must be at most {_MOST_SOBOL} in a Sobol sequence, got {n}")
-    return _sampled(axes, n, seed, "sobol", functools.partial(_sobol_points, len(axes), seed))
+    return _sampled(axes, n, seed, "sobol")
 
 
-def _sampled(
-    axes: Mapping[str, Range],
-    n: int,
-    seed: int,
-    kind: str,
-    points: Callable[[int, int], np.ndarray],
-) -> Design:
-    """Map points (stop - start, axes) of the unit cube to the axes."""
+def _sampled(axes: Mapping[str, Range], n: int, seed: int, kind: str) -> Design:
+    """Map points of the unit cube to the axes."""
     check_axes(axes)
     for name, axis in axes.items():
         if not isinstance(axis, Range):
@@ -280,23 +248,25 @@ def _sampled(
     ends = {name: [a.lower, a.upper, a.scale] for name, a in axes.items()}
 
     def values(start: int, stop: int) -> Columns:
-        cube = points(start, stop)
+        cube = _cube(kind, len(axes), n, seed)[start:stop]
         return {name: axis.at(cube[:, i]) for i, (name, axis) in enumerate(axes.items())}
 
     description = {"design": kind, "axes": ends, "n": n, "seed": seed}
     return Design(tuple(axes), n, values, description, _logarithmic(axes))
 
 
+# Whole, because a point of a hypercube depends on all others.
 @functools.lru_cache(maxsize=8)
-def _whole_hypercube(axes: int, n: int, seed: int) -> np.ndarray:
-    import scipy.stats.qmc  # imported on demand: slow
+def _cube(kind: str, axes: int, n: int, seed: int) -> np.ndarray:
+    """Return the points (n, axes) of a design in the unit cube."""
+    from scipy.stats import qmc  # imported on demand: slow
 
-    # Whole, because each point depends on all others: a slice cannot be drawn alone.
-    return scipy.stats.qmc.LatinHypercube(axes, rng=np.random.default_rng(seed)).random(n)
-
-
-def _hypercube(axes: int, n: int, seed: int, start: int, stop: int) -> np.ndarray:
-    return _whole_hypercube(axes, n, seed)[start:stop]
+    rng = np.random.default_rng(seed)
+    if kind == "lhs":
+        return qmc.LatinHypercube(axes, rng=rng).random(n)
+    engine = qmc.Sobol(axes, rng=rng)
+    # SciPy warns of a count that is no power of two, unless the first point is drawn alone.
+    return np.concatenate([engine.random(1), engine.random(n - 1)])
 
 
 def product(*parts: Design) -> Design:

@@ -1,6 +1,5 @@
 """sweep: a design of many runs, computed chunk by chunk into a store."""
 
-import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -29,38 +28,6 @@ from heli_jax.versions import changed_since, versions
 # only if workers are used.
 
 
-class Progress(NamedTuple):
-    """Progress of a sweep."""
-
-    done: int
-    """Finished elements, those of earlier runs included."""
-    total: int
-    rate: float
-    """Elements per second of this run; NaN after the first chunk, which included compilation."""
-    remaining: float
-    """Remaining time [s]; NaN likewise."""
-
-
-class Pace:
-    """Counter of finished work, as steps of the current stage; it calls `progress`."""
-
-    def __init__(self, total: int, progress: Callable[[Progress], None]) -> None:
-        self.total, self.progress = total, progress
-        self.first: tuple[float, int] | None = None
-
-    def __call__(self, done: int) -> None:
-        """Report the number of finished elements."""
-        stages.reach(done)
-        # The first chunk waited for imports and the compiler. With it, the remaining time would
-        # look ten times as long.
-        now, rate = time.perf_counter(), math.nan
-        if self.first is None:
-            self.first = now, done
-        else:
-            rate = (done - self.first[1]) / max(now - self.first[0], 1e-9)
-        self.progress(Progress(done, self.total, rate, (self.total - done) / rate))
-
-
 class Options(NamedTuple):
     """Options for the execution of a sweep; only the division may change the last digit."""
 
@@ -76,7 +43,8 @@ class Options(NamedTuple):
     """Devices of this process; all by default."""
     client: Any = None
     """A dask.distributed Client whose workers compute the chunks."""
-    progress: Callable[[Progress], None] = lambda _: None
+    progress: Callable[[int, int], None] = lambda done, total: None
+    """Called with the finished elements, those of earlier runs included, and their total."""
     say: Callable[[str], None] = lambda _: None
 
 
@@ -242,7 +210,7 @@ def _compute(job: Job, store: stores.Store, done: np.ndarray, options: Options) 
     todo = [int(k) for k in np.flatnonzero(~done)]
     total, size = job.design.size, store.split.chunk
     before = sum(min(size, total - int(k) * size) for k in np.flatnonzero(done))
-    begin, now, pace = time.perf_counter(), before, Pace(total, options.progress)
+    begin, now = time.perf_counter(), before
     if options.client is not None:
         # Here, because dask is an optional extra.
         from heli_jax.sweeps.cluster import computed
@@ -254,7 +222,8 @@ def _compute(job: Job, store: stores.Store, done: np.ndarray, options: Options) 
         for chunk, results in source:
             store.write(chunk, results)
             now += len(results["status"])
-            pace(now)
+            stages.reach(now)
+            options.progress(now, total)
     seconds = time.perf_counter() - begin
     return {
         "chunks": store.split.chunks(total),

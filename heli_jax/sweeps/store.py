@@ -26,8 +26,6 @@ from heli_jax.sweeps.design_point import NOT_RUN
 from heli_jax.sweeps.spec import Job
 from heli_jax.sweeps.worker import Split, Variable, variables
 
-FINISHED = "sweep.zarr/status/c/*"
-"""Files that exist for every finished chunk."""
 # Fill values of missing data: NaN, and for the status (unsigned) 'not run', which marks an
 # unfinished chunk. Seeds (signed) are written before the status and need no mark.
 _FILL = {"f": np.nan, "u": NOT_RUN, "i": 0}

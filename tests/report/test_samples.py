@@ -2,19 +2,16 @@
 
 import dataclasses
 
-import matplotlib.path
 import numpy as np
 import pytest
-import scipy.stats
 import xarray as xr
 
 from heli_jax.identification.uncertainty.bootstrap import Bootstrap
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.uncertainty.nuts import Convergence, Posterior
-from heli_jax.report import figures, tables
-from heli_jax.report.figures.estimates import gaussian_ellipse
+from heli_jax.report import tables
 from heli_jax.report.files import SupplementaryAnalyses
-from heli_jax.report.fit_page import Analysis, drawings, write_report
+from heli_jax.report.fit_page import Analysis, write_report
 from heli_jax.report.origin import Origin
 from heli_jax.report.sample_files import (
     posterior_tree,
@@ -102,39 +99,21 @@ def test_the_bootstrap_is_a_file_of_its_own_that_says_what_it_is(white, sampled,
     assert read.sizes == {"record": 90}
 
 
-def test_nothing_is_written_or_drawn_where_nothing_was_sampled(white, sampled, tmp_path):
+def test_nothing_is_written_where_nothing_was_sampled(white, sampled, tmp_path):
     none = dataclasses.replace(sampled, posterior=None, bootstrap=None)
     assert sample_files(None) == sample_files(none) == ()
     write_samples(tmp_path, white[0], none, MADE, "bench.yaml")
     assert list(tmp_path.iterdir()) == []
-    drawn = drawings(Analysis(*white, SupplementaryAnalyses(intervals=none)))
-    assert not {"pairs_posterior", "pairs_bootstrap"} & set(drawn)
     # No record could be fitted, so there is no empty file.
     failed = dataclasses.replace(none, bootstrap=Bootstrap({"Ixx": np.array([])}, 5))
     assert sample_files(failed) == ()
-    assert figures.bootstrap_pairs(failed.bootstrap, white[0]) is None
 
 
-def test_the_ellipse_holds_95_percent_of_the_gaussian(white):
-    fit = white[0]
-    draws = gaussian_draws(fit, 40_000)
-    x, y = gaussian_ellipse(fit, "Ixx", "If")
-    inside = matplotlib.path.Path(np.column_stack([x, y])).contains_points(
-        np.column_stack([np.ravel(draws["Ixx"]), np.ravel(draws["If"])])
-    )
-    # Four sd of a binomial count.
-    assert inside.mean() == pytest.approx(0.95, abs=4 * np.sqrt(0.95 * 0.05 / 40_000))
-    e = fit.estimates["Ixx"]
-    reach = np.sqrt(scipy.stats.chi2.ppf(0.95, 2)) * e.sd / e.value
-    assert np.log(x / e.value).max() == pytest.approx(reach, rel=1e-3)
-
-
-def test_the_page_shows_chains_pairs_and_their_diagnostics(white, sampled, tmp_path):
+def test_the_page_shows_chains_and_their_diagnostics(white, sampled, tmp_path):
     analysis = Analysis(*white, SupplementaryAnalyses(intervals=sampled))
     files = sample_files(sampled)
     assert files == ("posterior.nc", "bootstrap.nc")
-    names = write_report(tmp_path, analysis, "bench", {}, MADE._replace(files=files))
-    assert {"pairs_posterior", "pairs_bootstrap"} <= set(names)
+    write_report(tmp_path, analysis, "bench", {}, MADE._replace(files=files))
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert 'href="posterior.nc"' in page
     assert 'href="bootstrap.nc"' in page

@@ -12,7 +12,6 @@ import yaml
 from heli_jax import cli, load_fit, run_study
 from heli_jax.config.study import read_study
 from heli_jax.errors import InputError
-from heli_jax.studies import directory
 from heli_jax.studies import run as studies
 from heli_jax.studies.point import Outcome, fit_point
 from heli_jax.studies.worker import read_outcome, write_outcome
@@ -77,9 +76,9 @@ def test_interrupted_and_resumed_it_is_the_same_dataset(config, tmp_path, monkey
     over = {"fit.free.Ixx.start": [0.02, 0.04]}
     overrides = {"flights.0.log": ["a.csv", "short.csv"]}
 
-    def kill(progress):
-        if progress.done == 2:
-            assert len(list(killed.glob(directory.FINISHED))) == 2
+    def kill(done, _):
+        if done == 2:
+            assert len(list(killed.glob("fits/[!.]*/fit.json"))) == 2
             raise Killed
 
     with pytest.raises(Killed):

@@ -308,7 +308,7 @@ def test_another_configuration_does_not_go_on_with_a_store(write, tmp_path, caps
 def test_without_dask_the_extra_is_named(write, tmp_path):
     program = (
         "import sys\nsys.modules['distributed'] = None\nfrom heli_jax import cli\n"
-        f"sys.exit(cli.main(['sweep', {str(write(content()))!r}, '--workers', '2', '--out', 'o']))"
+        f"sys.exit(cli.main(['sweep', {str(write(content()))!r}, '--scheduler=x', '--out', 'o']))"
     )
     run = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, cwd=tmp_path, check=False

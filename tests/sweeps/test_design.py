@@ -1,6 +1,5 @@
 """Designs: values of the axes, against NumPy, SciPy and itertools."""
 
-import concurrent.futures
 import itertools
 
 import hypothesis.strategies as st
@@ -10,7 +9,6 @@ import scipy.stats.qmc
 from hypothesis import given
 
 from heli_jax.sweeps import Range, grid, lhs, paired, product, sobol, table, zipped
-from heli_jax.sweeps.design import _sobol_points as scrambled_sobol
 
 AXES = {"Ixx": Range(0.01, 0.1, "log"), "a": Range(4.0, 6.0)}
 
@@ -44,26 +42,6 @@ def test_slices_are_parts_of_the_whole(name, data):
         np.testing.assert_array_equal(part[axis], everything[axis][start:stop])
 
 
-@given(cuts=st.lists(st.integers(0, 50), min_size=2, max_size=6).map(sorted))
-def test_a_sequence_goes_on_where_the_last_slice_ended(cuts):
-    design = sobol(AXES, 50, seed=3)
-    everything = whole(sobol(AXES, 50, seed=3))["a"]
-    for start, stop in itertools.pairwise(cuts):
-        np.testing.assert_array_equal(design.values(start, stop)["a"], everything[start:stop])
-
-
-def test_threads_that_take_slices_of_one_sequence_do_not_disturb_each_other():
-    design, everything = sobol(AXES, 4000, seed=3), whole(sobol(AXES, 4000, seed=3))["a"]
-    starts = np.random.default_rng(0).permutation(np.repeat(np.arange(0, 4000, 100), 8)).tolist()
-
-    def slice_at(start):
-        return design.values(start, start + 100)
-
-    with concurrent.futures.ThreadPoolExecutor(8) as pool:
-        for start, found in zip(starts, pool.map(slice_at, starts), strict=True):
-            np.testing.assert_array_equal(found["a"], everything[start : start + 100])
-
-
 def test_a_grid_is_every_combination_the_last_axis_fastest():
     axes = {"Ixx": [1.0, 2.0, 3.0], "If": [5.0, 7.0], "a": [0.5, 0.25, 0.125, 0.0]}
     found = whole(grid(axes))
@@ -88,15 +66,6 @@ def test_samples_are_scipys(make, engine):
     np.testing.assert_allclose(found["a"], 4.0 + 2.0 * points[:, 1], rtol=1e-14)
     np.testing.assert_allclose(found["Ixx"], 0.01 * 10.0 ** points[:, 0], rtol=1e-13)
     assert not np.array_equal(found["a"], whole(make(AXES, 64, seed=12))["a"])
-
-
-@pytest.mark.filterwarnings("ignore:The balance properties")
-@pytest.mark.parametrize("axes", [1, 3, 32, 33])
-def test_points_of_a_sobol_sequence_are_scipys_to_the_last_bit(axes):
-    expected = scipy.stats.qmc.Sobol(axes, rng=np.random.default_rng(5)).random(700)
-    np.testing.assert_array_equal(scrambled_sobol(axes, 5, 0, 700), expected)
-    np.testing.assert_array_equal(scrambled_sobol(axes, 5, 311, 509), expected[311:509])
-    assert scrambled_sobol(axes, 5, 0, 0).shape == (0, axes)
 
 
 def test_a_latin_hypercube_has_one_point_in_every_row():

@@ -1,13 +1,6 @@
-"""The report's figures: each turns plain data into a `Chart`, or None if there is nothing to draw.
-
-Scatter plots of samples use Matplotlib within `style.in_style()` and are images on the page.
-"""
+"""The report's figures: each turns plain data into a `Chart`."""
 
 from heli_jax.report.figures.bode import draw_response, match, quotient
-from heli_jax.report.figures.estimates import (
-    bootstrap_pairs,
-    posterior_pairs,
-)
 from heli_jax.report.figures.signals import (
     overview,
     residual_correlation,
@@ -17,11 +10,9 @@ from heli_jax.report.figures.signals import (
 )
 
 __all__ = [
-    "bootstrap_pairs",
     "draw_response",
     "match",
     "overview",
-    "posterior_pairs",
     "quotient",
     "residual_correlation",
     "response",
