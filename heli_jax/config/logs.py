@@ -9,6 +9,7 @@ import numpy as np
 
 from heli_jax import naming, units
 from heli_jax.config.experiment import Experiment
+from heli_jax.config.feedthrough import follows
 from heli_jax.config.kinematics import between_samples, prepared
 from heli_jax.config.measurement import (
     filter_cautions,
@@ -115,6 +116,7 @@ def _read_flight(experiment: Experiment, i: int, f: FlightConfig, gain: bool) ->
             name=f.name or f"flight {i + 1}",
             number=f.flight,
             also=tuple(_also(experiment, a, inputs, outputs) for a in f.also),
+            follows=follows(experiment, f.rate, inputs),
             runs=runs,
             swashplate=swashplate,
         )

@@ -6,6 +6,7 @@ straight lines fit better. A record may have both, such as doublets and then a c
 """
 
 import dataclasses
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +22,8 @@ class Decision(NamedTuple):
     reason: str
 
 
+LOW_PASSED = "resampling.input-low-passed"
+"""Code of the note on an input commanded in steps that was low-passed with outputs."""
 _SHARE = 0.05, 0.9
 """Smallest shares of the motion in jumps for a mixed and for a held input. White noise has 0.01, a
 random walk 0.02, steps under 0.5 % of noise 0.96."""
@@ -80,6 +83,17 @@ def without_jumps(flight: Flight) -> Flight:
         inputs={**flight.inputs, **inputs},
         hold={**flight.hold, **dict.fromkeys(inputs, "linear")},
     )
+
+
+def low_passed(outputs: Iterable[str]) -> Decision:
+    """Return the decision for an input commanded in steps that was filtered like these outputs."""
+    return Decision("linear", f"was low-passed as {', '.join(outputs)}")
+
+
+def is_low_passed(flight: Flight, name: str) -> bool:
+    """True for an input that was filtered like the outputs, after which it is linear."""
+    notes = flight.source.notes if flight.source else ()
+    return any(n.code == LOW_PASSED and name in n.subjects for n in notes)
 
 
 def _of_few_values(moves: np.ndarray, moved: np.ndarray, share: float) -> Decision:

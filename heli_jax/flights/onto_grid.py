@@ -23,7 +23,7 @@ from heli_jax.flights.grid import (
     rounding_of,
     uniform_grid,
 )
-from heli_jax.flights.holds import Decision, decide
+from heli_jax.flights.holds import LOW_PASSED, Decision, decide, low_passed
 from heli_jax.flights.log import ChannelLog, Topic, column, sample_count, shown, wrong
 from heli_jax.flights.marks import infinite, repeats_removed
 from heli_jax.flights.request import FEWEST, Key, Request, other_units
@@ -33,8 +33,10 @@ from heli_jax.flights.resample import (
     at_nearest,
     at_own_rate,
     goes_down,
+    held_low_passed,
     held_mean,
     held_until_jumps,
+    hold,
     in_gaps,
     interpolate,
     is_slower,
@@ -418,7 +420,9 @@ def at_times(
 
     A held input is averaged from one instant to the next. A mixed one jumps at the instant nearest
     to its jump. Other inputs and the outputs are interpolated, or low-pass filtered if the rate
-    decreases. Samples of outputs slower than the grid go to their nearest instants.
+    decreases. Samples of outputs slower than the grid go to their nearest instants. If a low-passed
+    output follows a held input within a sample, the input is low-passed too. It is then linear
+    between samples.
 
     Args:
         signals: signals by key, SI, each on its own clock.
@@ -426,6 +430,10 @@ def at_times(
         times: times of the grid (M,) [s].
     """
     samples, notes, rate = {}, [], 1.0 / float(times[1] - times[0])
+    alike = _alike(request, signals, holds, times)
+    # Input and output need the same filter. If only the output is filtered, its ringing after jumps
+    # would be attributed to the vehicle.
+    low = {n: held_low_passed(*signals[n, "input"], times) for n in alike}
     for (key, kind), signal in signals.items():
         if kind == "input":
             if holds[key].hold == "mixed" and not goes_down(signal.seconds, times):
@@ -435,6 +443,15 @@ def at_times(
                 # A filter leaves out a short gap, but an input acts all the time.
                 made = np.where(np.isnan(made), interpolate(*signal, times), made)
                 samples[key, kind] = made
+            elif key in alike:
+                samples[key, kind] = low[key]
+                outputs = ", ".join(alike[key])
+                follow = "follow" if len(alike[key]) > 1 else "follows"
+                words = (
+                    f"{key} is also low-passed and taken as linear between samples, because "
+                    f"{outputs} {follow} it within a sample and is low-passed"
+                )
+                notes.append(note(LOW_PASSED, words, key))
             else:
                 # A low-pass filter would add ringing to a stick that jumps.
                 samples[key, kind] = held_mean(*signal, times)
@@ -452,16 +469,62 @@ def at_times(
             own = own_clock(signal)
             # `own` lacks the missing rows, so gaps are found here.
             gaps = in_gaps(own.seconds, times) if own is not signal else False
-            if usual_step(own.seconds) * rate > OWN or goes_down(own.seconds, times):
+            jumps = [n for n in alike if request.options.follows.get((n, key))]
+            if jumps:
+                inputs = [(signals[n, "input"], low[n]) for n in jumps]
+                made = _resampled_with(own, inputs, times)
+            elif usual_step(own.seconds) * rate > OWN or goes_down(own.seconds, times):
                 made = resampled(*own, times)
             else:
                 made = at_own_rate(own, times)
             samples[key, kind] = np.where(gaps, np.nan, made)
+    decided = {n: low_passed(alike[n]) if n in alike else d for n, d in holds.items()}
     # A low-passed signal has no jumps.
-    decided = {
+    decided |= {
         n: d._replace(hold="linear")
-        if d.hold == "mixed" and goes_down(signals[n, "input"].seconds, times)
-        else d
         for n, d in holds.items()
+        if d.hold == "mixed" and goes_down(signals[n, "input"].seconds, times)
     }
     return OnGrid(samples, decided, notes)
+
+
+def _alike(
+    request: Request,
+    signals: Mapping[Key, Timed],
+    holds: Mapping[str, Decision],
+    times: np.ndarray,
+) -> dict[str, list[str]]:
+    """Return the held inputs to be filtered, with the filtered outputs that follow them.
+
+    An output follows an input if it responds within a sample of the grid (M,) [s].
+    """
+    alike: dict[str, list[str]] = {}
+    for name, output in request.options.follows:
+        held = name in holds and holds[name].hold == "zero-order"
+        signal = signals.get((output, "output"))
+        if held and signal is not None and goes_down(own_clock(signal).seconds, times):
+            alike.setdefault(name, []).append(output)
+    return alike
+
+
+def _resampled_with(
+    signal: Timed, inputs: Sequence[tuple[Timed, np.ndarray]], times: np.ndarray
+) -> np.ndarray:
+    """Low-pass an output (M,) that jumps with inputs.
+
+    The jump is taken from the inputs, scaled by least squares, because it is known at all times.
+    The output's samples alone would put it half a step early.
+
+    Args:
+        inputs: held inputs that the output follows without delay, each with the result of
+            `held_low_passed`.
+        times: (M,) [s].
+    """
+    seconds, values = signal
+    held = np.array([hold(*u, np.maximum(seconds, u.seconds[0])) for u, _ in inputs])
+    moves = np.diff(values)
+    known = np.isfinite(moves)
+    # The minimum-norm solution gives a gain of zero to an input that never jumps.
+    gains = np.linalg.lstsq(np.diff(held)[:, known].T, moves[known], rcond=None)[0]
+    jumping = gains @ np.array([low for _, low in inputs])
+    return resampled(seconds, values - gains @ held, times) + jumping

@@ -69,6 +69,9 @@ class ReadOptions:
     """Number of the flight in a file that holds several, from 1."""
     also: tuple[Also, ...] = ()
     """Further logs of the same flight, aligned with this one; they need a rate."""
+    follows: Mapping[tuple[str, str], bool] = field(default_factory=dict)
+    """Pairs (input, output) in which the output follows the input within a sample. The value is
+    True if it follows without delay. Such held inputs are low-passed like the output."""
     runs: str = ""
     """Column of a table that numbers its runs."""
     swashplate: Swashplate | None = None

@@ -19,6 +19,9 @@ _GAP_STEPS = 5.0
 _GAP_SECONDS = 0.25
 _GOES_DOWN = 0.9
 """Ratio of new to old rate below which frequencies between the Nyquist frequencies could fold."""
+_CELLS = 16
+"""Parts of a grid step over which a held signal is averaged before the low-pass filter. The mean
+attenuates a signal at 0.4 of the rate by 0.1 %."""
 
 
 def longest_gap(seconds: np.ndarray) -> float:
@@ -103,6 +106,16 @@ def held_mean(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.
     # Weighted before the sum, because the sum of huge values times seconds could overflow.
     mean = np.add.reduceat(pieces * (np.diff(bounds) / steps), first)
     return np.clip(mean, lowest, highest)
+
+
+def held_low_passed(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Low-pass a stepwise signal by the filter of `resampled`, at the times of a grid."""
+    step = float(times[1] - times[0])
+    cell = step / _CELLS
+    count = int(np.ceil((max(seconds[-1], times[-1]) - seconds[0]) / cell)) + 1
+    means = held_mean(seconds, values, seconds[0] + cell * np.arange(count))
+    # A mean belongs to the middle of its cell.
+    return low_pass(means, cell, times - seconds[0] - 0.5 * cell, step)
 
 
 def goes_down(seconds: np.ndarray, times: np.ndarray) -> bool:

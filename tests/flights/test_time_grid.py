@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.signal import cont2discrete, dlsim
 
 from heli_jax.errors import InputError
 from heli_jax.flights import Flight, Signal, read_flight
-from heli_jax.flights.resample import held_mean, hold, interpolate
+from heli_jax.flights.holds import Decision, is_low_passed
+from heli_jax.flights.onto_grid import at_times
+from heli_jax.flights.request import ReadOptions, Request
+from heli_jax.flights.resample import Timed, held_mean, hold, interpolate
 
 
 def read(path, stamps: list[str], x: np.ndarray | None = None, **request) -> Flight:
@@ -190,3 +194,70 @@ def test_a_flight_at_a_lower_rate_keeps_the_impulse_of_its_stick(tmp_path):
     # After the step at 0.53 s, 0.02 s of the grid's step from 0.5 s remain.
     expected = [0.0] * 10 + [0.4] + [1.0] * 9
     assert flight.inputs["x_roll"] == pytest.approx(expected, abs=1e-9)
+
+
+def _heave(tmp_path, fine, rate, follows):
+    """Return a flight of a heaving rotor with inflow, and its response to the logged stick.
+
+    The flight is at `rate` [Hz], from a log of `fine` [Hz] whose stick jumps. Outputs are
+    acceleration and vertical rate.
+    """
+    A, B = np.array([[-0.55, 6.0], [0.0, -1 / 0.11]]), np.array([[-28.0], [1.26 / 0.11]])
+    # The acceleration, and its integral.
+    C, D = np.array([[-0.55, 6.0], [1.0, 0.0]]), np.array([[-28.0], [0.0]])
+    draw, u = np.random.default_rng(5), np.zeros(30 * fine)
+    at = fine
+    while at < 29 * fine:
+        stay = int(draw.uniform(0.1, 0.9) * fine)
+        u[at : at + stay] = draw.uniform(-1, 1)
+        at += stay
+    u[29 * fine :] = 0.0
+    held = cont2discrete((A, B, C, D), 1 / fine, "zoh")
+    y = dlsim(held, u)[1]
+    seconds = np.arange(u.size) / fine
+    table = np.column_stack([seconds, u, y])
+    np.savetxt(tmp_path / "heave.csv", table, "%.12g", ",", header="t,u,a,w", comments="")
+    flight = read_flight(
+        tmp_path / "heave.csv",
+        time="t",
+        rate=float(rate),
+        inputs={"col": Signal("u", "1", "1", hold="zero-order")},
+        outputs={"az": Signal("a", "m/s^2", "m/s^2"), "w": Signal("w", "m/s", "m/s")},
+        follows=follows,
+    )
+    kind = "zoh" if flight.hold["col"] == "zero-order" else "foh"
+    # scipy's triangle hold changes the state; only its output is valid.
+    made = dlsim(cont2discrete((A, B, C, D), 1 / rate, kind), flight.inputs["col"])[1].T
+    inside = slice(2 * rate, -2 * rate)
+    error = {
+        n: float(np.std((flight.outputs[n] - m)[inside]) / np.std(flight.outputs[n][inside]))
+        for n, m in zip(("az", "w"), made, strict=True)
+    }
+    return flight, error
+
+
+@pytest.mark.parametrize(("fine", "rate"), [(100, 40), (200, 50), (100, 20)])
+def test_an_acceleration_and_its_stick_are_filtered_alike(tmp_path, fine, rate):
+    flight, error = _heave(tmp_path, fine, rate, {("col", "az"): True})
+    assert error["az"] < 0.008
+    # The integral equals that with the mean of each step.
+    assert error["w"] < 0.004
+    assert flight.hold == {"col": "linear"}
+    assert is_low_passed(flight, "col")
+    held, before = _heave(tmp_path, fine, rate, {})
+    assert before["az"] > 0.1
+    assert held.hold == {"col": "zero-order"}
+    assert not is_low_passed(held, "col")
+
+
+def test_an_acceleration_that_is_no_faster_than_the_grid_cannot_follow_a_faster_stick():
+    t, slow = np.arange(800) / 200, np.arange(200) / 50
+    signals = {
+        ("col", "input"): Timed(t, np.sign(np.sin(7.3 * t))),
+        ("az", "output"): Timed(slow, np.cos(slow)),
+    }
+    stick = {"col": Signal("u", "1", "1", hold="zero-order")}
+    options = ReadOptions(rate=50.0, follows={("col", "az"): True})
+    request = Request("log", None, stick, {"az": Signal("a", "1", "1")}, options)
+    made = at_times(request, signals, {"col": Decision("zero-order", "")}, slow)
+    assert made.holds["col"].hold == "zero-order"

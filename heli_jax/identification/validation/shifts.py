@@ -19,6 +19,7 @@ from jaxtyping import Float
 from heli_jax import naming
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.flights.flight import Flight
+from heli_jax.flights.holds import is_low_passed
 from heli_jax.identification.estimation.evaluation import (
     Evaluation,
     directions,
@@ -96,8 +97,9 @@ def shift_in_time(
 
 
 def _linear_by_guess(flight: Flight, name: str) -> bool:
-    """True if an input is only assumed to be linear."""
-    return flight.hold[name] == "linear" and name in flight.hold_reason
+    """True if an input is only assumed to be linear, and was not low-passed."""
+    linear = flight.hold[name] == "linear" and name in flight.hold_reason
+    return linear and not is_low_passed(flight, name)
 
 
 def _best_place(at: Solution, e: Evaluation, kind: str, name: str) -> tuple[float, float]:
