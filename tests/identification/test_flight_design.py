@@ -3,7 +3,6 @@
 import dataclasses
 import json
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -275,9 +274,21 @@ def test_wrong_configurations(tmp_path, capsys, change):
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
 
 
-def test_wrong_wanted(tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("model", "files"), [("quad-roll", {"ardupilot-lat.param"}), ("yaw", set())]
+)
+def test_from_a_shipped_model_to_files(tmp_path, model, files):
+    config, out = tmp_path / "start.yaml", tmp_path / "run"
+    assert main(["models", model, "--config", str(config), "--quiet"]) == 0
+    few = ["--set", "design.max_steps=0", "--set", "simulate.duration=6"]
+    # Not every model has only parameters that one record determines.
+    assert main(["design", str(config), "--out", str(out), "--quiet", *few]) in (0, 3)
+    assert files <= {p.name for p in out.iterdir()}
+    assert main(["models", model, "--config", str(config)]) == 2
+
+
+def test_wrong_wanted(tmp_path):
     config = tmp_path / "design.yaml"
     config.write_text(CONFIG)
     for text in ("tau_f", "tau_f=x", "=2%", "nothing=2%"):
-        with jax.log_compiles(False):
-            assert main(["design", str(config), "--out", str(tmp_path / "o"), "--for", text]) == 2
+        assert main(["design", str(config), "--out", str(tmp_path / "o"), "--for", text]) == 2
