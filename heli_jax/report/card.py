@@ -56,13 +56,13 @@ def card(fit: Fit, responses: FittedResponses | None = None) -> tuple[Gate, ...]
     for name, estimate in fit.estimates.items():
         gates += _of_parameter(name, estimate)
     gates += _of_relations(fit)
-    # With process noise a simulation departs from the record even at the true parameters, and almost
-    # any model predicts one sample ahead. A method in frequency simulates nothing.
+    # With process noise a simulation departs from the record even at the true parameters, and
+    # almost any model predicts one sample ahead. A method in frequency simulates nothing.
     noise_model = objective_of(fit.method).noise_model
     if noise_model == "white":
-        for metrics, source in ((fit.metrics, "simulated"), (fit.validation, "held out, simulated")):
+        for metrics, how in ((fit.metrics, "simulated"), (fit.validation, "held out, simulated")):
             for name, m in metrics.items():
-                gates += _of_agreement(f"{name}, {source}", m, fitted_mean=_mean_is_fitted(fit))
+                gates += _of_agreement(f"{name}, {how}", m, fitted_mean=_mean_is_fitted(fit))
     gates += _of_held_out(fit)
     gates += _of_disturbance(fit)
     if noise_model != "spectrum":
