@@ -94,7 +94,7 @@ def test_fits_of_the_same_samples_are_compared_by_aic(tmp_path: Path) -> None:
 def test_what_is_not_to_be_trusted_is_said_of_compared_and_listed_fits(tmp_path, capsys) -> None:
     sentence = "Not trusted: Ixx (closed loop without an instrument)."
     brief = "closed loop without an instrument"
-    untrusted = {"Ixx": {"code": "loop.no-instrument", "shift": None, "brief": brief}}
+    untrusted = {"Ixx": {"code": "loop.no-instrument", "brief": brief}}
     a = write_run(tmp_path / "a", {"Ixx": (0.02, 0.001)})
     against = {"untrusted": untrusted, "distrust": sentence, "adequate": False}
     b = write_run(tmp_path / "b", {"Ixx": (0.03, 0.001)}, **against)
