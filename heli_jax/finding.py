@@ -126,6 +126,13 @@ def without_repeats(findings: Iterable[Finding]) -> list[Finding]:
     return list(by_sentence.values())
 
 
+def most_severe(findings: Sequence[Finding]) -> list[Finding]:
+    """Return the most severe findings, one of each topic; `findings` begin with the most severe."""
+    # The first finding represents all flights or signals with the same one.
+    by_topic = {f.topic: f for f in reversed(findings) if f.severity != "ok"}
+    return [f for f in findings if f is by_topic.get(f.topic)][:_IN_FULL]
+
+
 def sentences(findings: Iterable[Finding]) -> list[str]:
     """Return the sentences of findings without repetition."""
     return [f.sentence for f in without_repeats(findings)]

@@ -8,7 +8,7 @@ from heli_jax import compatibility
 from heli_jax.cli.terminal import print_page_table, print_table, print_text
 from heli_jax.compatibility import Compatibility
 from heli_jax.config.frequency import missing_handling
-from heli_jax.finding import Finding
+from heli_jax.finding import Finding, most_severe
 from heli_jax.identification.design.accuracy import GUESSED
 from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.fit import Check, Estimate
@@ -178,16 +178,9 @@ def print_check(check: Check, *, verbose: bool = False) -> None:
     print_findings(check.findings, verbose=verbose)
 
 
-_IN_FULL = 3
-"""Findings that the terminal shows in full."""
-
-
 def print_findings(findings: Sequence[Finding], *, verbose: bool) -> None:
     """Print the most severe findings in full, and the others by their titles."""
-    # The first finding represents all flights or signals with the same one.
-    by_topic = {f.topic: f for f in reversed(findings) if f.severity != "ok"}
-    first = [f for f in findings if f is by_topic.get(f.topic)]
-    shown = findings if verbose else first[:_IN_FULL]
+    shown = findings if verbose else most_severe(findings)
     for f in shown:
         print_text(f"{_MARKS[f.severity]} {f.topic}: {f.sentence}")
     rest = [f for f in findings if f not in shown]
