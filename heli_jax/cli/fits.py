@@ -9,6 +9,7 @@ from heli_jax.cli.terminal import print_page_table, print_table, print_text
 from heli_jax.compatibility import Compatibility
 from heli_jax.config.frequency import missing_handling
 from heli_jax.finding import Finding, most_severe
+from heli_jax.identification.diagnostics.record import SMOOTHED
 from heli_jax.identification.design.accuracy import GUESSED
 from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.fit import Check, Estimate
@@ -156,7 +157,7 @@ def print_check(check: Check, *, verbose: bool = False) -> None:
     # The fit's result at its estimates may differ, since sensitivities depend on the parameters.
     print_text("At the start values (a fit repeats this at its estimates):")
     print_text(verdict.text)
-    rows = []
+    rows, smoothed = [], any(f.code == SMOOTHED for f in check.findings)
     for i, name in enumerate(verdict.names):
         # The covariance is that of the logarithms, so its root is the relative sd.
         relative = math.sqrt(verdict.covariance[i, i])
@@ -165,7 +166,7 @@ def print_check(check: Check, *, verbose: bool = False) -> None:
         if name in check.at_zero:
             size, unit = check.at_zero[name]
             expected = f"{terse(size * relative, 2)} {unit}"
-        expected = "not determined" if lacking else expected
+        expected = "not determined" if lacking else "-" if smoothed else expected
         rows.append((name, expected, percent(verdict.prior_share[name], 0)))
     print_table(("parameter", "expected sd", "prior share"), rows)
     for name, sd in check.noise.items():
