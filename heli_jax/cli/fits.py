@@ -1,7 +1,6 @@
 """Terminal and file output of the commands."""
 
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from heli_jax import compatibility
@@ -9,8 +8,8 @@ from heli_jax.cli.terminal import print_page_table, print_table, print_text
 from heli_jax.compatibility import Compatibility
 from heli_jax.config.frequency import missing_handling
 from heli_jax.finding import Finding, most_severe
-from heli_jax.identification.diagnostics.record import SMOOTHED
 from heli_jax.identification.design.accuracy import GUESSED
+from heli_jax.identification.diagnostics.record import SMOOTHED
 from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.fit import Check, Estimate
 from heli_jax.identification.identifiability.verdict import Verdict
@@ -190,9 +189,12 @@ def print_findings(findings: Sequence[Finding], *, verbose: bool) -> None:
         ("notes", ("note",)),
         ("passed", ("ok",)),
     ):
-        titles = Counter(f.topic for f in rest if f.severity in severities)
-        if titles:
-            each = (t if count == 1 else f"{t} ({count})" for t, count in titles.items())
+        subjects: dict[str, dict[str, None]] = {}
+        for f in rest:
+            if f.severity in severities:
+                subjects.setdefault(f.topic, {}).update(dict.fromkeys(f.subjects))
+        if subjects:
+            each = (f"{t} ({', '.join(of)})" if of else t for t, of in subjects.items())
             print_text(f"  {label}: {', '.join(each)}")
 
 

@@ -10,7 +10,7 @@ from heli_jax.flights.log import ChannelLog, shown, wrong
 from heli_jax.flights.preset import fitting_presets
 from heli_jax.linear_models import read as linear_models
 from heli_jax.new_config import guess, tables
-from heli_jax.new_config.logs import Log
+from heli_jax.new_config.logs import FEWEST, Log
 from heli_jax.new_config.signals import is_place, moving_channels, outputs_by_name
 
 _AXES = {
@@ -74,23 +74,28 @@ def _by_moving_stick(log: Log, path: str) -> str:
     """Return the linear model of the axis whose stick moves most and whose motion is logged."""
     called = tables.names()
     names = tuple(n for n in log.series if not is_place(n, log.series))
-    moving = {}
+    moving, still = {}, list[str]()
     for stick, (model, measured) in _AXES.items():
         by_name = guess.by_name(called["inputs"][stick], names, called["commands"][stick])
         by_name = by_name or guess.by_number(called["numbered"][stick], names)
-        sticks = moving_channels(log, [n for n in by_name if not guess.is_excitation(n)])
+        sticks = [n for n in by_name if not guess.is_excitation(n)]
         outputs = [
             n for m in measured for n in outputs_by_name(log, called["outputs"][m], _UNITS[m])
         ]
-        if sticks and moving_channels(log, outputs):
-            moving[model] = log.series[sticks[0]].values
+        moved = moving_channels(log, sticks)
+        if moved and moving_channels(log, outputs):
+            moving[model] = log.series[moved[0]].values
+        elif sticks and outputs:
+            still += outputs if moved else sticks
     if fitting_presets(log.format, names):
         return "roll-flybarless"
     if not moving:
-        listed = ", ".join(map(shown, names[:12]))
+        listed = ", ".join(map(shown, names[:12])) or f"none with {FEWEST} numbers"
         problem = "no column names match a stick and a rate or angle of its axis that both move"
+        if still:
+            problem = f"{', '.join(map(shown, still))} does not move, expected a stick and a motion"
         remedy = "name a model by --model, then fill in the signals in the file it writes"
-        raise wrong(path, f"{problem} (columns: {listed or 'none with numbers'}); {remedy}")
+        raise wrong(path, f"{problem} (columns: {listed}); {remedy}")
     most = {model: float(np.nanmax(np.abs(values))) for model, values in moving.items()}
     # Fractions of full travel are compared directly; the full travel of other numbers is unknown.
     alike = max(most.values()) <= _FULL_TRAVEL

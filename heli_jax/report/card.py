@@ -140,7 +140,7 @@ def _of_verdicts(fit: Fit) -> list[Gate]:
     rows = (
         ("identifiability", "all parameters", "determined", fit.verdict.identifiable, determined),
         ("trust", "all parameters", "trusted", not untrusted, trusted),
-        ("adequacy", "the model", "not no", fit.adequate, adequate),
+        ("adequacy", "the model", "adequate", fit.adequate, adequate),
     )
     return [
         Gate(what, of, math.nan, "", gate, passed, words) for what, of, gate, passed, words in rows
