@@ -19,8 +19,8 @@ record cannot give the requested estimates.
 
 LEFT_OUT = "channels.left-out"
 """Code of the finding on parts of a log that are not read."""
-_FARTHEST = 10.0
-"""Largest step of a score test that still gives a size [multiples of the estimate]."""
+_IN_FULL = 3
+"""Findings that the terminal and a page's first screen show in full."""
 HALF_INTERVAL = 1.96
 """Half-width of a 95 % interval [standard deviations]. A misfit that shifts the estimate further
 leaves the true value outside the interval.
@@ -69,8 +69,6 @@ class Distrust(NamedTuple):
 
     code: str
     """Code of the finding."""
-    shift: float | None
-    """Shift of the estimate by the misfit [SI]; None if unknown."""
     brief: str
 
 
@@ -128,6 +126,13 @@ def without_repeats(findings: Iterable[Finding]) -> list[Finding]:
     return list(by_sentence.values())
 
 
+def most_severe(findings: Sequence[Finding]) -> list[Finding]:
+    """Return the most severe findings, one of each topic; `findings` begin with the most severe."""
+    # The first finding represents all flights or signals with the same one.
+    by_topic = {f.topic: f for f in reversed(findings) if f.severity != "ok"}
+    return [f for f in findings if f is by_topic.get(f.topic)][:_IN_FULL]
+
+
 def sentences(findings: Iterable[Finding]) -> list[str]:
     """Return the sentences of findings without repetition."""
     return [f.sentence for f in without_repeats(findings)]
@@ -137,8 +142,7 @@ def distrusted(findings: Sequence[Finding], estimates: Mapping[str, Any]) -> dic
     """Return the finding that makes each parameter's interval unusable, the largest shift first.
 
     Args:
-        estimates: estimates by parameter, with `value` and `sd` [SI]; sd is None if not
-            identifiable.
+        estimates: estimates by parameter, with `sd` [SI], None if not identifiable.
     """
     known = {name: e for name, e in estimates.items() if e.sd is not None}
 
@@ -149,23 +153,21 @@ def distrusted(findings: Sequence[Finding], estimates: Mapping[str, Any]) -> dic
             for n, e in known.items()
         }
 
-    # One step gives the size to first order only. If a misfit invalidates one interval, it also
-    # invalidates those that it shifts at least half as far.
+    # One step gives the size to first order only, which may be wrong by a factor of ten. If a
+    # misfit invalidates one interval, it also invalidates those that it shifts half as far.
     takes = [
         (f, by, 0.5 if max(by.values(), default=0.0) > 1.0 else 1.0)
         for f, by in ((f, parts(f)) for f in findings)
     ]
     out: dict[str, Distrust] = {}
-    for name, estimate in known.items():
+    for name in known:
         moved = [(by[name], f) for f, by, most in takes if by[name] > most]
         unsized = [f for f in findings if name in f.distrusts]
         if moved:
-            part, first = max(moved, key=lambda one: one[0])
-            shift = float(first.shifts[name])
-            sized = part > 1.0 and abs(shift) <= _FARTHEST * max(abs(estimate.value), estimate.sd)
-            out[name] = Distrust(first.code, shift if sized else None, first.brief)
+            _, first = max(moved, key=lambda one: one[0])
+            out[name] = Distrust(first.code, first.brief)
         elif unsized:
-            out[name] = Distrust(unsized[0].code, None, unsized[0].brief)
+            out[name] = Distrust(unsized[0].code, unsized[0].brief)
     return out
 
 

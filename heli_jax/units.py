@@ -73,7 +73,8 @@ _FACTOR = r"(?:1|[A-Za-zµ°%_]+)(?:\s*(?:\^|\*\*)\s*-?\d)?"
 _UNIT = re.compile(rf"{_FACTOR}(?:\s*[*/·]\s*{_FACTOR}|\s+{_FACTOR})*")
 _EXAMPLES = (
     *("m", "mm", "cm", "km", "in", "ft", "mi", "nmi", "s", "ms", "us", "min", "h"),
-    *("rad", "mrad", "deg", "rev", "rpm", "Hz", "kt", "kg", "g", "lb", "slug", "N", "lbf", "gee"),
+    *("rad", "mrad", "rad/s", "deg", "deg/s", "rev", "rpm", "Hz", "kt"),
+    *("kg", "g", "lb", "slug", "N", "lbf", "gee"),
     *("Pa", "J", "W", "A", "V", "ohm", "H", "F", "%", "stick"),
 )
 """Units that error messages list; docs/units.md has all."""

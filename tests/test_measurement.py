@@ -106,7 +106,7 @@ def test_a_filter_that_is_not_modelled_is_a_caution(load, tmp_path):
         tmp_path / "flight.log", np.sin(TIMES), (("INS_GYRO_FILTER", 0), ("INS_HNTCH_ENABLE", 1))
     )
     (moving,) = read_flights(load(flight()))
-    assert [c.code for c in moving.source.cautions] == ["filters.unknown"]
+    assert [c.code for c in moving.source.cautions] == ["filters.unknown-filter"]
 
 
 ROTORFLIGHT = {

@@ -152,13 +152,16 @@ def test_topics_with_clocks_of_their_own_get_a_rate() -> None:
     assert channels_of_preset("px4-helicopter", px4, ["p", "phi", "lat"]) == px4[:2]
 
 
-@pytest.mark.parametrize("log", ["none.csv", "text.csv"], ids=["missing", "nothing of a model"])
+@pytest.mark.parametrize("log", ["none.csv", "text.csv", "still.csv"])
 def test_a_log_that_tells_nothing_ends_in_a_sentence(
     log: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write(tmp_path / "text.csv", {"t": T, "a": STICK, "b": RATE})
+    write(tmp_path / "still.csv", {"t": T, "lat_cmd": 0.0 * STICK, "p": RATE})
     assert cli.main(["new", str(tmp_path / log), "--out", str(tmp_path / "x.yaml")]) == 2
-    assert len(capsys.readouterr().err.splitlines()) == 1
+    [message] = capsys.readouterr().err.splitlines()
+    # The stick that does not move is named before the list of columns.
+    assert ("lat_cmd" in message.split("(")[0]) is (log == "still.csv")
     assert not (tmp_path / "x.yaml").exists()
 
 

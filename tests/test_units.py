@@ -87,7 +87,7 @@ def test_another_kind_is_refused(unit, si):
 
 @pytest.mark.parametrize(
     ("unit", "near"),
-    [("Deg", "deg"), ("radd", "rad"), ("RPM", "rpm"), ("mmm", "mm"), ("rads", "rad")],
+    [("Deg", "deg"), ("radd", "rad"), ("RPM", "rpm"), ("mmm", "mm"), ("rads", "rad/s")],
 )
 def test_unknown_unit_names_the_nearest(unit, near):
     with pytest.raises(ValueError, match=f"'{unit}'.*'{near}'"):

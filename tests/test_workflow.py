@@ -11,6 +11,7 @@ import heli_jax
 from heli_jax.cli import main
 from heli_jax.cli.fits import print_check
 from heli_jax.errors import InputError
+from heli_jax.finding import found
 from heli_jax.identification.design.accuracy import starting_at_zero
 from heli_jax.identification.problem import Free, Prior
 
@@ -189,6 +190,12 @@ def test_of_a_start_at_zero_no_part_is_expected(config, capsys):
     assert rows["If"].count("%") == 1
     sd = 0.5 * float(np.sqrt(check.verdict.covariance[1, 1]))
     assert f"{sd:.1e} kg m^2" in rows["If"]
+    # Without sensor noise nothing is known of the expected sd; the prior's share remains.
+    smoothed = (*check.findings, found("noise.smoothed", "doubt", "roll"))
+    print_check(dataclasses.replace(check, findings=smoothed))
+    rows = {line.split()[0]: line for line in capsys.readouterr().out.splitlines() if line.strip()}
+    assert [rows[n].count("%") for n in ("Ixx", "If")] == [1, 1]
+    assert "kg m^2" not in rows["If"]
 
 
 def test_the_time_of_a_run_is_told_part_by_part(config):

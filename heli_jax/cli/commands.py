@@ -740,10 +740,15 @@ def _models(options: argparse.Namespace) -> int:
         return DONE
     title, tables = described(options.name)
     if options.json:
-        content = {t.title: [dict(zip(t.head, r, strict=True)) for r in t.rows] for t in tables}
+        content = {
+            words: [dict(zip(t.head, row, strict=True)) for row in t.rows]
+            for words, t in tables.items()
+        }
         print(json.dumps({"model": title, **content}, indent=1))
     else:
-        print_text("\n".join([title, *map(summaries.as_text, tables)]))
+        print_text(title)
+        for words, t in tables.items():
+            print_text(summaries.as_text(words, t.head, t.rows))
     return DONE
 
 

@@ -7,10 +7,11 @@ from heli_jax.analysis.linear import eigenmodes
 from heli_jax.dynamics.model import vehicle_constants
 from heli_jax.linear_models.read import linear_model
 from heli_jax.numbers import terse
-from heli_jax.summaries import Row, Summary
+from heli_jax.report.tables import Table
+from heli_jax.summaries import Row
 
 
-def described(text: str) -> tuple[str, list[Summary]]:
+def described(text: str) -> tuple[str, dict[str, Table]]:
     """Return name and meaning of a model, and its tables in SI.
 
     Args:
@@ -25,25 +26,25 @@ def described(text: str) -> tuple[str, list[Summary]]:
     meaning = models.listed().get(str(name), "") if linear is None else linear.content.meaning
     records = {"states": model.State, "inputs": model.Inputs, "outputs": model.Outputs}
     head = ("name", "unit", "meaning")
-    tables = [Summary(title, head, tuple(_rows(record))) for title, record in records.items()]
+    tables = {title: Table(head, _rows(record)) for title, record in records.items()}
     defaults = vehicle_constants(model)
     sources = {n: c.source for n, c in constants.items()}
-    rows = (
+    rows = [
         (n, terse(defaults[n], 5), *words, sources.get(n, ""))
         for n, *words in _rows(model.Params)
         if n in defaults
-    )
+    ]
     head = ("name", "value", "unit", "meaning", "source")
-    tables.append(Summary("parameters", head, tuple(rows)))
+    tables["parameters"] = Table(head, rows)
     if linear is not None:
         modes = [(m, m.eigenvalue.real) for m in eigenmodes(model, linear.vehicle().params)]
         # Time constant of the envelope; it is negative if the mode grows.
-        cells = (
+        cells = [
             (m.name, *map(terse, (m.frequency, m.damping, -1.0 / real if real else None)))
             for m, real in modes
-        )
+        ]
         head = ("mode", "frequency [rad/s]", "damping", "time constant [s]")
-        tables.append(Summary("modes", head, tuple(cells)))
+        tables["modes"] = Table(head, cells)
     return f"{model.name}: {meaning}", tables
 
 

@@ -1,15 +1,15 @@
 """Terminal and file output of the commands."""
 
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from heli_jax import compatibility
 from heli_jax.cli.terminal import print_page_table, print_table, print_text
 from heli_jax.compatibility import Compatibility
 from heli_jax.config.frequency import missing_handling
-from heli_jax.finding import Finding
+from heli_jax.finding import Finding, most_severe
 from heli_jax.identification.design.accuracy import GUESSED
+from heli_jax.identification.diagnostics.record import SMOOTHED
 from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.fit import Check, Estimate
 from heli_jax.identification.identifiability.verdict import Verdict
@@ -159,7 +159,7 @@ def print_check(check: Check, *, verbose: bool = False) -> None:
     # The fit's result at its estimates may differ, since sensitivities depend on the parameters.
     print_text("At the start values (a fit repeats this at its estimates):")
     print_text(verdict.text)
-    rows = []
+    rows, smoothed = [], any(f.code == SMOOTHED for f in check.findings)
     for i, name in enumerate(verdict.names):
         # The covariance is that of the logarithms, so its root is the relative sd.
         relative = math.sqrt(verdict.covariance[i, i])
@@ -168,7 +168,7 @@ def print_check(check: Check, *, verbose: bool = False) -> None:
         if name in check.at_zero:
             size, unit = check.at_zero[name]
             expected = f"{terse(size * relative, 2)} {unit}"
-        expected = "not determined" if lacking else expected
+        expected = "not determined" if lacking else "-" if smoothed else expected
         rows.append((name, expected, percent(verdict.prior_share[name], 0)))
     print_table(("parameter", "expected sd", "prior share"), rows)
     for name, sd in check.noise.items():
@@ -181,16 +181,9 @@ def print_check(check: Check, *, verbose: bool = False) -> None:
     print_findings(check.findings, verbose=verbose)
 
 
-_IN_FULL = 3
-"""Findings that the terminal shows in full."""
-
-
 def print_findings(findings: Sequence[Finding], *, verbose: bool) -> None:
     """Print the most severe findings in full, and the others by their titles."""
-    # The first finding represents all flights or signals with the same one.
-    by_topic = {f.topic: f for f in reversed(findings) if f.severity != "ok"}
-    first = [f for f in findings if f is by_topic.get(f.topic)]
-    shown = findings if verbose else first[:_IN_FULL]
+    shown = findings if verbose else most_severe(findings)
     for f in shown:
         print_text(f"{_MARKS[f.severity]} {f.topic}: {f.sentence}")
     rest = [f for f in findings if f not in shown]
@@ -199,9 +192,12 @@ def print_findings(findings: Sequence[Finding], *, verbose: bool) -> None:
         ("notes", ("note",)),
         ("passed", ("ok",)),
     ):
-        titles = Counter(f.topic for f in rest if f.severity in severities)
-        if titles:
-            each = (t if count == 1 else f"{t} ({count})" for t, count in titles.items())
+        subjects: dict[str, dict[str, None]] = {}
+        for f in rest:
+            if f.severity in severities:
+                subjects.setdefault(f.topic, {}).update(dict.fromkeys(f.subjects))
+        if subjects:
+            each = (f"{t} ({', '.join(of)})" if of else t for t, of in subjects.items())
             print_text(f"  {label}: {', '.join(each)}")
 
 

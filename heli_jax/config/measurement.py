@@ -151,11 +151,11 @@ def filter_cautions(
             doubts.append(_not_modelled(name, output, logged))
         if logged.unknown:
             words = (
-                f"{name} was also filtered by {', '.join(_short(s) for s in logged.unknown)}. "
+                f"{name} was also filtered by {', '.join(s.split()[0] for s in logged.unknown)}. "
                 "These filters are not modelled, because they change in flight or are of an "
                 "unknown kind"
             )
-            doubts.append(Finding("filters.unknown", "doubt", words, subjects=(name,)))
+            doubts.append(Finding("filters.unknown-filter", "doubt", words, subjects=(name,)))
     return tuple(doubts)
 
 

@@ -1,6 +1,5 @@
 """Result of a fit, as plain data."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -16,7 +15,6 @@ from heli_jax.identification.validation.adequacy import Adequacy
 from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.held_out import HeldOutFrequency
 from heli_jax.identification.validation.metrics import Metrics, Signals, Whiteness
-from heli_jax.numbers import number
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -150,23 +148,12 @@ class Fit:
     @property
     def distrust(self) -> str:
         """One sentence for each reason to distrust intervals; empty if all are trusted."""
-        by_reason: dict[str, dict[str, float | None]] = {}
+        by_reason: dict[str, list[str]] = {}
         for name, d in self.distrusts.items():
-            by_reason.setdefault(d.brief, {})[name] = d.shift
+            by_reason.setdefault(d.brief, []).append(name)
         return " ".join(
-            f"Do not use {' or '.join(sizes)}: {reason}{self._shifts(sizes)}."
-            for reason, sizes in by_reason.items()
+            f"Do not use {' or '.join(names)}: {reason}." for reason, names in by_reason.items()
         )
-
-    def _shifts(self, sizes: Mapping[str, float | None]) -> str:
-        """Return the words on how far a misfit shifts the estimates; empty if unknown."""
-        units = self.nuisance | self.estimates
-        words = [
-            f"{n} by about {number(abs(size), 2)} {units[n].unit}".removesuffix(" 1")
-            for n, size in sizes.items()
-            if size is not None
-        ]
-        return f", which shifts {' and '.join(words)}" if words else ""
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -96,7 +96,7 @@ def write_config(
     written = f"wrote {', '.join(map(str, (out, *paths)))}"
     notes = [note("configuration.written", written), *read.notes]
     if todo:
-        words = f"fill in {todo} values marked {EDIT}"
+        words = f"fill in {todo} value{'s' * (todo > 1)} marked {EDIT}"
         notes.append(note("configuration.numbers-to-give", words, value=todo))
     lacking = [] if signals is None else [n for n, g in signals.inputs.items() if g is None]
     if signals is not None and not signals.outputs:

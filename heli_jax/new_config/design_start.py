@@ -108,8 +108,9 @@ def _gains(model: Any, params: Any) -> dict[str, dict[str, float]]:
 def _limit(model: Any, name: str, unit: str, gains: dict[str, dict[str, float]]) -> str:
     """Return the limits of an input, and where ArduPilot adds its chirp."""
     axis = next((a for a in model.axes if a.stick == name), None)
-    on_axis = axis is not None and axis.name in ("roll", "pitch", "yaw")
-    if on_axis and gains.get(name, {}).get(axis.rate):
+    if axis is not None and axis.name not in ("roll", "pitch", "yaw"):
+        axis = None
+    if axis is not None and gains.get(name, {}).get(axis.rate):
         return f"{{amplitude: 0.3, set_point: {axis.rate}, ardupilot: rate-{axis.name}}}  # rad/s"
-    place = f", ardupilot: mixer-{axis.name}" if on_axis and unit == "1" else ""
+    place = f", ardupilot: mixer-{axis.name}" if axis is not None and unit == "1" else ""
     return f"{{amplitude: {_AMPLITUDE.get(unit, EDIT)}{place}}}  # {unit}"

@@ -20,7 +20,7 @@ from heli_jax.new_config.guess import Series
 
 _ASSUMED = 100.0
 """Assumed rate of rows without any information on their rate [Hz]."""
-_FEWEST = 8
+FEWEST = 8
 """Fewest samples of a signal."""
 
 
@@ -71,7 +71,7 @@ def read_log(path: Path, number: int | None, rate: float | None = None) -> Log:
     series = {
         name: Series(topic.times, without_marks(as_floats(values)), topic.units.get(name, ""))
         for topic in log.topics
-        if topic.clock and topic.times.size >= _FEWEST
+        if topic.clock and topic.times.size >= FEWEST
         for name, values in topic.columns.items()
         if np.asarray(values).dtype.kind in "biuf" and _is_known(as_floats(values))
     }
@@ -120,4 +120,4 @@ def _without_time(info: LogInfo) -> str:
 
 
 def _is_known(values: np.ndarray) -> bool:
-    return int(np.sum(np.isfinite(values))) >= _FEWEST
+    return int(np.sum(np.isfinite(values))) >= FEWEST

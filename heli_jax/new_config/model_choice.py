@@ -10,7 +10,7 @@ from heli_jax import models
 from heli_jax.flights.log import ChannelLog, shown, wrong
 from heli_jax.flights.preset import fitting_presets
 from heli_jax.new_config import guess, tables
-from heli_jax.new_config.logs import Log
+from heli_jax.new_config.logs import FEWEST, Log
 from heli_jax.new_config.rate import channels_of_preset
 from heli_jax.new_config.signals import is_place, moving_channels, outputs_by_name
 
@@ -100,7 +100,7 @@ def _moving_stick(log: Log, path: str, sticks: Collection[str], preset: str | No
     """Return the stick that moves most, of those whose motion is logged."""
     called = tables.names()
     names = tuple(n for n in log.series if not is_place(n, log.series))
-    moving = {}
+    moving, still = {}, list[str]()
     for stick in sticks:
         if preset is None:
             by_name = guess.by_name(called["inputs"][stick], names, called["commands"][stick])
@@ -118,11 +118,15 @@ def _moving_stick(log: Log, path: str, sticks: Collection[str], preset: str | No
         moved = moving_channels(log, inputs)
         if moved and moving_channels(log, outputs):
             moving[stick] = log.series[moved[0]].values
+        elif inputs and outputs:
+            still += outputs if moved else inputs
     if not moving:
-        listed = ", ".join(map(shown, names[:12]))
+        listed = ", ".join(map(shown, names[:12])) or f"none with {FEWEST} numbers"
         problem = "no column names match a stick and a rate or angle of its axis that both move"
+        if still:
+            problem = f"{', '.join(map(shown, still))} does not move, expected a stick and a motion"
         remedy = "name a model by --model, then fill in the signals in the file it writes"
-        raise wrong(path, f"{problem} (columns: {listed or 'none with numbers'}); {remedy}")
+        raise wrong(path, f"{problem} (columns: {listed}); {remedy}")
     most = {stick: float(np.nanmax(np.abs(values))) for stick, values in moving.items()}
     # Fractions of full travel are compared directly; the full travel of other numbers is unknown.
     alike = max(most.values()) <= _FULL_TRAVEL

@@ -56,18 +56,13 @@ def card(fit: Fit, responses: FittedResponses | None = None) -> tuple[Gate, ...]
     for name, estimate in fit.estimates.items():
         gates += _of_parameter(name, estimate)
     gates += _of_relations(fit)
-    # With process noise a simulation departs from the record even at the true parameters. The gates
-    # then apply to one-step predictions. A method in frequency simulates nothing.
+    # With process noise a simulation departs from the record even at the true parameters, and
+    # almost any model predicts one sample ahead. A method in frequency simulates nothing.
     noise_model = objective_of(fit.method).noise_model
-    sources = [
-        (fit.one_step, "one step ahead"),
-        (fit.one_step_validation, "held out, one step ahead"),
-    ]
     if noise_model == "white":
-        sources += [(fit.metrics, "simulated"), (fit.validation, "held out, simulated")]
-    for metrics, source in sources:
-        for name, m in metrics.items():
-            gates += _of_agreement(f"{name}, {source}", m, fitted_mean=_mean_is_fitted(fit))
+        for metrics, how in ((fit.metrics, "simulated"), (fit.validation, "held out, simulated")):
+            for name, m in metrics.items():
+                gates += _of_agreement(f"{name}, {how}", m, fitted_mean=_mean_is_fitted(fit))
     gates += _of_held_out(fit)
     gates += _of_disturbance(fit)
     if noise_model != "spectrum":
@@ -145,7 +140,7 @@ def _of_verdicts(fit: Fit) -> list[Gate]:
     rows = (
         ("identifiability", "all parameters", "determined", fit.verdict.identifiable, determined),
         ("trust", "all parameters", "trusted", not untrusted, trusted),
-        ("adequacy", "the model", "not no", fit.adequate, adequate),
+        ("adequacy", "the model", "adequate", fit.adequate, adequate),
     )
     return [
         Gate(what, of, math.nan, "", gate, passed, words) for what, of, gate, passed, words in rows

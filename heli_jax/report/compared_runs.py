@@ -12,13 +12,13 @@ from heli_jax.finding import Finding, note, sentences
 from heli_jax.identification.methods import objective_of
 from heli_jax.identification.result import Estimate
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
-from heli_jax.numbers import NOTHING, number, vaf_percent, with_sd
+from heli_jax.numbers import NOTHING, number, vaf_percent
 from heli_jax.report.origin import origin
 from heli_jax.report.page import filled
 from heli_jax.report.saved_fit import SavedFit, load_fit
 from heli_jax.report.style import pretty
-from heli_jax.report.tables import NOT_DETERMINED, Table
-from heli_jax.summaries import as_text
+from heli_jax.report.tables import Table
+from heli_jax.summaries import as_text, cells_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -83,7 +83,7 @@ class ComparedRuns(NamedTuple):
         first, *others = {_samples(run) for run in self.runs}
         if first and not others and all(map(_converged, self.runs)):
             aic = [run.content["aic"] for run in self.runs]
-            above = (number(value - min(aic), 3) for value in aic)
+            above = (number(round(value - min(aic), 1), 3) for value in aic)
             rows.append(("all", "fitted", "AIC above the best", *above))
         return Table(("output", "flights", "metric", *self.labels), rows)
 
@@ -203,7 +203,9 @@ def _combinations(run: SavedFit) -> dict[str, Estimate]:
     every = run.content.get("determined_combinations") or ()
     known = (c for c in every if all(c.get(key) is not None for key in _NUMBERS))
     return {
-        c["name"]: Estimate(*(c[key] for key in _NUMBERS), "SI", math.nan, 0.0, False)
+        c["name"]: Estimate(
+            c["value"], c["sd"], c["lower95"], c["upper95"], "SI", math.nan, 0.0, at_bound=False
+        )
         for c in known
         if _converged(run)
     }
@@ -229,10 +231,12 @@ def _measured(e: Estimate | None, run: SavedFit) -> str:
         return NOTHING
     if not _converged(run):
         return NOT_CONVERGED
-    if e.sd is None:
-        # An insignificant disturbance has size zero.
-        return "0" if e.at_bound and e.value == 0.0 else NOT_DETERMINED
-    return with_sd(e.value, e.sd)
+    if e.sd is None and e.at_bound and e.value == 0.0:
+        return "0"  # an insignificant disturbance
+    value, sd, interval = cells_of(e)
+    if not sd:
+        return value
+    return f"{value} ({interval})" if e.lower95 is None else f"{value} ± {sd}"
 
 
 def _difference(first: Estimate | None, other: Estimate | None) -> str:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax import naming
+from heli_jax.finding import most_severe
 from heli_jax.identification.identifiability.verdict import FACTOR
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Fit, Signals
@@ -64,9 +65,11 @@ def write_report(
     first = None
     if (worst := worst_output(fit)) is not None:
         first = picture("overview", lambda: figures.overview(*worst, problem.model), numbers)
+    statements = lines(fit)
     page = filled(
         "report.html.j2",
         title=title,
+        state=max(reversed(statements), key=lambda s: _LEVELS.index(s.level)).word,
         fit=fit,
         problem=problem,
         baseline=baseline,
@@ -74,7 +77,8 @@ def write_report(
         card=card(fit, supplementary.responses),
         summary=summary,
         # The template calls this module for its rows.
-        lines=lines(fit),
+        lines=statements,
+        severe=most_severe(fit.findings),
         limits={
             "factor": f"{FACTOR:g}",
             "explained": percent(EXPLAINED, 0),
@@ -195,11 +199,14 @@ def caption(picture: Picture) -> str:
     return f"{picture.title}. {words} (figures/{picture.name}.svg)"
 
 
+_LEVELS = ("none", "good", "warning", "bad")
+
+
 class Line(NamedTuple):
     """One of the three statements at the head of the page."""
 
     level: str
-    """Level: good, warning, bad or none."""
+    """One of `_LEVELS`."""
     word: str
     text: str
     """One sentence."""

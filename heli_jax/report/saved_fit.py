@@ -91,8 +91,10 @@ def load_fit(directory: str | Path) -> SavedFit:
     """
     require_kind("directory", directory, (str, Path), "the path of a fit's run directory")
     directory = Path(directory)
-    if not directory.is_dir():
+    if not (directory / "fit.json").exists():
         got = "a file" if directory.exists() else "nothing of that name"
+        if directory.is_dir():
+            got = "a folder without fit.json"
         raise InputError(
             f"{directory}: expected the run directory of a fit (heli-jax fit --out DIR), got {got}"
         )

@@ -254,6 +254,17 @@ def test_what_to_fly_next_does_what_is_promised():
     assert plan.after == pytest.approx(after[int(np.argmax(now))], rel=1e-2)
 
 
+def test_a_smoothed_log_gives_no_next_flight():
+    f = flight(0, 500)
+    steady = steps(np.random.default_rng(5), 500, 100, 200)
+    clean = replace(f, inputs={"u": steady, "v": np.zeros(500)}, sd={})
+    t = np.arange(500) * DT
+    smooth = replace(clean, outputs={n: np.sin(t) for n in f.outputs})
+    for flown, code in ((clean, "excitation.next-flight"), (smooth, "noise.smoothed")):
+        codes = [f.code for f in check(problem(flown)).findings]
+        assert [c for c in codes if c in ("excitation.next-flight", "noise.smoothed")] == [code]
+
+
 def test_findings_stand_once():
     result = check(problem(flight(0, 2000, still=False)))
     codes = [f.code for f in result.findings]

@@ -118,6 +118,13 @@ def test_degrees_that_are_read_as_radians_are_doubted(load):
     assert record_doubts(of(load(P))) == []
 
 
+def test_a_unit_in_doubt_takes_all_intervals(load):
+    for size in (12.0 / np.percentile(np.abs(P), 99), 57.3):
+        found = of(load(size * P))
+        found.status, found.estimates = "converged", {"Lp": None}
+        assert [f.distrusts for f in units.size_of_angles(found)] == [("Lp",)]
+
+
 def test_dropouts_are_no_measurements_and_can_be_stated(load):
     p = P.copy()
     p[np.random.default_rng(1).choice(N, 20, replace=False)] = 0.0

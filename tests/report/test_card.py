@@ -59,12 +59,14 @@ def test_a_card_is_never_passed_beside_a_no(sound):
     assert "failed: adequacy" in summary(lines)
 
 
-def test_a_simulation_of_a_disturbed_machine_is_not_judged(sound):
+def test_filter_error_has_no_gate_of_agreement(sound):
+    # Almost any model predicts one sample ahead, and in gusts no simulation follows the record.
     fit, *_ = sound
-    filtered = dataclasses.replace(fit, method="filter-error", one_step=fit.metrics)
-    assert not [g for g in card(filtered) if g.of == "roll, simulated"]
-    judged = [g for g in card(filtered) if g.of == "roll, one step ahead"]
-    assert any(g.passed for g in judged)
+    filtered = dataclasses.replace(
+        fit, method="filter-error", one_step=fit.metrics, one_step_validation=fit.metrics
+    )
+    left_out = {g.what for g in card(fit)} - {g.what for g in card(filtered)}
+    assert left_out >= {"VAF", "NRMSE fit", "Theil coefficient", "Theil variance part"}
 
 
 def test_theils_bias_part_is_asked_for_only_where_no_bias_was_estimated(sound):

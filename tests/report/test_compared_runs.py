@@ -84,6 +84,8 @@ def test_fits_of_the_same_samples_are_compared_by_aic(tmp_path: Path) -> None:
         return write_run(tmp_path / name, {"Ixx": (0.02, 0.001)}, aic=aic, n_samples=20, **more)
 
     a, b = of("a1", -10.0), of("a2", -12.5, method="filter-error")
+    again = compare_runs([a, of("a4", -10.0 + 7e-8)])
+    assert again.agreement.rows[-1][2:] == ("AIC above the best", "0", "0")
     assert compare_runs([a, b]).agreement.rows[-1][2:] == ("AIC above the best", "2.5", "0")
     for other in (of("b1", 0.0), of("a3", 0.0, method="frequency-error")):
         assert all(
@@ -94,11 +96,15 @@ def test_fits_of_the_same_samples_are_compared_by_aic(tmp_path: Path) -> None:
 def test_what_is_not_to_be_trusted_is_said_of_compared_and_listed_fits(tmp_path, capsys) -> None:
     sentence = "Not trusted: Ixx (closed loop without an instrument)."
     brief = "closed loop without an instrument"
-    untrusted = {"Ixx": {"code": "loop.no-instrument", "shift": None, "brief": brief}}
+    untrusted = {"Ixx": {"code": "loop.no-instrument", "brief": brief}}
     a = write_run(tmp_path / "a", {"Ixx": (0.02, 0.001)})
     against = {"untrusted": untrusted, "distrust": sentence, "adequate": False}
-    b = write_run(tmp_path / "b", {"Ixx": (0.03, 0.001)}, **against)
+    withdrawn = Estimate(0.03, 0.001, None, None, "kg m^2", 1.0, 0.0, False, 0.001)._asdict()
+    b = write_run(tmp_path / "b", {}, parameters={"Ixx": withdrawn}, **against)
     compared = compare_runs([a, b])
+    assert [row[1:3] for row in compared.estimates.rows] == [
+        ("0.0200 ± 0.0010", "0.0300 (not trusted)")
+    ]
     assert compared.verdicts.rows[1][4] == f"The data determine all. {sentence}"
     said = [n.code for n in compared.notes if n.subjects == ("b",)]
     assert said == ["compared.not-trusted", "compared.not-adequate"]
@@ -108,7 +114,8 @@ def test_what_is_not_to_be_trusted_is_said_of_compared_and_listed_fits(tmp_path,
 
 def test_what_flights_share_is_compared_too(tmp_path: Path) -> None:
     def of(value: float, sd: float | None, unit: str, *, at_bound: bool = False) -> dict:
-        return Estimate(value, sd, None, None, unit, 1.0, 0.0, at_bound)._asdict()
+        ends = (None, None) if sd is None else (value - 1.96 * sd, value + 1.96 * sd)
+        return Estimate(value, sd, *ends, unit, 1.0, 0.0, at_bound)._asdict()
 
     a = {"sigma_w": of(2.0, 0.3, "rad/s^2"), "flight 1/bias p": of(0.1, 0.1, "rad/s")}
     b = {"sigma_w": of(0.0, None, "rad/s^2", at_bound=True), "time_shift": of(0.05, 0.01, "s")}

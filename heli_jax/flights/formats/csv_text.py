@@ -497,6 +497,8 @@ class CsvTable:
                 problem += f" {len(self.names)} as in the header in line {self._head.number}"
                 if not self._head.is_fitting:
                     problem += "; no line of names is directly above rows with as many cells"
+                if delimiter == "," and count > len(self.names):
+                    problem += "; if these are decimal commas, separate the cells by semicolons"
                 return wrong(self.path, problem, f"line {line}")
         return wrong(self.path, "holds no rows that can be read, expected rows of numbers")
 

@@ -273,12 +273,16 @@ def nothing_follows(c: Context) -> Iterator[Finding]:
         )
 
 
+SMOOTHED = "noise.smoothed"
+"""Code of a record without sensor noise, which gives no expected standard deviations."""
+
+
 def smoothed_outputs(c: Context) -> Iterator[Finding]:
     """Find outputs without sensor noise before a fit, whose accuracy nothing predicts."""
     for label, flight in [] if c.fitted else c.flights:
         smooth = [n for n, y in flight.outputs.items() if n not in flight.sd and without_noise(y)]
         if smooth:
-            yield found("noise.smoothed", "doubt", *smooth, flight=label)
+            yield found(SMOOTHED, "doubt", *smooth, flight=label)
 
 
 def gusts_guessed(c: Context) -> Iterator[Finding]:
@@ -293,7 +297,8 @@ def gusts_guessed(c: Context) -> Iterator[Finding]:
 
 def next_flight(c: Context) -> Iterator[Finding]:
     """Suggest the manoeuvre that narrows the widest interval more than the same record again."""
-    plan = None if c.fitted else plan_next_flight(c.problem, c.at, c.e)
+    unknown = c.fitted or any(True for _ in smoothed_outputs(c))
+    plan = None if unknown else plan_next_flight(c.problem, c.at, c.e)
     if plan is None or not plan.after < BETTER * plan.again:
         return
     unit = naming.unit(c.problem.model.Inputs, plan.input) or ""

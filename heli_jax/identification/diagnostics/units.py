@@ -235,7 +235,7 @@ def in_degrees(
             str(name),
             value=size,
             denies=certain,
-            distrusts=() if certain or flown else estimates,
+            distrusts=() if flown else estimates,
             flight=label,
             unit=signal.unit,
             degrees=signal.unit.replace("rad", "deg"),
