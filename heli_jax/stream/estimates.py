@@ -193,12 +193,17 @@ def _products(
 def _errors(
     frame: _Frame, block: tuple[int, int], lines: _Lines, W: Array, z: Array
 ) -> tuple[Complex[Array, "K p F"], Matrices, Array]:
-    """Return the errors without the effects of the ends, the model, and the number of effects."""
+    """Return the errors without the effects of the ends, the model, and the part (K,) of the
+    errors' power that these effects take."""
     record = _Block(0, 0, block[0])
     m, at = _model(frame, record, block[1], lines, z)
     ends = ends_of(m, record, W, at, lines.outputs)
     made = at_each_line(partial(modelled, m), ends.R, at._replace(ends=ends.inputs))
-    return lines.outputs - made, m, jnp.sum(ends.Q**2)
+    return (
+        lines.outputs - made,
+        m,
+        jnp.mean(jnp.sum(ends.Q**2, axis=1).reshape(record.lines, -1), 1),
+    )
 
 
 @jitted
@@ -215,6 +220,11 @@ def _values(frame: _Frame, z: Array) -> tuple[Array, Array]:
 
 _ROUNDS, _STEPS = 8, 12
 """Most estimates of the noise's spectrum, and most steps for each."""
+_WIDER = 1.1
+"""Errors over the Cramer-Rao bound, measured: the weights are estimated from the same few blocks
+(experiments/stream.py)."""
+_MOST_LOST = 0.8
+"""Largest part of a line's power that counts as taken by the ends."""
 _STILL = 0.03
 """Change of all estimates [sd] that ends the search."""
 
@@ -248,15 +258,17 @@ def estimate(problem: Problem, state: State, before: Known | None = None) -> Kno
         began = z
         z, covariance = _search(frame, block, lines, W, z)
         errors, vehicle, lost = jax.device_get(_errors(frame, block, lines, W, z))
-        rows = 2 * done.count * errors.shape[0] * errors.shape[1]
-        errors = errors * np.sqrt(rows / max(rows - done.count * float(lost) - z.size, 1.0))
+        # The ends take most of the power at the lowest lines, where gusts are.
+        left = done.count * errors.shape[1] * np.sum(2.0 * (1.0 - lost))
+        power = (1.0 - np.minimum(lost, _MOST_LOST)) * max(1.0 - z.size / left, 0.1)
+        errors = errors / np.sqrt(power)[:, None, None]
         W = whitening_by(vehicle, [errors[:, :, i] for i in range(done.count)], state.length)[0]
         moved = (z - began) / np.sqrt(np.maximum(np.diag(covariance), 1e-300))
         if before is not None and np.max(np.abs(moved)) < _STILL:
             break
         before = before or Known({}, z, covariance, W, {}, 0)
     _, _, information = jax.device_get(_products(frame, block, lines, W, z))
-    covariance = _inverse(information)
+    covariance = _WIDER**2 * _inverse(information)
     return Known(
         _named(problem, frame, z, covariance),
         z,
