@@ -123,6 +123,23 @@ def as_function() -> Iterator[Interrupts]:
         signal.signal(signal.SIGINT, before)
 
 
+@contextlib.contextmanager
+def ending_block() -> Iterator[Callable[[], bool]]:
+    """Let an interrupt end the block alone; yield a function that returns if there was one."""
+    seen: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    before = signal.signal(signal.SIGINT, lambda number, _: seen.append(number))
+    # `watch` must not hear of it.
+    pipe = signal.set_wakeup_fd(-1)
+    try:
+        yield lambda: bool(seen)
+    finally:
+        signal.signal(signal.SIGINT, before)
+        signal.set_wakeup_fd(pipe, warn_on_full_buffer=False)
+
+
 def resumable(out: Path, finished: str) -> str:
     """Return the final message of work that --resume can continue."""
     if not out.exists():

@@ -65,7 +65,9 @@ class Known(NamedTuple):
     """What the blocks so far determine."""
 
     estimates: dict[str, Estimated]
-    """Free parameters, then products and quotients that are determined far better than they."""
+    """Free parameters, gains and shift."""
+    relative: Float[np.ndarray, "q q"]
+    """Covariance relative to the values."""
     z: Float[np.ndarray, " q"]
     """Coordinates of the estimates, where the next call begins."""
     covariance: Float[np.ndarray, "q q"]
@@ -75,11 +77,43 @@ class Known(NamedTuple):
     coherence: dict[tuple[str, str], float]
     """By input and output: part of the output's power that follows the input."""
     blocks: int
+    """Blocks completed so far."""
+
+    def of(self, name: str) -> Estimated | None:
+        """Return the estimate of a parameter, of a product `a*If` or a quotient `a/If`; None if
+        there is none."""
+        if name in self.estimates:
+            return self.estimates[name]
+        mark = "/" if "/" in name else "*"
+        pair, sign = name.split(mark), -1.0 if mark == "/" else 1.0
+        if len(pair) != 2 or not all(n in self.estimates for n in pair):
+            return None
+        i, j = (list(self.estimates).index(n) for n in pair)
+        C = self.relative
+        sd = float(np.sqrt(max(C[i, i] + C[j, j] + 2.0 * sign * C[i, j], 0.0)))
+        value = self.estimates[pair[0]].value * self.estimates[pair[1]].value ** sign
+        factor = float(np.exp(min(Z95 * sd, 700.0)))
+        return Estimated(value, abs(value) * sd, *sorted((value / factor, value * factor)))
 
     def sd_of(self, name: str) -> float:
-        """Return the sd of an estimate relative to its value; infinite if there is none."""
-        one = self.estimates.get(name)
+        """Return the sd of an estimate over its value; infinite without one."""
+        one = self.of(name)
         return one.sd / abs(one.value) if one is not None and one.value else np.inf
+
+    def combinations(self) -> dict[str, Estimated]:
+        """Return the products and quotients that are determined far better than their factors."""
+        made, own = {}, np.sqrt(np.diag(self.relative))
+        for (i, a), (j, b) in itertools.combinations(enumerate(self.estimates), 2):
+            for name in (f"{b}/{a}", f"{a}*{b}"):
+                one = self.of(name)
+                if one is not None and one.sd < _BETTER * min(own[i], own[j]) * abs(one.value):
+                    made[name] = one
+        return made
+
+
+_BETTER = 0.5
+"""Relative sd of a product or quotient, over the smaller of its factors', up to which it is
+listed."""
 
 
 class _Frame(NamedTuple):
@@ -246,11 +280,7 @@ def estimate(problem: Problem, state: State, before: Known | None = None) -> Kno
     if before is None:
         z = np.asarray(start_vector(frame.layout, frame.data, problem))
         # As frequency error begins: each signal alone, as if all of it were noise.
-        (S,) = (
-            smoothed([done.lines[:, m:, 0]])
-            if done.count == 1
-            else [smoothed([done.lines[:, m:, i] for i in range(done.count)])[0]]
-        )
+        S = smoothed([done.lines[:, m:, i] for i in range(done.count)])[0]
         W = inverse_roots(S * np.eye(S.shape[1]))
     else:
         z, W = before.z, before.whitening
@@ -266,16 +296,17 @@ def estimate(problem: Problem, state: State, before: Known | None = None) -> Kno
         moved = (z - began) / np.sqrt(np.maximum(np.diag(covariance), 1e-300))
         if before is not None and np.max(np.abs(moved)) < _STILL:
             break
-        before = before or Known({}, z, covariance, W, {}, 0)
+        before = before or Known({}, covariance, z, covariance, W, {}, 0)
     _, _, information = jax.device_get(_products(frame, block, lines, W, z))
-    covariance = _WIDER**2 * _inverse(information)
+    P = np.asarray(jax.jacfwd(partial(prior_rows, frame.layout, frame.data))(jnp.asarray(z)))
+    covariance = _inverse((information - P.T @ P) / _WIDER**2 + P.T @ P)
     return Known(
-        _named(problem, frame, z, covariance),
+        *_named(frame, z, covariance),
         z,
         covariance,
         W,
         _coherence(problem, frame.layout.outputs[0], lines, done.count),
-        done.count,
+        int(state.blocks),
     )
 
 
@@ -319,33 +350,22 @@ def _search(
 
 
 def _named(
-    problem: Problem, frame: _Frame, z: np.ndarray, covariance: np.ndarray
-) -> dict[str, Estimated]:
-    """Return the estimates by name, and products and quotients that are far better determined."""
-    layout = frame.layout
+    frame: _Frame, z: np.ndarray, covariance: np.ndarray
+) -> tuple[dict[str, Estimated], np.ndarray]:
+    """Return the estimates by name, and their covariance relative to the values."""
     values, slopes = jax.device_get(_values(frame, z))
     sds = np.sqrt(np.diag(covariance))
     ends = [jax.device_get(_values(frame, z + side * Z95 * sds)[0]) for side in (-1.0, 1.0)]
     made = {
         n: Estimated(float(v), float(abs(s) * sd), *sorted((float(a), float(b))))
-        for n, v, s, sd, a, b in zip(layout.of_interest, values, slopes, sds, *ends, strict=True)
+        for n, v, s, sd, a, b in zip(
+            frame.layout.of_interest, values, slopes, sds, *ends, strict=True
+        )
     }
-    relative = slopes / np.where(values == 0, np.nan, values)
-    C = covariance * np.outer(relative, relative)
-    for i, j in itertools.combinations(range(len(layout.free)), 2):
-        for sign, mark in ((-1.0, "/"), (1.0, "*")):
-            sd = float(np.sqrt(max(C[i, i] + C[j, j] + 2.0 * sign * C[i, j], 0.0)))
-            if sd < _BETTER * np.sqrt(min(C[i, i], C[j, j])):
-                value, factor = float(values[i] * values[j] ** sign), np.exp(Z95 * sd)
-                low, high = sorted((value / factor, value * factor))
-                name = f"{layout.free[i]}{mark}{layout.free[j]}"
-                made[name] = Estimated(value, abs(value) * sd, low, high)
-    return made
+    over = slopes / np.where(values == 0, np.inf, values)
+    return made, covariance * np.outer(over, over)
 
 
-_BETTER = 0.5
-"""Relative sd of a product or quotient, over the smaller of its factors', up to which it is
-listed."""
 _AVERAGES = 12
 """Least lines and blocks in a coherence."""
 

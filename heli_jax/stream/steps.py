@@ -8,6 +8,7 @@ Sources: Morelli (2000) for the recursive transform; `identification/estimation/
 for the estimate.
 """
 
+import dataclasses
 import math
 from typing import NamedTuple
 
@@ -130,14 +131,15 @@ def init(
         for v in (flight.outputs[outputs[pair[0]]], flight.inputs[names[0]])
     ]
     kind = jnp.result_type(float)
-    K, zero = min((N - 1) // 2, LINES), jnp.zeros((), int)
+    # Separate arrays, because a donated array may be given once only.
+    K = min((N - 1) // 2, LINES)
     shape, wide = (BLOCKS, K, len(names) + len(outputs)), np.result_type(kind, np.complex64)
     return State(
-        samples=zero,
-        missing=zero,
-        row=zero,
-        blocks=zero,
-        within=zero,
+        samples=jnp.zeros((), int),
+        missing=jnp.zeros((), int),
+        row=jnp.zeros((), int),
+        blocks=jnp.zeros((), int),
+        within=jnp.zeros((), int),
         sums=jnp.zeros(shape, wide),
         ends=jnp.zeros((BLOCKS, 2, recent, len(names)), kind),
         inputs=jnp.zeros((recent, len(names)), kind),
@@ -193,17 +195,20 @@ def step(state: State, sample: Sample) -> tuple[State, Info]:
     now = jnp.where(whole, jnp.concatenate([u[state.ahead], y[state.ahead]]), 0.0)
     before = jnp.where(first, 0.0, state.sums[slot])
     added = before + turn[:, None] * now.astype(turn.dtype)[None, :]
-    made = eqx.tree_at(
-        lambda s: (
-            s.samples, s.missing, s.row, s.blocks, s.within, s.sums, s.ends, s.inputs, s.outputs,
-            s.rls, s.rls_past,
-        ),
+    made = dataclasses.replace(
         state,
-        (
-            state.samples + 1, state.missing + (~seen).astype(int), row, blocks, jnp.where(whole, within + 1, 0),
-            state.sums.at[slot].set(added), ends, u, y, rls, past,
-        ),
-    )  # fmt: skip
+        samples=state.samples + 1,
+        missing=state.missing + (~seen).astype(int),
+        row=row,
+        blocks=blocks,
+        within=jnp.where(whole, within + 1, 0),
+        sums=state.sums.at[slot].set(added),
+        ends=ends,
+        inputs=u,
+        outputs=y,
+        rls=rls,
+        rls_past=past,
+    )
     return made, Info(error, largest, full)
 
 
