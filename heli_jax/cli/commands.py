@@ -125,7 +125,7 @@ _COMMANDS = {
              help="wanted sd of a parameter or quotient: Ixx=2%%, a/If=100"),
         _arg("--until-end", help="end with the present end of the file"),
         _arg("--block", type=_seconds, metavar="S",
-             help="length of the blocks that are estimated [s] (default: 10)"),
+             help="length of the blocks that are estimated [s] (default: 20)"),
     )),
     "simulate": ("simulate the configuration's run, or its flights", (
         *_CONFIG,

@@ -254,9 +254,6 @@ def _values(frame: _Frame, z: Array) -> tuple[Array, Array]:
 
 _ROUNDS, _STEPS = 8, 12
 """Most estimates of the noise's spectrum, and most steps for each."""
-_WIDER = 1.1
-"""Errors over the Cramer-Rao bound, measured: the weights are estimated from the same few blocks
-(experiments/stream.py)."""
 _MOST_LOST = 0.8
 """Largest part of a line's power that counts as taken by the ends."""
 _STILL = 0.03
@@ -298,8 +295,7 @@ def estimate(problem: Problem, state: State, before: Known | None = None) -> Kno
             break
         before = before or Known({}, covariance, z, covariance, W, {}, 0)
     _, _, information = jax.device_get(_products(frame, block, lines, W, z))
-    P = np.asarray(jax.jacfwd(partial(prior_rows, frame.layout, frame.data))(jnp.asarray(z)))
-    covariance = _inverse((information - P.T @ P) / _WIDER**2 + P.T @ P)
+    covariance = _inverse(information)
     return Known(
         *_named(frame, z, covariance),
         z,
