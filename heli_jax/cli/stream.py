@@ -66,6 +66,16 @@ def wanted_of(texts: Sequence[str]) -> dict[str, Wanted]:
     return wanted
 
 
+def require_free(experiment: Experiment, wanted: Mapping[str, Wanted]) -> None:
+    """Refuse wanted sds of what is not estimated."""
+    fit = experiment.config.fit
+    free = [] if fit is None else [*fit.free, *["time_shift"] * fit.nuisance.time_shift]
+    for name in wanted:
+        if not all(n in free for n in re.split(r"[/*]", name, maxsplit=1)):
+            known = ", ".join(free)
+            raise InputError(f"--for: {name!r:.60} is not free, expected {known}, or a quotient")
+
+
 # Sources of bytes: a growing file, standard input, or messages as rows of a table.
 
 
@@ -158,10 +168,10 @@ class Follower:
                 f"{experiment.path}: flights[0].signals.time: missing, expected the column of "
                 "times of a table"
             )
-        each = (*signals.inputs.values(), *signals.outputs.values())
-        self.names = list(
-            dict.fromkeys(s.signal for s in each if getattr(s, "constant", None) is None)
-        )
+        inputs = [s.signal for s in signals.inputs.values() if s.constant is None and s.signal]
+        outputs = [s.signal for s in signals.outputs.values() if s.signal]
+        self.names = list(dict.fromkeys([*inputs, *outputs]))
+        self._inputs = len({*inputs})
         self.experiment, self.time, self.log, self.block = experiment, clock, log, block
         self.sorter = Sorter(place, clock, self.names)
         self.problem: Problem | None = None
@@ -203,8 +213,9 @@ class Follower:
             return False
         n = int(np.searchsorted(seconds, seconds[0] + self._length, side="right"))
         first = Rows(*(v[:n] for v in self._first))
-        moves = np.nanmax(first.values, axis=0) > np.nanmin(first.values, axis=0)
-        if not last and not moves.all():
+        moves = [np.unique(v[np.isfinite(v)]).size > 1 for v in first.values.T]
+        begun = any(moves[self._inputs :]) and any([not self._inputs, *moves[: self._inputs]])
+        if not last and not begun:
             # On the ground nothing moves yet.
             self._length += self.block
             return False
@@ -283,10 +294,8 @@ def rows_of(follower: Follower, wanted: Mapping[str, Wanted]) -> list[tuple[str,
         return []
     each = known.estimates | known.combinations()
     for name in wanted:
-        if (one := known.of(name)) is None:
-            names = ", ".join(known.estimates)
-            raise InputError(f"--for: {name} is not free, expected {names}, or a quotient of two")
-        each[name] = one
+        if (one := known.of(name)) is not None:
+            each[name] = one
     rows = []
     for name, one in each.items():
         want, enough = wanted.get(name), ""
@@ -388,6 +397,7 @@ def run_stream(
         InputError: a row or the configuration is wrong, or nothing was received.
     """
     require_flights(experiment)
+    require_free(experiment, wanted)
     if place is None:
         place = str(experiment.path.parent / experiment.config.flights[0].log)
     follower = Follower(experiment, place, log, block or BLOCK)

@@ -171,7 +171,11 @@ def _model(
         of = [delays.group(i) for i in range(len(names))]
         whole = [0 if g is None else delays.whole[g] for g in of]
         rest = [0.0 if g is None else delays.rest[g] for g in of]
-    turn = jnp.asarray(block.z)
+    omega, kind = jnp.asarray(np.angle(block.z)), lines.inputs.dtype
+
+    def turned(samples: Array) -> Array:
+        angle = omega[:, None] * samples.astype(omega.dtype)
+        return jax.lax.complex(jnp.cos(angle), jnp.sin(angle))
 
     def lagged(more: int) -> Array:
         """Return the transforms of the inputs as they were `more` samples before."""
@@ -184,10 +188,10 @@ def _model(
                 # A shifted block begins and ends with other samples.
                 sign = jnp.where((lags >= 1) & (lags <= lag), 1.0, 0.0)
                 sign = jnp.where((lags <= 0) & (lags > lag), -1.0, sign)
-                other = (sign[:, None] * lines.ends[:, i]).astype(turn.dtype)
-                column = column + turn[:, None] ** lags.astype(float)[None, :] @ other
-                column = jnp.exp(-1j * jnp.angle(turn) * lag)[:, None] * column
-            columns.append(column * u.gains[n].astype(turn.dtype) if n in u.gains else column)
+                other = (sign[:, None] * lines.ends[:, i]).astype(kind)
+                column = column + turned(jnp.asarray(lags)[None, :]) @ other
+                column = turned(-jnp.asarray(lag)[None, None]) * column
+            columns.append(column * u.gains[n].astype(kind) if n in u.gains else column)
         return jnp.stack(columns, axis=1)
 
     now = lagged(0)
@@ -200,7 +204,7 @@ def _model(
             for i, r in enumerate(rest)
         ]
         share = jnp.stack([jnp.asarray(v, float) for v in shares])[None, :, None]
-        share = share.astype(turn.dtype)
+        share = share.astype(kind)
         held = share * lagged(1) + (1.0 - share) * now
     rows = np.asarray([naming.names(layout.model.Outputs).index(n) for n in layout.outputs[0]])
     B = jnp.concatenate([M for M, _ in each], axis=1)
@@ -308,10 +312,15 @@ def estimate(problem: Problem, state: State, before: Known | None = None) -> Kno
 
 def _inverse(information: np.ndarray) -> np.ndarray:
     """Return the inverse of a positive semidefinite matrix; huge where it is singular."""
-    size = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    size = np.sqrt(_positive(np.diag(information)))
     values, vectors = np.linalg.eigh(information / np.outer(size, size))
     V = vectors / np.sqrt(np.maximum(values, 1e-14)) / size[:, None]
     return V @ V.T
+
+
+def _positive(diagonal: np.ndarray) -> np.ndarray:
+    """Return a diagonal without zeros, of unknowns without effect."""
+    return np.maximum(diagonal, max(1e-16 * diagonal.max(), 1e-100))
 
 
 def _search(
@@ -328,7 +337,7 @@ def _search(
     k, damping = len(limits), 1e-4
     cost, g, H = jax.device_get(_products(frame, block, lines, W, z))
     for _ in range(_STEPS):
-        D = np.diag(np.maximum(np.diag(H), 1e-300))
+        D = np.diag(_positive(np.diag(H)))
         move = -np.linalg.solve(H + damping * D, g)
         trial = z + np.clip(move, -1.0, 1.0)
         trial[:k] = np.clip(trial[:k], *limits.T)

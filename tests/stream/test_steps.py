@@ -92,8 +92,8 @@ def test_steps_are_those_of_a_scan_and_of_a_batch(flight):
     two, _ = jax.vmap(lambda s: stream.follow(stream.init(problem), s))(both)
     for a, b, c in zip(*map(jax.tree.leaves, (whole, state, two)), strict=True):
         size = np.abs(a).max() + 1e-300
-        assert np.abs(a - b).max() <= 1e-12 * size
-        assert np.abs(a - c[1]).max() <= 1e-12 * size
+        assert np.abs(a - b).max() <= 1e-10 * size
+        assert np.abs(a - c[1]).max() <= 1e-10 * size
 
 
 def test_estimates_are_those_of_the_batch(flight):
@@ -142,7 +142,7 @@ def test_delays_are_exact_at_the_ends_of_blocks(hold, late):
 
 
 def test_a_quotient_is_sharper_than_its_parameters(flight):
-    free = {"Ixx": Free(0.03), "a": Free(5.5, prior=Prior(5.5, 0.5))}
+    free = {"Ixx": Free(0.03), "If": Free(2e-4), "a": Free(5.5, prior=Prior(5.5, 0.5))}
     problem = problem_of(flight, free=free)
     known = stream.estimate(problem, followed(problem, flight, block=10.0)[0])
     one = known.combinations()["a/Ixx"]
