@@ -5,9 +5,10 @@
 Records of 120 s at 50 Hz, with gusts as large as the stick's response and with white noise alone;
 Ixx, If and kappa start off by a quarter. PART (all) is coverage, enough or time.
 
-Coverage: 95 % intervals after 20, 60 and 100 s, of one, three and five blocks. Enough: at the first block after which the sd of
-Ixx is at most the wanted one, the batch fit (filter error in gusts, else output error) of the same
-samples states its own sd. Time: 100 s at 1 kHz, sample by sample on one core.
+Coverage: 95 % intervals after 20, 60 and 100 s, which are one, three and five blocks. Enough: at
+the first block after which the sd of Ixx is at most the wanted one, the batch fit (filter error in
+gusts, else output error) of the same samples states its own sd. Time: 100 s at 1 kHz, sample by
+sample.
 """
 
 import time
