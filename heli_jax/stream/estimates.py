@@ -259,8 +259,8 @@ def _values(frame: _Frame, z: Array) -> tuple[Array, Array]:
 _ROUNDS, _STEPS = 8, 12
 """Most estimates of the noise's spectrum, and most steps for each."""
 _FEW = 0.15
-"""Widening of the intervals after one block; after n blocks the n-th part. The weights are estimated
-from the same blocks. Measured by experiments/stream.py."""
+"""Widening of the intervals after one block, and the n-th part of it after n blocks: the weights
+are estimated from the same blocks. Measured by experiments/stream.py."""
 _MOST_LOST = 0.8
 """Largest part of a line's power that counts as taken by the ends."""
 _STILL = 0.03
