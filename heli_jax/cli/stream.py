@@ -1,6 +1,5 @@
 """`heli-jax stream`: what a flight determines so far, while it goes on."""
 
-import contextlib
 import os
 import re
 import select
@@ -199,7 +198,12 @@ class Follower:
                 file.write(head + b"\n".join(rows.lines) + b"\n")
             self._stamps.append(rows.seconds)
         if self._grid is None:
-            self._first = Rows(*(_joined(a, b) for a, b in zip(self._first, rows, strict=True)))
+            old = self._first
+            self._first = Rows(
+                np.concatenate([old.seconds, rows.seconds]),
+                np.concatenate([old.values, rows.values]),
+                old.lines + rows.lines,
+            )
             if not self._begin(last):
                 return
             assert self._grid is not None
@@ -212,7 +216,7 @@ class Follower:
         if not seconds.size or not (last or seconds[-1] - seconds[0] >= self._length):
             return False
         n = int(np.searchsorted(seconds, seconds[0] + self._length, side="right"))
-        first = Rows(*(v[:n] for v in self._first))
+        first = self._first.part(0, n)
         moves = [np.unique(v[np.isfinite(v)]).size > 1 for v in first.values.T]
         begun = any(moves[self._inputs :]) and any([not self._inputs, *moves[: self._inputs]])
         if not last and not begun:
@@ -278,10 +282,6 @@ class Follower:
             return False
         self.known = estimate(self.problem, self.state, self.known)
         return True
-
-
-def _joined(a: Any, b: Any) -> Any:
-    return a + b if isinstance(a, list) else np.concatenate([a, b])
 
 
 # The screen.
@@ -403,7 +403,7 @@ def run_stream(
     follower = Follower(experiment, place, log, block or BLOCK)
     shown = 0.0
     arrives = received(place, until_end, stopped, follower.time, follower.names)
-    with _Screen(follower, wanted) as screen, contextlib.closing(arrives):
+    with _Screen(follower, wanted) as screen:
         for data in arrives:
             follower.take(data)
             changed = follower.update()

@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import itertools
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -62,7 +62,7 @@ class Estimated(NamedTuple):
 
 
 class Known(NamedTuple):
-    """What the blocks so far determine."""
+    """Estimates of the blocks so far."""
 
     estimates: dict[str, Estimated]
     """Free parameters, gains and shift."""
@@ -117,7 +117,7 @@ listed."""
 
 
 class _Frame(NamedTuple):
-    """What the estimates need of a problem; hashable parts are static."""
+    """Parts of a problem that the estimates need."""
 
     layout: Layout
     data: Data
@@ -211,9 +211,10 @@ def _model(
     return Matrices(Ad, B, C[rows], D[rows]), Sources(U, held)
 
 
+# Any: arrays of NumPy or JAX.
 @jitted
 def _products(
-    frame: _Frame, block: tuple[int, int], lines: _Lines, W: Array, z: Array
+    frame: _Frame, block: tuple[int, int], lines: _Lines, W: Any, z: Any
 ) -> tuple[Array, Array, Array]:
     """Return e'e, J'e and J'J of whitened errors and priors."""
     record, ahead = _Block(0, 0, block[0]), block[1]
@@ -229,7 +230,7 @@ def _products(
 
 @jitted
 def _errors(
-    frame: _Frame, block: tuple[int, int], lines: _Lines, W: Array, z: Array
+    frame: _Frame, block: tuple[int, int], lines: _Lines, W: Any, z: Any
 ) -> tuple[Complex[Array, "K p F"], Matrices, Array]:
     """Return the errors without the effects of the ends, the model, and the part (K,) of the
     errors' power that these effects take."""
@@ -245,7 +246,7 @@ def _errors(
 
 
 @jitted
-def _values(frame: _Frame, z: Array) -> tuple[Array, Array]:
+def _values(frame: _Frame, z: Any) -> tuple[Array, Array]:
     """Return the parameters, gains and shift, and their derivatives by z."""
 
     def values(z: Array) -> Array:
@@ -279,7 +280,7 @@ def estimate(problem: Problem, state: State, before: Known | None = None) -> Kno
         return None
     frame, m = _frame(problem), len(naming.names(problem.model.Inputs))
     scale = 1.0 / np.sqrt(state.length)
-    lines = _Lines(done.lines[:, :m], done.lines[:, m:], scale * done.ends)
+    lines = _Lines(*map(jnp.asarray, (done.lines[:, :m], done.lines[:, m:], scale * done.ends)))
     block = (state.length, state.ahead)
     if before is None:
         z = np.asarray(start_vector(frame.layout, frame.data, problem))
@@ -398,7 +399,7 @@ def _coherence(
     made = {}
     for i, name in enumerate(naming.names(problem.model.Inputs)):
         for j, output in enumerate(outputs):
-            uu, yy = power(u[:, i], u[:, i]).real, power(y[:, j], y[:, j]).real
+            uu, yy = (np.real(power(v, v)) for v in (u[:, i], y[:, j]))
             follows = np.abs(power(u[:, i], y[:, j])) ** 2 / np.where(uu > 0, uu, np.inf)
             made[name, output] = float(np.sum(follows) / max(np.sum(yy), 1e-300))
     return made

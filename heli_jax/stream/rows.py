@@ -33,6 +33,11 @@ class Rows(NamedTuple):
     """Numbers of the log, NaN where a cell is empty."""
     lines: list[bytes]
 
+    def part(self, first: int, last: int | None) -> "Rows":
+        """Return the rows from one to before another."""
+        at = slice(first, last)
+        return Rows(self.seconds[at], self.values[at], self.lines[at])
+
 
 class Sorter:
     """Puts the lines of a table in order.
@@ -112,10 +117,10 @@ class Sorter:
     def _out(self, out: np.ndarray) -> Rows:
         """Give out the first of the rows that are held."""
         n, held = int(out.sum()), self._held
-        self._held = Rows(*(v[n:] for v in held))
+        self._held = held.part(n, None)
         if n:
             self.done = float(held.seconds[n - 1])
-        return Rows(*(v[:n] for v in held))
+        return held.part(0, n)
 
 
 class Clocked(NamedTuple):
@@ -213,7 +218,7 @@ class Grid:
             new = whole > 0
             seconds = self.dt * index[new]
             self._index = int(index[-1]) if index.size else self._index
-            rows = Rows(*(v[new] for v in rows[:2]), [])
+            rows = Rows(rows.seconds[new], rows.values[new], [])
         else:
             cut = self._cut + np.cumsum(steps - kept)
             self._cut = float(cut[-1]) if cut.size else self._cut

@@ -38,9 +38,9 @@ _BOUND = 100.0
 class Sample(NamedTuple):
     """Samples at one instant of the uniform grid, SI; NaN if missing."""
 
-    inputs: Float[Array, " m"]
+    inputs: Float[Array, " m"] | np.ndarray
     """In the order of the model's Inputs."""
-    outputs: Float[Array, " p"]
+    outputs: Float[Array, " p"] | np.ndarray
     """Measured outputs, sorted by name."""
 
 
@@ -224,7 +224,8 @@ def _rls(state: State, sample: Sample, row: Array) -> tuple[RLSState, Array, Arr
     ready = row > order
     kept = jax.tree.map(lambda new, old: jnp.where(ready, new, old), after, state.rls)
     past = jnp.concatenate([jnp.stack([y, u])[:, None], past[:, :-1]], axis=1)
-    return kept, past, *(jnp.where(ready, v, jnp.nan) for v in info)
+    error, largest = (jnp.where(ready, v, jnp.nan) for v in info)
+    return kept, past, error, largest
 
 
 def follow(state: State, samples: Sample) -> tuple[State, Info]:
