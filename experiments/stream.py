@@ -80,7 +80,7 @@ def coverage(runs: int) -> None:
 
 
 def enough(runs: int) -> None:
-    for label, params in (("gusts", TRUE), ("white noise", CALM)):
+    for label, params in (("white noise", CALM), ("gusts", TRUE)):
         wanted, ratios, when = WANTED[label], [], []
         for seed in range(runs):
             flight = record(params, 1000 + seed)

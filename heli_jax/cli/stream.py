@@ -182,7 +182,7 @@ class Follower:
         self._follow = jax.jit(follow, donate_argnums=0)
 
     def take(self, data: bytes) -> None:
-        """Take what arrived."""
+        """Take further bytes."""
         self._rows(self.sorter.take(data))
 
     def finish(self) -> None:
