@@ -49,6 +49,7 @@ ALLOWED = {
     "simulation": {"dynamics", *BASE},
     "analysis": {"simulation", "dynamics", "flights", *BASE},
     "identification": {"fused", "analysis", "simulation", "dynamics", "flights", *BASE},
+    "stream": {"identification", "simulation", "dynamics", "flights", *BASE},
     "models": {"linear_models", "dynamics", *BASE},
     "fused": {"numerics"},
     "sweeps": {"fused", "analysis", "simulation", "dynamics", "flights", "run_directory", *BASE},

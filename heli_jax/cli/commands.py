@@ -117,6 +117,17 @@ _COMMANDS = {
     "frf": ("frequency responses of a log, with coherence and intervals", (
         _OTHER_LOG, *_CONFIG, _OUT,
     )),
+    "stream": ("follow a flight while it goes on, then fit it", (
+        *_CONFIG, _OUT, _VERBOSE,
+        _arg("--from", dest="place", metavar="PLACE",
+             help="a growing table, - for standard input, or mavlink:DEVICE (default: the first "
+             "log of the configuration); Ctrl-C ends it"),
+        _arg("--for", dest="wanted", action="append", default=[], metavar="NAME=SD",
+             help="wanted sd of a parameter or quotient: Ixx=2%%, a/If=100"),
+        _arg("--until-end", help="end with the present end of the file"),
+        _arg("--block", type=_seconds, metavar="S",
+             help="length of the blocks that are estimated [s] (default: 20)"),
+    )),
     "simulate": ("simulate the configuration's run, or its flights", (
         *_CONFIG,
         _arg("--out", metavar="FILE", help=".csv or .parquet (default: CSV on stdout)"),
@@ -477,6 +488,33 @@ def _frf(options: argparse.Namespace) -> int:
     # numbers are missing.
     codes = {"converged": DONE, "not-identifiable": NOT_DETERMINED}
     return max((codes.get(status, NOT_CONVERGED) for status in statuses), default=DONE)
+
+
+def _stream(options: argparse.Namespace) -> int:
+    out = _new_directory(options)
+    log = out.with_name(f"{out.name}.csv")
+    run_directory.require_free(log)
+    run_directory.require_place(log, f"{log}")
+    _prepare_jax()
+    from heli_jax import workflow
+    from heli_jax.cli import fits, stream
+
+    experiment = workflow.load_config(options.config, options.set)
+    wanted = stream.wanted_of(options.wanted)
+    with stream.ending_block() as stopped:
+        experiment = stream.run_stream(
+            experiment,
+            options.place,
+            wanted,
+            log,
+            until_end=options.until_end,
+            block=options.block,
+            stopped=stopped,
+        )
+    options.say(f"wrote what was received to {log}")
+    run = workflow.run_fit(experiment, out, progress=options.say)
+    fits.print_fit(run, verbose=options.verbose)
+    return run.fit.exit_code
 
 
 def _simulate(options: argparse.Namespace) -> int:

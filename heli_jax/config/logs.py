@@ -106,7 +106,7 @@ def _read_flight(experiment: Experiment, i: int, f: FlightConfig, gain: bool) ->
         flights = (read_parts if f.gaps == "split" or runs else read_flight)(
             path if opened is None else opened,
             # None is passed on: whether a log needs a clock's name is known once it is open.
-            time=_clock(time),
+            time=clock_signal(time),
             inputs={n: inputs[n] for n in named.inputs} | instruments,
             outputs={n: outputs[n] for n in named.outputs},
             rate=f.rate,
@@ -181,14 +181,14 @@ def _also(
         "" if align is None else align.to,
         {n: inputs[n] for n in also.signals.inputs},
         {n: outputs[n] for n in also.signals.outputs},
-        _clock(time),
+        clock_signal(time),
         also.flight,
         align is not None and align.reverse,
         opened,
     )
 
 
-def _clock(time: TimeConfig | None) -> Signal | None:
+def clock_signal(time: TimeConfig | None) -> Signal | None:
     """Return the clock of a table, as a configuration states it."""
     if time is None:
         return None

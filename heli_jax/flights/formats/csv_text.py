@@ -101,7 +101,18 @@ def open_csv(path: Path) -> "CsvTable":
     where = str(path)
     packed = read_regular(path, "a log in CSV", _LARGEST)
     data = as_text(where, unpacked(where, packed) if is_gzipped(path) else packed)
-    blanks = inner_ending(path) not in (".csv", ".tsv")
+    return table_of(where, packed, data, blanks=inner_ending(path) not in (".csv", ".tsv"))
+
+
+def table_of(where: str, packed: bytes, data: bytes, *, blanks: bool = False) -> "CsvTable":
+    """Return the table in a text.
+
+    Args:
+        where: name of its file, for messages.
+        packed: the file's own bytes.
+        data: its text in UTF-8.
+        blanks: True if cells may be separated by blanks.
+    """
     head = _find_head(where, data, (*_DELIMITERS, " ") if blanks else _DELIMITERS)
     line = f"line {head.number}"
     if not data[head.begin : head.begin + _LOOKED_AT].strip() and not data[head.begin :].strip():
@@ -350,6 +361,11 @@ class CsvTable:
         lines = [line for line in lines if "," in line and (head.delimiter != "," or '"' in line)]
         cells = (cell.strip() for line in lines for cell in _cells_of(line, head.delimiter))
         self._sign = "," if any(map(_WITH_COMMA.fullmatch, cells)) else "."
+
+    @property
+    def begin(self) -> int:
+        """Beginning of the rows in the text [bytes]."""
+        return self._head.begin
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
         """Return the columns as float64 (N,), NaN where a cell is empty."""

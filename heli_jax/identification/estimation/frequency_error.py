@@ -19,7 +19,6 @@ Sources: Pintelon and Schoukens (2012), chapters 6, 9 and 10; Klein and Morelli 
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -40,10 +39,10 @@ from heli_jax.identification.estimation.frequency_instrument import (
     instrumented_inputs,
 )
 from heli_jax.identification.estimation.frequency_lines import (
-    Driving,
     FlightFacts,
     Matrices,
     Record,
+    Sources,
     alike,
     cannot_linearise,
     condition_of,
@@ -306,13 +305,19 @@ def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Floa
     at = jax.lax.stop_gradient(v)
     instruments, products = data.flights[0].by_instrument is not None, []
     for members in alike(layout, data):
-
-        def model(v: Array, by_instrument: bool, members: list[int] = members) -> Any:
-            return discretised(layout, data, unknowns(v), members, by_instrument=by_instrument)
-
         y = measured(layout, data, members)
         for record, W in records_of_group(layout, noise, members):
-            products.append(_products_of_record(model, at, record, W, y, instruments))
+
+            def model(
+                v: Array, by_instrument: bool, members: list[int] = members, record: Record = record
+            ) -> tuple[Matrices, Sources]:
+                m, driving = discretised(
+                    layout, data, unknowns(v), members, by_instrument=by_instrument
+                )
+                return m, sources(record, driving)
+
+            of_record = lines_of_flights(record, y)
+            products.append(products_of_record(model, at, record, W, of_record, instruments))
     ee, Ze, ZZ, ZJ = jax.tree.map(lambda *v: sum(v), *products)
     S = orthonormal(ZZ)
     r, M = S.T @ Ze, S.T @ ZJ
@@ -322,26 +327,27 @@ def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Floa
     return jnp.append(r + M @ (v - at), left)
 
 
-def _products_of_record(
-    model: Callable[[Array, bool], tuple[Matrices, Driving]],
+def products_of_record(
+    model: Callable[[Array, bool], tuple[Matrices, Sources]],
     v: Float[Array, " q"],
     record: Record,
     W: Complex[Array, "K p p"],
-    outputs: Float[Array, "f N p"],
-    instruments: bool,
+    y: Complex[Array, "K p f"],
+    instruments: bool = False,
 ) -> tuple[Float[Array, ""], Float[Array, " q"], Float[Array, "q q"], Float[Array, "q q"]]:
     """Return e'e, Z'e, Z'Z and Z'J over one record of each flight of a group, without its ends.
 
     Args:
-        model: model and inputs of the group by the shared unknowns v, directly or by instrument.
+        model: model and transforms of the inputs by the shared unknowns v, directly or by
+            instrument.
+        y: transforms of the measured outputs.
         instruments: take the derivatives Z by instrument; else they are J.
     """
-    y, (m, driving) = lines_of_flights(record, outputs), model(v, False)
-    ends = ends_of(m, record, W, sources(record, driving), y)
+    m, at = model(v, False)
+    ends = ends_of(m, record, W, at, y)
 
     def errors(v: Array, by_instrument: bool) -> Float[Array, "r f"]:
-        m, driving = model(v, by_instrument)
-        at = sources(record, driving)
+        m, at = model(v, by_instrument)
         # Inputs by instrument have no effects of ends.
         at = at if by_instrument else at._replace(ends=ends.inputs)
         return errors_of_record(m, W, ends.R, at, y)

@@ -157,11 +157,15 @@ def first_model(layout: Layout, data: Data, z: Float[Array, " q"]) -> Matrices:
 
 
 def whitening_by(
-    vehicle: Matrices, errors: Sequence[Complex[np.ndarray, "K p"]]
+    vehicle: Matrices, errors: Sequence[Complex[np.ndarray, "K p"]], samples: int | None = None
 ) -> tuple[Complex[np.ndarray, "K p p"], ...]:
-    """Return the whitening of each record's errors; records of equal length share an array."""
+    """Return the whitening of each record's errors; records of equal length share an array.
+
+    Args:
+        samples: N of every record, if its lines end below the Nyquist frequency.
+    """
     counts, p = Counter(len(e) for e in errors), errors[0].shape[1]
-    before = _prewhitening(vehicle, errors, list(counts))
+    before = _prewhitening(vehicle, errors, list(counts), samples)
     left = smoothed(
         [np.einsum("kij,kj->ki", before[len(e)], e) for e in errors], GUST_PART, least=GUST_LEAST
     )
@@ -178,7 +182,10 @@ def whitening_by(
 
 
 def _prewhitening(
-    vehicle: Matrices, errors: Sequence[Complex[np.ndarray, "K p"]], lengths: list[int]
+    vehicle: Matrices,
+    errors: Sequence[Complex[np.ndarray, "K p"]],
+    lengths: list[int],
+    samples: int | None,
 ) -> dict[int, Complex[np.ndarray, "K p p"]]:
     """Return S0^(-1/2) by length of the record; the identity if the gust model fails."""
     Ad, C = np.asarray(vehicle.Ad, float), np.asarray(vehicle.C, float)
@@ -190,7 +197,7 @@ def _prewhitening(
         count = np.diff(np.append(edges, K)).astype(float)
         power = np.add.reduceat(summed_powers(of_length), edges, axis=0)
         lines = count * len(of_length)
-        cells.append(((at + 1) / (2 * K + 1), power / lines[:, None, None], lines))
+        cells.append(((at + 1) / (samples or 2 * K + 1), power / lines[:, None, None], lines))
     f, power, lines = (np.concatenate(v) for v in zip(*cells, strict=True))
     with np.errstate(all="ignore"):
         h = C @ np.linalg.inv(np.exp(2j * np.pi * f)[:, None, None] * np.eye(len(Ad)) - Ad)
