@@ -61,7 +61,7 @@ ALLOWED = {
 # Entry points may import everything below them, but never the command line.
 ENTRY = {
     "config", "generate", "new_model", "run_directory", "workflow", "cli",
-    "compatibility", "new_config", "studies", "sweep_workflow",
+    "compatibility", "design_workflow", "new_config", "studies", "sweep_workflow",
     "__init__",
     "__main__",
 }  # fmt: skip
@@ -128,7 +128,7 @@ ROOMS = (
     "methods", "defaults", "problem", "unknowns",
     "estimation", "identifiability", "design", "validation", "equation_error", "result",
     "uncertainty",
-    "restarts", "search", "diagnostics", "fit", "select",
+    "restarts", "search", "diagnostics", "fit", "flight_design", "select",
 )  # fmt: skip
 
 

@@ -4,7 +4,7 @@ import functools
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -26,8 +26,7 @@ from heli_jax.report.page import filled, picture
 from heli_jax.report.style import label
 from heli_jax.report.tables import Table
 
-if TYPE_CHECKING:
-    from heli_jax.design_workflow import DesignRun
+# `run` is a DesignRun of `heli_jax.design_workflow`, which imports this module.
 
 _FILES = ("design.json", "input.csv")
 _GAIN = 1e-3
@@ -42,7 +41,7 @@ def verdict(rated: Rated) -> str:
     return f"not determined: {', '.join(lost)}" if lost else "all determined"
 
 
-def manoeuvres_table(run: "DesignRun", most: int = _ROWS) -> Table:
+def manoeuvres_table(run: Any, most: int = _ROWS) -> Table:
     """Return the optimum, the user's inputs and the best of the library, a row each."""
     design = run.design
     names = list(dict.fromkeys([*products(run), *design.optimum.sd]))
@@ -64,7 +63,7 @@ def manoeuvres_table(run: "DesignRun", most: int = _ROWS) -> Table:
     return Table((*head, "least margin"), rows)
 
 
-def products(run: "DesignRun") -> list[str]:
+def products(run: Any) -> list[str]:
     """Return the criterion and the wanted products, if they are products."""
     asked = [] if run.design.criterion in CRITERIA else [run.design.criterion]
     return [*asked, *run.wanted]
@@ -74,7 +73,7 @@ def _percent(share: float) -> str:
     return f"{number(100.0 * share, 2)} %"
 
 
-def summary(run: "DesignRun") -> str:
+def summary(run: Any) -> str:
     """Return what the design gains, in a sentence."""
     design = run.design
     best, optimum = design.library[0], design.optimum
@@ -87,7 +86,7 @@ def summary(run: "DesignRun") -> str:
     return f"The optimised input lowers {what} by {_percent(gain)} against {best.words}."
 
 
-def write_design(folder: Path, run: "DesignRun", config: str) -> None:
+def write_design(folder: Path, run: Any, config: str) -> None:
     """Write design.json, input.csv, report.html and figures/ of a design."""
     columns = input_columns(run)
     write_table(folder / "input.csv", columns)
@@ -118,7 +117,7 @@ def write_design(folder: Path, run: "DesignRun", config: str) -> None:
     (folder / "report.html").write_text(page, encoding="utf-8")
 
 
-def doubts(run: "DesignRun") -> list[str]:
+def doubts(run: Any) -> list[str]:
     """Return what limits the trust in a design."""
     design, found = run.design, []
     if not design.converged:
@@ -136,7 +135,7 @@ def doubts(run: "DesignRun") -> list[str]:
     return found
 
 
-def input_columns(run: "DesignRun") -> dict[str, np.ndarray]:
+def input_columns(run: Any) -> dict[str, np.ndarray]:
     """Return time and excitations in the units of `design.inputs`, one run after another."""
     settings = run.config.config.design
     assert settings is not None
@@ -154,7 +153,7 @@ def input_columns(run: "DesignRun") -> dict[str, np.ndarray]:
     return {n: np.concatenate([p[n] for p in parts]) for n in parts[0]}
 
 
-def autopilot_files(run: "DesignRun") -> dict[str, str]:
+def autopilot_files(run: Any) -> dict[str, str]:
     """Return by name the files of the first run for autopilots and transmitters.
 
     Autopilots play the best chirp of the library, a transmitter the optimised input.
@@ -186,7 +185,7 @@ def autopilot_files(run: "DesignRun") -> dict[str, str]:
     return files
 
 
-def _content(run: "DesignRun") -> dict[str, Any]:
+def _content(run: Any) -> dict[str, Any]:
     design = run.design
 
     def of(rated: Rated) -> dict[str, Any]:
@@ -219,7 +218,7 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _draw(run: "DesignRun", i: int) -> Chart:
+def _draw(run: Any, i: int) -> Chart:
     """Draw the excitations and the limited motion of a run."""
     flight, model = run.problem.training[i], run.problem.model
     t, motion = np.arange(flight.n_samples) * flight.dt, run.design.motion[i]
@@ -247,7 +246,7 @@ def _draw(run: "DesignRun", i: int) -> Chart:
     )
 
 
-def naming_units(run: "DesignRun") -> Mapping[str, str | None]:
+def naming_units(run: Any) -> Mapping[str, str | None]:
     """Return the units of states and outputs."""
     model = run.problem.model
     return {

@@ -29,7 +29,7 @@ def refused(capsys, arguments):
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
-@pytest.mark.parametrize("ending", ["csv", "parquet", "nc"])
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
 def test_channels_become_a_table(tmp_path, ending, capsys):
     path, out = some_ulog(tmp_path), tmp_path / f"out.{ending}"
     signals = [f"{ATTITUDE}[[]0].xyz[0]".replace("[[]", "["), "manual_control_setpoint.*"]

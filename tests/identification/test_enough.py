@@ -11,7 +11,7 @@ from heli_jax import Flight, Free, Model, Nuisance, Problem
 from heli_jax.analysis.flight_responses import Settings, flight_responses
 from heli_jax.dynamics.onboard.filters import Filter
 from heli_jax.flights import Signal, read_flight
-from heli_jax.flights.signal_facts import quantum, signal_facts
+from heli_jax.flights.signal_facts import signal_facts
 from heli_jax.identification.design.next_flight import plan_next_flight
 from heli_jax.identification.diagnostics.record import of_rates
 from heli_jax.identification.fit import check, fit
@@ -116,14 +116,6 @@ def test_rails_are_what_piles_up_at_both_ends():
         assert rails(x) == (0.0, 0.0)
     quiet = [rails(steps(np.random.default_rng(s), 1500)) for s in range(100)]
     assert sum(max(r) > 0 for r in quiet) <= 1
-
-
-def test_steps_of_the_log_are_held_against_the_noise():
-    rng = np.random.default_rng(0)
-    y = np.sin(0.05 * np.arange(2000)) + 0.002 * rng.standard_normal(2000)
-    assert quantum(y) == 0.0
-    coarse = np.round(y / 0.04) * 0.04 * np.pi / 180
-    assert quantum(coarse) == pytest.approx(0.04 * np.pi / 180)
 
 
 def test_the_rate_of_an_input_that_moved_between_its_samples():
