@@ -77,11 +77,13 @@ def expected(seconds: float) -> None:
 def fitted(of: Problem, input: Rated, seeds: int) -> None:
     """Print scatter, expected standard deviation and coverage of fits in gusts."""
     params, model = truth(), of.model
+    initial_sd = MODEL.initial_sd
+    assert initial_sd is not None
 
     @jax.jit
     def fly(u: Any, added: Any, key: Any) -> Any:
         here = naming.replace(params, Ixx_added=added)
-        sds, first = MODEL.initial_sd(here), MODEL.initial_state(here)
+        sds, first = initial_sd(here), MODEL.initial_state(here)
         draws = jax.random.normal(jax.random.fold_in(key, 2), (len(sds),))
         first = naming.replace(
             first, **{n: s * d for (n, s), d in zip(sds.items(), draws, strict=True)}
@@ -103,7 +105,7 @@ def fitted(of: Problem, input: Rated, seeds: int) -> None:
         values = [(result.estimates[n], float(getattr(params, n))) for n in FREE]
         logs.append([np.log(e.value / true) for e, true in values])
         inside.append(
-            [e.lower95 is not None and e.lower95 <= true <= e.upper95 for e, true in values]
+            [(e.lower95 or np.inf) <= true <= (e.upper95 or -np.inf) for e, true in values]
         )
     scatter, covered = np.std(logs, axis=0, ddof=1), np.mean(inside, axis=0)
     print(

@@ -30,7 +30,8 @@ def scatter(problem: heli_jax.Problem, rated: Rated, runs: int) -> dict[str, np.
     """Return the estimated products (runs,) of simulated flights."""
     flight, model = problem.training[0], problem.model
     u = {n: rated.inputs[0].get(n, np.zeros(flight.n_samples)) for n in flight.inputs}
-    params = problem.start_params()
+    params, initial_sd = problem.start_params(), model.initial_sd
+    assert initial_sd is not None
 
     @jax.jit
     def fly(key: jax.Array) -> dict[str, jax.Array]:
@@ -38,7 +39,7 @@ def scatter(problem: heli_jax.Problem, rated: Rated, runs: int) -> dict[str, np.
         inputs = model.Inputs(**{n: jnp.asarray(v) for n, v in u.items()})
         first = model.initial_state(params)
         # The gusts are in their steady state at the first sample.
-        sds = model.initial_sd(params)
+        sds = initial_sd(params)
         for k, (n, sd) in zip(jax.random.split(of_gusts, len(sds)), sds.items(), strict=True):
             first = first._replace(**{n: sd * jax.random.normal(k)})
         run = simulate(

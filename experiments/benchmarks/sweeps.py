@@ -314,7 +314,7 @@ def on_workers(flight: Flight, n: int, workers: int) -> float:
     from heli_jax.sweeps.cluster import connected
 
     best = np.inf
-    local = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None)
+    local = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=":0")
     with local, connected(local.scheduler_address) as client:
         for _ in range(3):
             seen: list[tuple[float, int]] = []

@@ -53,11 +53,8 @@ def manoeuvres_table(run: Any, most: int = _ROWS) -> Table:
         if run.wanted:
             needed = design.needed(rated, run.wanted)
             cells.append(f"{needed:.3g} s" if math.isfinite(needed) else "never")
-        margin = (
-            max(rated.margins[tight], 0.0)
-            if abs(rated.margins[tight]) < 1e-5
-            else rated.margins[tight]
-        )
+        # Inputs are made smaller to a millionth below a limit.
+        margin = rated.margins[tight] if abs(rated.margins[tight]) > 1e-5 else 0.0
         rows.append((rated.words, *cells, f"{_percent(margin)} ({tight})"))
     head = ("input", *(f"sd {n}" for n in names), *(("enough after",) if run.wanted else ()))
     return Table((*head, "least margin"), rows)
@@ -239,7 +236,10 @@ def _draw(run: Any, i: int) -> Chart:
     units = naming_units(run)
     for name, most in run.limits.motion.items():
         series = [samples("", t, motion[name], style.BLUE, 0.9)]
-        panels.append(panel(label(name, units[name]), series, 1.0, levels=(-most, most)))
+        ends = (-1.1 * most, 1.1 * most)
+        panels.append(
+            panel(label(name, units[name]), series, 1.0, limits=ends, levels=(-most, most))
+        )
     title = f"Optimised input and motion, {flight.name}"
     return Chart(
         title, "time [s]", time_limits(t), tuple(panels), "Lines: the limits.", of=flight.name

@@ -35,7 +35,7 @@ STATES = {
     "lateral-directional": "beta p r phi",
     "rate-first-order": "p q r",
     "rate-second-order": "p dp act",
-    "quad-roll": "v p phi mot",
+    "quad-roll": "v p phi motor",
 }
 
 
