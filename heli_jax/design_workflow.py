@@ -16,8 +16,9 @@ from heli_jax.dynamics.model import require_constants, zeros
 from heli_jax.errors import InputError, located, require_known
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.design.information import Feedback
-from heli_jax.identification.flight_design import Design, InputLimit, Limits, design
+from heli_jax.identification.flight_design import Design, InputLimit, Limits, design, exponents
 from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.layout import layout_of
 from heli_jax.simulation.simulate import simulate, substeps_for
 from heli_jax.yaml_file import as_yaml
 
@@ -80,7 +81,11 @@ def run_design(
     # An excitation of a set point has another unit than the input.
     shifted = any(limit.set_point is not None for limit in settings.inputs.values())
     moves = any(np.ptp(u) > 0 for u in plan.sticks.values())
+    asked = dict(settings.wanted if wanted is None else wanted)
     with located(where):
+        # Before the search, which may take minutes.
+        for name in asked:
+            exponents(name, layout_of(problem, problem.training).of_interest)
         found = design(
             problem,
             limits,
@@ -94,8 +99,7 @@ def run_design(
             max_steps=settings.max_steps,
             progress=progress,
         )
-        asked = dict(settings.wanted if wanted is None else wanted)
-        found.needed(found.optimum, asked)  # names a parameter that is not free
+        found.needed(found.optimum, asked)  # refuses a criterion in place of a name
     run = DesignRun(config, problem, limits, found, asked, None if out is None else Path(out))
     if run.directory is not None:
         _write(run, run.directory)

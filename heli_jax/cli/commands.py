@@ -498,9 +498,10 @@ def _stream(options: argparse.Namespace) -> int:
     _prepare_jax()
     from heli_jax import workflow
     from heli_jax.cli import fits, stream
+    from heli_jax.cli.wanted import wanted_of
 
     experiment = workflow.load_config(options.config, options.set)
-    wanted = stream.wanted_of(options.wanted)
+    wanted = wanted_of(options.wanted)
     with stream.ending_block() as stopped:
         experiment = stream.run_stream(
             experiment,

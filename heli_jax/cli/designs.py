@@ -3,11 +3,14 @@
 from typing import TYPE_CHECKING
 
 from heli_jax.cli.terminal import print_page_table, print_text
+from heli_jax.cli.wanted import wanted_of
 from heli_jax.errors import InputError
 
 if TYPE_CHECKING:
     from heli_jax.design_workflow import DesignRun
 
+_LARGEST = 10.0
+"""Relative sd that is no wanted one."""
 _ROWS = 5
 """Manoeuvres of the library in the table."""
 
@@ -16,20 +19,13 @@ def wanted_sds(texts: list[str]) -> dict[str, float]:
     """Return relative sds by parameter from texts such as `a=2%`.
 
     Raises:
-        InputError: a text is no such.
+        InputError: a text of another form, or an sd that is not relative.
     """
-    wanted = {}
-    for text in texts:
-        name, equals, value = text.partition("=")
-        number = value.strip().removesuffix("%")
-        try:
-            share = float(number) * (0.01 if value.strip().endswith("%") else 1.0)
-        except ValueError:
-            share = 0.0
-        if not (equals and name.strip() and 0.0 < share < 10.0):
-            raise InputError(f"--for {text!r:.80}: expected NAME=PERCENT, such as a=2%")
-        wanted[name.strip()] = share
-    return wanted
+    wanted = wanted_of(texts)
+    for name, one in wanted.items():
+        if not (one.relative and one.sd < _LARGEST):
+            raise InputError(f"--for {name!r:.60}: expected NAME=PERCENT, such as a=2%")
+    return {name: one.sd for name, one in wanted.items()}
 
 
 def print_design(run: "DesignRun", *, verbose: bool = False) -> None:

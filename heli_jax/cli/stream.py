@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ import numpy as np
 from heli_jax import config as configuration
 from heli_jax import naming, units
 from heli_jax.cli.terminal import plain_text, print_table, print_text
+from heli_jax.cli.wanted import Wanted
 from heli_jax.config import Experiment
 from heli_jax.config.logs import clock_signal, first_signals, require_flights, with_log
 from heli_jax.errors import InputError, located
@@ -56,33 +57,6 @@ def ending_block() -> Iterator[Callable[[], bool]]:
     finally:
         signal.signal(signal.SIGINT, before)
         signal.set_wakeup_fd(pipe, warn_on_full_buffer=False)
-
-
-class Wanted(NamedTuple):
-    """A wanted standard deviation."""
-
-    sd: float
-    relative: bool
-    """True if it is a fraction of the value."""
-
-    def reached(self, value: float, sd: float) -> bool:
-        return sd <= self.sd * (abs(value) if self.relative else 1.0)
-
-
-def wanted_of(texts: Sequence[str]) -> dict[str, Wanted]:
-    """Return the wanted sds by name, of texts such as `a=2%` and `a/Ixx=0.5`.
-
-    Raises:
-        InputError: a text of another form.
-    """
-    wanted = {}
-    for text in texts:
-        found = re.fullmatch(r"(.+)=([0-9.]+(?:[eE][+-]?[0-9]+)?)(%?)", text)
-        number = float(found[2]) if found and found[2].count(".") < 2 and found[2] != "." else 0.0
-        if found is None or not 0.0 < number < np.inf:
-            raise InputError(f"--for: expected NAME=SD or NAME=PERCENT%, got {text!r:.60}")
-        wanted[found[1]] = Wanted(number / (100.0 if found[3] else 1.0), bool(found[3]))
-    return wanted
 
 
 def require_free(experiment: Experiment, wanted: Mapping[str, Wanted]) -> None:

@@ -72,14 +72,14 @@ class Rated(NamedTuple):
     value: float
     """Criterion, the logarithm of an sd; mean over the vehicles."""
     sd: dict[str, float]
-    """Expected relative sd of each parameter (one over which it may be zero: in units of its
-    start), the largest of all vehicles; infinite if it is not determined."""
+    """Expected sd of each parameter relative to its value, or to its start if it may be zero: the
+    largest of all vehicles, infinite for a motion that diverges."""
     margins: dict[str, float]
     """1 - largest value over limit, by limit."""
     covariance: Float[np.ndarray, "v p p"]
-    """Of the parameters in relative coordinates, for each vehicle."""
+    """Covariance of the parameters in relative coordinates, for each vehicle."""
     manoeuvre: Manoeuvre | None = None
-    """Of the library."""
+    """Manoeuvre of the library that it is, if any."""
 
     @property
     def undetermined(self) -> tuple[str, ...]:
@@ -92,7 +92,7 @@ class Design(NamedTuple):
 
     criterion: str
     duration: float
-    """Of all flights together [s]."""
+    """Duration of all flights together [s]."""
     library: tuple[Rated, ...]
     """The best first."""
     optimum: Rated

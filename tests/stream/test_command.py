@@ -10,7 +10,8 @@ import yaml
 
 from heli_jax import load_fit
 from heli_jax.cli import main
-from heli_jax.cli.stream import Wanted, received, wanted_of
+from heli_jax.cli.stream import received
+from heli_jax.cli.wanted import Wanted, wanted_of
 from heli_jax.errors import InputError
 from heli_jax.flights import Signal
 

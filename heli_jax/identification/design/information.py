@@ -17,11 +17,10 @@ from jaxtyping import Array, Float
 from heli_jax import naming
 from heli_jax.identification.estimation.evaluation import named
 from heli_jax.identification.estimation.residual import weak_rows
-from heli_jax.identification.estimation.simulated_flights import driven
+from heli_jax.identification.estimation.simulated_flights import driven, simulated_flight
 from heli_jax.identification.identifiability.analysis import relative_slopes, unknowns_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
-from heli_jax.simulation.simulate import simulate
 
 # Inputs, Params and State are Any, because they are a model's own classes.
 
@@ -125,20 +124,11 @@ class Experiment(NamedTuple):
         u = unpack(layout, data, vehicle.z)
         each = []
         for i, names in enumerate(layout.outputs):
-            drive = driven(layout, data, u, i)
-            run = simulate(
-                layout.model,
-                drive.params,
-                drive.inputs,
-                dt=drive.dt,
-                initial_state=drive.state,
-                solver=layout.solver,
-                substeps=layout.substeps,
-                block=1 if keys is not None or self.feedback else layout.block,
-                feedback=self.feedback,
-                hold=layout.hold(i),
-                key=None if keys is None else keys[i],
-            )
+            # The motion is differentiated in reverse mode too. A shift is zero at the start.
+            options = {"adjoint": None, "feedback": self.feedback}
+            if keys is not None or self.feedback is not None:
+                options |= {"block": 1, "key": None if keys is None else keys[i]}
+            run = simulated_flight(layout, i, driven(layout, data, u, i), None, **options)
             each.append((run.inputs, {n: getattr(run.outputs, n) for n in names}, run))
         flights = zip(given, each, strict=True)
         flown = tuple(f._replace(inputs=v, outputs=y) for f, (v, y, _) in flights)

@@ -41,7 +41,7 @@ class Plan(NamedTuple):
     excitation: np.ndarray
     """(m,), added to the input, SI."""
     duration: float
-    """Of the record [s]."""
+    """Duration of the record [s]."""
     left_out: tuple[str, ...]
     """Inputs that do not move in the record."""
 

@@ -68,7 +68,7 @@ def predict(layout: Layout, data: Data, u: Unknowns) -> tuple[Run, ...]:
     for (m, *_), members in groups.items():
         if len(members) == 1 and layout.windows[members[0]][0] == 1:
             i = members[0]
-            run = _simulated(layout, i, driven(layout, data, u, i), u.shift)
+            run = simulated_flight(layout, i, driven(layout, data, u, i), u.shift)
             measured = [getattr(run.outputs, n) for n in layout.outputs[i]]
             by_flight[i] = Run(jnp.stack(jax.tree.leaves(run.states)), jnp.stack(measured), None)
         else:
@@ -76,8 +76,17 @@ def predict(layout: Layout, data: Data, u: Unknowns) -> tuple[Run, ...]:
     return tuple(by_flight[i] for i in range(len(data.flights)))
 
 
-def _simulated(layout: Layout, i: int, drive: Drive, shift: Any) -> Trajectory:
-    """Simulate with the holds of the i-th flight."""
+# Any: options of `simulate`.
+def simulated_flight(
+    layout: Layout, i: int, drive: Drive, shift: Any, **options: Any
+) -> Trajectory:
+    """Simulate with the holds of the i-th flight.
+
+    Args:
+        options: of `simulate`, in place of those for least squares.
+    """
+    # ForwardMode compiles faster than an adjoint for both modes, and least squares uses it alone.
+    usual = {"block": layout.block, "adjoint": dfx.ForwardMode()}
     return simulate(
         layout.model,
         drive.params,
@@ -87,10 +96,8 @@ def _simulated(layout: Layout, i: int, drive: Drive, shift: Any) -> Trajectory:
         solver=layout.solver,
         substeps=layout.substeps,
         delay=shift,
-        block=layout.block,
-        # It compiles faster than an adjoint for both modes, and least squares uses forward mode.
-        adjoint=dfx.ForwardMode(),
         hold=layout.hold(i),
+        **{**usual, **options},
     )
 
 
@@ -111,7 +118,7 @@ def _side_by_side(
         if late is not None:
             # `_with_lead` has shifted by whole samples, except for the leading sample.
             late = Delays(late.groups, tuple(-1 for _ in late.whole), late.rest)
-        run = _simulated(layout, members[0], Drive(params, inputs, dt, state), late)
+        run = simulated_flight(layout, members[0], Drive(params, inputs, dt, state), late)
         return jax.tree.map(lambda v: v[: m + chained], (run.states, run.outputs))
 
     states, outputs = jax.vmap(window)(*stacked)
