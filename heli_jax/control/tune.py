@@ -1,0 +1,234 @@
+"""Gains tuned by gradients through the nonlinear closed loop, for many vehicles at once."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.optimize
+from jaxtyping import Array, Float
+
+from heli_jax import naming
+from heli_jax.control.controller import (
+    COMMAND,
+    SET,
+    Controller,
+    begin,
+    commanded,
+    gains_of,
+    in_loop,
+    measured,
+    require_signals,
+    signals_of,
+    with_controller,
+    with_gains,
+)
+from heli_jax.control.loops import (
+    Plant,
+    frequencies,
+    loop_margins,
+    loop_responses,
+    plant_of,
+    sampled_loop,
+)
+from heli_jax.dynamics.model import Model
+from heli_jax.simulation.simulate import simulate, substeps_for
+
+_SHARP = 100.0
+"""Sharpness of the smooth minimum of |1 + L| over frequencies and vehicles."""
+_WIDEST = 3.0
+"""Largest change of a gain's logarithm."""
+
+
+class Scenario(NamedTuple):
+    """What the vehicles fly while gains are tuned, in deviations from steady flight."""
+
+    inputs: Mapping[str, Any]
+    """Inputs (N,) that no controller commands, such as wind, SI."""
+    set_points: Mapping[str, Any]
+    """Changes of set points (N,) by signal, SI."""
+    samples: int
+
+
+class Tuned(NamedTuple):
+    """Gains after the optimisation."""
+
+    controller: Any
+    converged: bool
+    """True if the optimiser converged, and all vehicles are stable with the wanted distance."""
+    cost: tuple[float, float]
+    """Cost before and after: mean over vehicles of log(1 + mean square of deviations and commands
+    over their largest acceptable values)."""
+    distance: tuple[float, float]
+    """Least distance |1 + L| before and after, over vehicles, commands and frequencies."""
+    stable: tuple[float, float]
+    """Share of stable vehicles before and after."""
+
+
+def tune(
+    model: Model,
+    vehicles: Any,
+    trimmed: Any,
+    controller: Controller,
+    scenario: Scenario,
+    *,
+    most: Mapping[str, float],
+    distance: float = 0.5,
+    max_steps: int = 50,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Tuned:
+    r"""Return the controller whose gains minimise deviations and effort over a set of vehicles.
+
+    The cost is the mean over the vehicles of $\log(1 + \overline{\sum_j (e_j/m_j)^2 + \sum_i
+    (u_i/m_i)^2})$ of the nonlinear closed loop, so that a diverging vehicle counts without drowning
+    the others. Gains keep their signs. $|1 + L| \ge$ `distance` holds at every command, frequency
+    and vehicle: a gain margin of $-20\log_{10}(1-d)$ dB and a phase margin of $2\arcsin(d/2)$.
+
+    Args:
+        vehicles: the model's Params with arrays (k,), such as draws of a posterior. All start in
+            the steady flight of the first, and have its sticks.
+        trimmed: steady flights with arrays (k,), see `trims_of`.
+        controller: gains to begin with.
+        most: largest acceptable deviation of signals and commands, SI.
+        distance: least distance of L from -1.
+        max_steps: most steps of SLSQP.
+
+    Raises:
+        ValueError: an unknown name, or a controller without gains.
+    """
+    problem = _Tuning(model, vehicles, trimmed, controller, scenario, dict(most))
+    names = list(gains_of(controller))
+    start = np.asarray([float(v) for v in gains_of(controller).values()])
+    moved = np.flatnonzero(start)
+    if not moved.size:
+        raise ValueError("expected a controller with gains, got none that is not zero")
+
+    def gains(z: Array) -> dict[str, Array]:
+        k = jnp.asarray(start).at[moved].set(start[moved] * jnp.exp(z))
+        return dict(zip(names, k, strict=True))
+
+    cost = jax.jit(jax.value_and_grad(lambda z: problem.cost(gains(z))))
+    apart = jax.jit(lambda z: problem.distances(gains(z)))
+    slope = jax.jit(jax.jacrev(lambda z: problem.distances(gains(z))))
+
+    def value(z: np.ndarray) -> tuple[float, np.ndarray]:
+        f, g = cost(jnp.asarray(z))
+        progress(f"cost {float(f):.4g}")
+        return float(f), np.asarray(g)
+
+    zero = np.zeros(moved.size)
+    with np.errstate(over="ignore"):
+        found = scipy.optimize.minimize(
+            value, zero, jac=True, method="SLSQP",
+            bounds=[(-_WIDEST, _WIDEST)] * moved.size,
+            constraints={
+                "type": "ineq",
+                "fun": lambda z: np.asarray(apart(jnp.asarray(z))) - distance,
+                "jac": lambda z: np.asarray(slope(jnp.asarray(z))),
+            },
+            options={"maxiter": max_steps, "ftol": 1e-5},
+        )  # fmt: skip
+    made = with_gains(controller, gains(jnp.asarray(found.x)))
+    before, after = problem.judged(controller), problem.judged(made)
+    reached = bool(found.success) and after[1] == 1.0 and after[0] >= distance - 1e-3
+    costs = value(zero)[0], value(found.x)[0]
+    return Tuned(made, reached, costs, (before[0], after[0]), (before[1], after[1]))
+
+
+class _Tuning:
+    """Cost and distances of a set of vehicles, as functions of the gains."""
+
+    def __init__(
+        self,
+        model: Model,
+        vehicles: Any,
+        trimmed: Any,
+        controller: Controller,
+        scenario: Scenario,
+        most: dict[str, float],
+    ) -> None:
+        model = in_loop(model, commanded(model, controller))
+        known = (*signals_of(model), *naming.names(model.Inputs))
+        require_signals(most, known, f"most: model {model.name} has no signal or input")
+        require_signals(
+            scenario.inputs,
+            naming.names(model.Inputs),
+            f"scenario: model {model.name} has no input",
+        )
+        require_signals(
+            scenario.set_points, controller.references, "scenario: the controller has no set point"
+        )
+        self.model, self.controller, self.dt = model, controller, controller.dt
+        self.closed = with_controller(model, controller)
+        self.vehicles, self.most, self.scenario = vehicles, most, scenario
+        self.plants: Plant = jax.vmap(lambda p, t: plant_of(model, p, t[0], t[1], self.dt))(
+            vehicles, (trimmed.state, trimmed.inputs)
+        )
+        first = jax.tree.map(lambda v: v[0], (vehicles, trimmed.state, trimmed.inputs))
+        state, inputs = begin(
+            self.closed, self.params(first[0], {}), _Flight(*first[1:]), scenario.samples
+        )
+        changed = {**scenario.inputs, **{SET + n: v for n, v in scenario.set_points.items()}}
+        self.begun = state
+        self.inputs = naming.replace(
+            inputs, **{n: getattr(inputs, n) + jnp.asarray(v) for n, v in changed.items()}
+        )
+        self.omega = frequencies(self.dt)
+
+    def params(self, vehicle: Any, gains: Mapping[str, Any]) -> Any:
+        return self.closed.Params(**{**naming.asdict(vehicle), **gains})
+
+    def cost(self, gains: Mapping[str, Array]) -> Float[Array, ""]:
+        """Return the mean cost of the vehicles."""
+        substeps = substeps_for(self.dt, self.closed.fastest)
+
+        def of_one(vehicle: Any) -> Array:
+            params = self.params(vehicle, gains)
+            run = simulate(
+                self.closed, params, self.inputs, dt=self.dt, initial_state=self.begun,
+                substeps=substeps, adjoint=dfx.RecursiveCheckpointAdjoint(),
+            )  # fmt: skip
+            signals = jax.vmap(lambda s, u: measured(self.closed, params, s, u))(
+                run.states, run.inputs
+            )
+            at = measured(
+                self.closed, params, self.begun, jax.tree.map(lambda v: v[0], self.inputs)
+            )
+            total = jnp.zeros(self.scenario.samples)
+            for name, size in self.most.items():
+                if name in signals:
+                    target = getattr(run.inputs, SET + name, at[name])
+                    total = total + ((target - signals[name]) / size) ** 2
+                else:
+                    total = total + (getattr(run.states, COMMAND + name) / size) ** 2
+            # A vehicle that left the range of floats has no gradient; it counts as a large cost.
+            total = jnp.where(jnp.isfinite(total), total, 1e12)
+            return jnp.log1p(jnp.mean(jnp.minimum(total, 1e12)))
+
+        return jnp.mean(jax.vmap(of_one)(self.vehicles))
+
+    def distances(self, gains: Mapping[str, Array]) -> Float[Array, " m"]:
+        """Return the smooth minimum of |1 + L| over vehicles and frequencies, by command."""
+        controller = with_gains(self.controller, gains)
+
+        def of_one(plant: Plant) -> Array:
+            loop = sampled_loop(self.model, plant, controller)
+            return jnp.abs(1.0 + loop_responses(loop, self.dt, self.omega))
+
+        apart = jax.vmap(of_one)(self.plants)
+        apart = jnp.moveaxis(apart, 1, 0).reshape(apart.shape[1], -1)
+        return -jax.nn.logsumexp(-_SHARP * apart, axis=1) / _SHARP
+
+    def judged(self, controller: Controller) -> tuple[float, float]:
+        """Return the least distance and the share of stable vehicles."""
+        loops = jax.vmap(lambda plant: sampled_loop(self.model, plant, controller))(self.plants)
+        apart = jax.vmap(lambda loop: loop_responses(loop, self.dt, self.omega))(loops)
+        stable = np.all([m.stable for m in loop_margins(loops, self.dt)], axis=0)
+        return float(jnp.min(jnp.abs(1.0 + apart))), float(np.mean(stable))
+
+
+class _Flight(NamedTuple):
+    state: Any
+    inputs: Any
