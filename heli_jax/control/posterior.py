@@ -8,11 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
-from heli_jax.analysis.trim import HOVER, Condition, trim
+from heli_jax.analysis.trim import HOVER, Condition, is_full_nonlinear, trim
 from heli_jax.dynamics.model import Model, zeros
 
 _SYMMETRIC = 0.02
 """Largest relative difference of the halves of an interval that is symmetric in the logarithm."""
+_STILL = 1e-9
+"""Largest rate of a state at rest [SI]."""
 _TWO_SIDED = 1.959963984540054
 
 
@@ -64,29 +66,44 @@ def _drawn(e: Any, z: np.ndarray) -> np.ndarray:
 
 def vehicles_of(
     model: Model, params: Any, values: Mapping[str, np.ndarray], condition: Condition = HOVER
-) -> tuple[Any, SteadyFlights]:
-    """Return the vehicles with some parameters drawn, arrays (k,), and their steady flights.
+) -> tuple[Any, SteadyFlights, int]:
+    """Return vehicles with drawn parameters, arrays (k,), their steady flights, and failures.
 
-    Linear models are steady at zero, others are trimmed.
+    Linear models are steady at zero, others are trimmed. Vehicles without the steady flight are
+    left out and counted.
 
     Args:
-        values: parameters (k,) by name.
+        values: parameters (k,) by name, the mode first; none: the vehicle itself.
 
     Raises:
-        ValueError: a vehicle has no steady flight in this condition.
+        ValueError: the first vehicle has no steady flight in this condition.
     """
-    count = len(next(iter(values.values())))
-    vehicles = [
-        naming.replace(params, **{n: jnp.asarray(float(v[i])) for n, v in values.items()})
-        for i in range(count)
-    ]
-    if model.linear:
-        flights = [SteadyFlights(zeros(model.State), zeros(model.Inputs))] * count
-    else:
-        found = [trim(model, p, condition) for p in vehicles]
-        flights = [SteadyFlights(t.state, t.inputs) for t in found]
+    count = len(next(iter(values.values()))) if values else 1
+    vehicles, flights = [], []
+    for i in range(count):
+        own = {n: jnp.asarray(float(v[i])) for n, v in values.items()}
+        vehicle = naming.replace(params, **own)
+        try:
+            flights.append(_steady(model, vehicle, condition))
+        except ValueError:
+            if i == 0:
+                raise
+            continue
+        vehicles.append(vehicle)
 
     def stacked(records: list[Any]) -> Any:
         return jax.tree.map(lambda *v: jnp.stack([jnp.asarray(x, float) for x in v]), *records)
 
-    return stacked(vehicles), stacked(flights)
+    return stacked(vehicles), stacked(flights), count - len(vehicles)
+
+
+def _steady(model: Model, params: Any, condition: Condition) -> SteadyFlights:
+    if not is_full_nonlinear(model):
+        at = SteadyFlights(zeros(model.State), zeros(model.Inputs))
+        rates = naming.asdict(model.vector_field(params, *at))
+        moving = [n for n, v in rates.items() if not abs(float(v)) < _STILL]
+        if moving:
+            raise ValueError(f"model {model.name} is not at rest at zero: {moving[0]} changes")
+        return at
+    found = trim(model, params, condition)
+    return SteadyFlights(found.state, found.inputs)

@@ -8,12 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 
 from heli_jax import naming
+from heli_jax.analysis.margins import Margins
 from heli_jax.control.controller import (
     COMMAND,
     SET,
+    STATE,
     Controller,
     begin,
     commanded,
@@ -27,6 +29,7 @@ from heli_jax.control.controller import (
 )
 from heli_jax.control.loops import (
     Plant,
+    SampledLoop,
     frequencies,
     loop_margins,
     loop_responses,
@@ -38,6 +41,8 @@ from heli_jax.simulation.simulate import simulate, substeps_for
 
 _SHARP = 100.0
 """Sharpness of the smooth minimum of |1 + L| over frequencies and vehicles."""
+_DIVERGED = 1e12
+"""Square of a deviation over its largest acceptable value that counts as diverged."""
 _WIDEST = 3.0
 """Largest change of a gain's logarithm."""
 
@@ -50,6 +55,17 @@ class Scenario(NamedTuple):
     set_points: Mapping[str, Any]
     """Changes of set points (N,) by signal, SI."""
     samples: int
+
+
+class Flown(NamedTuple):
+    """A flight in closed loop; arrays (N,), vmap adds vehicles."""
+
+    deviations: dict[str, Any]
+    """Signals less their set points, or less their values in steady flight."""
+    commands: dict[str, Any]
+    """Commands as held before each sample."""
+    finite: Any
+    """True if the vehicle did not diverge out of the range of floats."""
 
 
 class Tuned(NamedTuple):
@@ -98,7 +114,7 @@ def tune(
     Raises:
         ValueError: an unknown name, or a controller without gains.
     """
-    problem = _Tuning(model, vehicles, trimmed, controller, scenario, dict(most))
+    problem = Tuning(model, vehicles, trimmed, controller, scenario, dict(most))
     names = list(gains_of(controller))
     start = np.asarray([float(v) for v in gains_of(controller).values()])
     moved = np.flatnonzero(start)
@@ -137,7 +153,7 @@ def tune(
     return Tuned(made, reached, costs, (before[0], after[0]), (before[1], after[1]))
 
 
-class _Tuning:
+class Tuning:
     """Cost and distances of a set of vehicles, as functions of the gains."""
 
     def __init__(
@@ -180,34 +196,41 @@ class _Tuning:
     def params(self, vehicle: Any, gains: Mapping[str, Any]) -> Any:
         return self.closed.Params(**{**naming.asdict(vehicle), **gains})
 
+    def run(self, vehicle: Any, gains: Mapping[str, Any], **options: Any) -> "Flown":
+        """Return the flight of one vehicle."""
+        params = self.params(vehicle, gains)
+        run = simulate(
+            self.closed, params, self.inputs, dt=self.dt, initial_state=self.begun,
+            substeps=substeps_for(self.dt, self.closed.fastest), **options,
+        )  # fmt: skip
+        signals = jax.vmap(lambda s, u: measured(self.closed, params, s, u))(run.states, run.inputs)
+        first = jax.tree.map(lambda v: v[0], self.inputs)
+        at = measured(self.closed, params, self.begun, first)
+        off = {
+            n: v - getattr(run.inputs, SET + n, at[n])
+            for n, v in signals.items()
+            if not n.startswith((COMMAND, STATE))
+        }
+        held = {n: getattr(run.states, COMMAND + n) for n in commanded(self.model, self.controller)}
+        return Flown(off, held, run.finite)
+
     def cost(self, gains: Mapping[str, Array]) -> Float[Array, ""]:
         """Return the mean cost of the vehicles."""
-        substeps = substeps_for(self.dt, self.closed.fastest)
 
         def of_one(vehicle: Any) -> Array:
-            params = self.params(vehicle, gains)
-            run = simulate(
-                self.closed, params, self.inputs, dt=self.dt, initial_state=self.begun,
-                substeps=substeps, adjoint=dfx.RecursiveCheckpointAdjoint(),
-            )  # fmt: skip
-            signals = jax.vmap(lambda s, u: measured(self.closed, params, s, u))(
-                run.states, run.inputs
-            )
-            at = measured(
-                self.closed, params, self.begun, jax.tree.map(lambda v: v[0], self.inputs)
-            )
-            total = jnp.zeros(self.scenario.samples)
-            for name, size in self.most.items():
-                if name in signals:
-                    target = getattr(run.inputs, SET + name, at[name])
-                    total = total + ((target - signals[name]) / size) ** 2
-                else:
-                    total = total + (getattr(run.states, COMMAND + name) / size) ** 2
+            flown = self.run(vehicle, gains, adjoint=dfx.RecursiveCheckpointAdjoint())
+            both = {**flown.deviations, **flown.commands}
+            total = sum((both[n] / size) ** 2 for n, size in self.most.items())
             # A vehicle that left the range of floats has no gradient; it counts as a large cost.
-            total = jnp.where(jnp.isfinite(total), total, 1e12)
-            return jnp.log1p(jnp.mean(jnp.minimum(total, 1e12)))
+            total = jnp.where(jnp.isfinite(total), total, _DIVERGED)
+            return jnp.log1p(jnp.mean(jnp.minimum(total, _DIVERGED)))
 
         return jnp.mean(jax.vmap(of_one)(self.vehicles))
+
+    def flown(self, controller: Controller) -> "Flown":
+        """Return the flights of all vehicles, NumPy arrays (k, N)."""
+        gains = {n: jnp.asarray(v, float) for n, v in gains_of(controller).items()}
+        return jax.device_get(jax.jit(jax.vmap(lambda p: self.run(p, gains)))(self.vehicles))
 
     def distances(self, gains: Mapping[str, Array]) -> Float[Array, " m"]:
         """Return the smooth minimum of |1 + L| over vehicles and frequencies, by command."""
@@ -221,12 +244,22 @@ class _Tuning:
         apart = jnp.moveaxis(apart, 1, 0).reshape(apart.shape[1], -1)
         return -jax.nn.logsumexp(-_SHARP * apart, axis=1) / _SHARP
 
+    def responses(self, controller: Controller) -> Complex[np.ndarray, "k m f"]:
+        """Return L of all vehicles at every command and frequency."""
+        respond = jax.vmap(lambda loop: loop_responses(loop, self.dt, self.omega))
+        return np.asarray(respond(self._loops(controller)))
+
+    def margins(self, controller: Controller) -> tuple[Margins, ...]:
+        """Return the margins (k,) of the loop at each command."""
+        return loop_margins(self._loops(controller), self.dt)
+
+    def _loops(self, controller: Controller) -> SampledLoop:
+        return jax.vmap(lambda plant: sampled_loop(self.model, plant, controller))(self.plants)
+
     def judged(self, controller: Controller) -> tuple[float, float]:
         """Return the least distance and the share of stable vehicles."""
-        loops = jax.vmap(lambda plant: sampled_loop(self.model, plant, controller))(self.plants)
-        apart = jax.vmap(lambda loop: loop_responses(loop, self.dt, self.omega))(loops)
-        stable = np.all([m.stable for m in loop_margins(loops, self.dt)], axis=0)
-        return float(jnp.min(jnp.abs(1.0 + apart))), float(np.mean(stable))
+        stable = np.all([m.stable for m in self.margins(controller)], axis=0)
+        return float(np.min(np.abs(1.0 + self.responses(controller)))), float(np.mean(stable))
 
 
 class _Flight(NamedTuple):
