@@ -3,12 +3,20 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
-from heli_jax.analysis.trim import HOVER, Condition, is_full_nonlinear, trim
+from heli_jax.analysis.trim import (
+    HOVER,
+    Condition,
+    equilibrium,
+    is_full_nonlinear,
+    is_trimmed,
+    trim,
+)
 from heli_jax.dynamics.model import Model, zeros
 
 _SYMMETRIC = 0.02
@@ -79,31 +87,31 @@ def vehicles_of(
         ValueError: the first vehicle has no steady flight in this condition.
     """
     count = len(next(iter(values.values()))) if values else 1
-    vehicles, flights = [], []
-    for i in range(count):
-        own = {n: jnp.asarray(float(v[i])) for n, v in values.items()}
-        vehicle = naming.replace(params, **own)
-        try:
-            flights.append(_steady(model, vehicle, condition))
-        except ValueError:
-            if i == 0:
-                raise
-            continue
-        vehicles.append(vehicle)
 
-    def stacked(records: list[Any]) -> Any:
-        return jax.tree.map(lambda *v: jnp.stack([jnp.asarray(x, float) for x in v]), *records)
+    def all_alike(record: Any) -> Any:
+        return jax.tree.map(lambda v: jnp.full(count, jnp.asarray(v, float)), record)
 
-    return stacked(vehicles), stacked(flights), count - len(vehicles)
-
-
-def _steady(model: Model, params: Any, condition: Condition) -> SteadyFlights:
+    vehicles = naming.replace(all_alike(params), **{n: jnp.asarray(v) for n, v in values.items()})
     if not is_full_nonlinear(model):
-        at = SteadyFlights(zeros(model.State), zeros(model.Inputs))
-        rates = naming.asdict(model.vector_field(params, *at))
-        moving = [n for n, v in rates.items() if not abs(float(v)) < _STILL]
-        if moving:
-            raise ValueError(f"model {model.name} is not at rest at zero: {moving[0]} changes")
-        return at
-    found = trim(model, params, condition)
-    return SteadyFlights(found.state, found.inputs)
+        return vehicles, all_alike(_at_rest(model, params)), 0
+    found = eqx.filter_jit(jax.vmap(lambda p: equilibrium(model, p, condition)))(vehicles)
+    kept = np.flatnonzero(is_trimmed(found))
+    if 0 not in kept:
+        trim(model, jax.tree.map(lambda v: v[0], vehicles), condition)
+        raise ValueError("the first vehicle has no steady flight")
+    vehicles, state, inputs = jax.tree.map(lambda v: v[kept], (vehicles, found.state, found.inputs))
+    return vehicles, SteadyFlights(state, inputs), count - len(kept)
+
+
+def _at_rest(model: Model, params: Any) -> SteadyFlights:
+    """Return the state of zeros.
+
+    Raises:
+        ValueError: the model moves there.
+    """
+    at = SteadyFlights(zeros(model.State), zeros(model.Inputs))
+    rates = naming.asdict(model.vector_field(params, *at))
+    moving = [n for n, v in rates.items() if not abs(float(v)) < _STILL]
+    if moving:
+        raise ValueError(f"model {model.name} is not at rest at zero: {moving[0]} changes")
+    return at
