@@ -89,9 +89,9 @@ def run_control(
         scenario = _scenario(model, settings, steps, where)
         tuned = None
         if settings.max_steps:
-            some = jax.tree.map(lambda v: v[: settings.vehicles], (vehicles, flights))
+            some, steady = jax.tree.map(lambda v: v[: settings.vehicles], (vehicles, flights))
             tuned = tune(
-                model, *some, controller, scenario, most=most, distance=settings.distance,
+                model, some, steady, controller, scenario, most=most, distance=settings.distance,
                 max_steps=settings.max_steps, progress=progress,
             )  # fmt: skip
             controller = tuned.controller

@@ -159,7 +159,7 @@ def frequencies(dt: float, count: int = 60, lowest: float = 0.1) -> np.ndarray:
 
 def loop_responses(loop: SampledLoop, dt: float, omega: np.ndarray) -> Complex[Array, "m k"]:
     """Return L of one loop at frequencies (k,) [rad/s], opened at each of the m commands."""
-    z = jnp.exp(1j * dt * jnp.asarray(omega))[:, None, None]
+    z = jnp.asarray(np.exp(1j * dt * np.asarray(omega)))[:, None, None]
     eye = jnp.eye(loop.A.shape[-1], dtype=z.dtype)[None]
     rows = []
     for A, b, c in (opened(loop, i) for i in range(loop.B.shape[-1])):

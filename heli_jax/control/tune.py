@@ -3,11 +3,9 @@
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.optimize
 from jaxtyping import Array, Complex, Float
 
 from heli_jax import naming
@@ -37,6 +35,7 @@ from heli_jax.control.loops import (
     sampled_loop,
 )
 from heli_jax.dynamics.model import Model
+from heli_jax.simulation.options import REVERSE_MODE
 from heli_jax.simulation.simulate import simulate, substeps_for
 
 _SHARP = 100.0
@@ -48,7 +47,7 @@ _WIDEST = 3.0
 
 
 class Scenario(NamedTuple):
-    """What the vehicles fly while gains are tuned, in deviations from steady flight."""
+    """Flight for which gains are tuned, in deviations from steady flight."""
 
     inputs: Mapping[str, Any]
     """Inputs (N,) that no controller commands, such as wind, SI."""
@@ -114,6 +113,8 @@ def tune(
     Raises:
         ValueError: an unknown name, or a controller without gains.
     """
+    import scipy.optimize  # simulations with a pilot need not wait for it
+
     problem = Tuning(model, vehicles, trimmed, controller, scenario, dict(most))
     names = list(gains_of(controller))
     start = np.asarray([float(v) for v in gains_of(controller).values()])
@@ -218,7 +219,7 @@ class Tuning:
         """Return the mean cost of the vehicles."""
 
         def of_one(vehicle: Any) -> Array:
-            flown = self.run(vehicle, gains, adjoint=dfx.RecursiveCheckpointAdjoint())
+            flown = self.run(vehicle, gains, adjoint=REVERSE_MODE)
             both = {**flown.deviations, **flown.commands}
             total = sum((both[n] / size) ** 2 for n, size in self.most.items())
             # A vehicle that left the range of floats has no gradient; it counts as a large cost.
@@ -226,6 +227,11 @@ class Tuning:
             return jnp.log1p(jnp.mean(jnp.minimum(total, _DIVERGED)))
 
         return jnp.mean(jax.vmap(of_one)(self.vehicles))
+
+    def cost_of(self, controller: Controller) -> float:
+        """Return the mean cost of the vehicles with a controller."""
+        gains = {n: jnp.asarray(v, float) for n, v in gains_of(controller).items()}
+        return float(jax.jit(self.cost)(gains))
 
     def flown(self, controller: Controller) -> "Flown":
         """Return the flights of all vehicles, NumPy arrays (k, N)."""

@@ -81,7 +81,7 @@ class SteadyFlight(NamedTuple):
 
 
 class Sampled(NamedTuple):
-    """What happens to the state at every sample."""
+    """A change of the state at every sample."""
 
     dt: float
     """Sample time [s]."""

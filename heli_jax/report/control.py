@@ -3,7 +3,6 @@
 import csv
 import functools
 import io
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -296,10 +295,9 @@ def _bode(run: Any, L: np.ndarray, name: str) -> Chart:
 def _nichols(run: Any, L: np.ndarray, name: str) -> Chart:
     """Draw size over phase of a loop, for the estimates and some vehicles."""
     lines: list[Series] = []
-    ends: Sequence[float] = (-360.0, 0.0)
     for k in range(min(len(L), 20) - 1, -1, -1):
         color, width = (style.BLACK, 1.2) if k == 0 else (style.BLUE, 0.5)
         lines.append(Series("", phase(L[k]), 20.0 * np.log10(np.abs(L[k])), color, width=width))
     point = Series("-1", np.array([-180.0]), np.zeros(1), style.VERMILLION, "points", width=5.0)
     shown = panel("|L| [dB]", [*lines, point], 2.6, limits=(-40.0, 40.0), levels=(0.0,))
-    return Chart(f"Nichols chart, loop opened at {name}", "phase [deg]", tuple(ends), (shown,))
+    return Chart(f"Nichols chart, loop opened at {name}", "phase [deg]", (-360.0, 0.0), (shown,))

@@ -109,7 +109,7 @@ def test_lqr_gains_solve_the_riccati_equation(r50):
     inputs = naming.names(model.Inputs)
     R = np.diag([1.0 / MOST[n] ** 2 for n in inputs])
     K = np.linalg.solve(R, B.T @ scipy.linalg.solve_continuous_are(A, B, Q, R))
-    ours = [[law.gains[n][s] for s in states] for n in inputs]
+    ours = np.array([[float(law.gains[n][s]) for s in states] for n in inputs])
     np.testing.assert_allclose(ours, K, rtol=1e-8, atol=1e-10)
 
 
@@ -271,6 +271,7 @@ def test_gains_are_parameters_that_a_fit_estimates(roll):
     found = fit(Problem(closed, p, [flight], free, Nuisance(bias=False, initial_state=False)))
     e = found.estimates[gain]
     assert found.status == "converged"
+    assert e.sd is not None
     assert abs(e.value - 0.05) < 3 * e.sd < 0.01
     with pytest.raises(ValueError, match="output-error"):
         Problem(closed, p, [flight], free, method="frequency-error")
