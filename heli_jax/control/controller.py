@@ -120,10 +120,11 @@ def gains_of(controller: Controller) -> dict[str, Any]:
 
 def with_gains(controller: Controller, values: Signals) -> Any:
     """Return the controller with the gains among `values` (a mapping with their names)."""
-    changes = [values[_name(controller, path)] for path, _ in _scalars(controller)]
-    if not changes:
-        return controller
-    return eqx.tree_at(lambda c: [leaf for _, leaf in _scalars(c)], controller, changes)
+    leaves, structure = jax.tree_util.tree_flatten_with_path(controller)
+    changed = [
+        values[_name(controller, path)] if np.shape(leaf) == () else leaf for path, leaf in leaves
+    ]
+    return jax.tree.unflatten(structure, changed)
 
 
 def measured(model: Model, params: Record, state: Record, inputs: Record) -> dict[str, Any]:

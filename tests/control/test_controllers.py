@@ -228,6 +228,34 @@ def test_poles_of_lqg_are_those_of_regulator_and_filter(r50):
     np.testing.assert_allclose(largest, np.sort(np.abs(wanted))[::-1], atol=2e-4)
 
 
+def test_a_filter_in_the_loop_is_the_recursion_in_numpy(r50):
+    model, params = r50
+    sd = {"u": 0.1, "v": 0.1, "w": 0.1, "p": 0.01, "q": 0.01, "r": 0.01, "phi": 0.01, "theta": 0.01}
+    noise = {"u": 0.5, "v": 0.5, "w": 0.5, "p": 0.2, "q": 0.2, "r": 0.2}
+    law = lqg(
+        model, params, at_rest(model), most=MOST, sd=sd, noise=noise, dt=DT, references=("phi",)
+    )
+    closed = with_controller(model, law)
+    p = closed.Params(**naming.asdict(params))
+    state, inputs = begin(closed, p, at_rest(model), 100)
+    inputs = naming.replace(inputs, set_phi=jnp.full(100, 0.1), lat=jnp.full(100, 0.01))
+    run = simulate(closed, p, inputs, dt=DT, initial_state=state, substeps=16)
+    A, B, *_ = matrices(model, params)
+    Ad, Bd = discrete(A, B)
+    states, driven = naming.names(model.State), naming.names(model.Inputs)
+    K = np.array([[law.gains[n][s] for s in states] for n in driven])
+    C = np.array([[float(s == n) for s in states] for n in sd])
+    target = np.array([0.1 * (s == "phi") for s in states])
+    added = np.array([0.01 * (n == "lat") for n in driven])
+    x, e, phi = np.zeros(len(A)), np.zeros(len(A)), []
+    for _ in range(100):
+        phi.append(x[states.index("phi")])
+        e = e + np.asarray(law.M) @ (C @ x - C @ e)
+        u = K @ (target - e)
+        e, x = Ad @ e + Bd @ u, Ad @ x + Bd @ (u + added)
+    np.testing.assert_allclose(run.states.phi, phi, atol=1e-5)
+
+
 def test_loops_of_a_cascade_cross_where_they_should(r50):
     model, params = r50
     wanted = {"lat": {"phi": 2.0, "p": 8.0}, "lon": {"theta": 2.0, "q": 8.0}}
