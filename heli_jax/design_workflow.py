@@ -16,7 +16,8 @@ from heli_jax.dynamics.model import require_constants, zeros
 from heli_jax.errors import InputError, located, require_known
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.design.information import Feedback
-from heli_jax.identification.flight_design import Design, InputLimit, Limits, design, exponents
+from heli_jax.identification.flight_design import Design, InputLimit, Limits, design
+from heli_jax.identification.identifiability.verdict import exponents
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import layout_of
 from heli_jax.simulation.simulate import simulate, substeps_for
@@ -99,7 +100,6 @@ def run_design(
             max_steps=settings.max_steps,
             progress=progress,
         )
-        found.needed(found.optimum, asked)  # refuses a criterion in place of a name
     run = DesignRun(config, problem, limits, found, asked, None if out is None else Path(out))
     if run.directory is not None:
         _write(run, run.directory)

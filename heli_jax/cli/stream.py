@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import re
 import select
 import signal
 import sys
@@ -27,6 +26,7 @@ from heli_jax.errors import InputError, located
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.grid import Grid as EvenClock
 from heli_jax.flights.grid import rounding_of, uniform_grid
+from heli_jax.identification.identifiability.verdict import exponents
 from heli_jax.identification.problem import Problem
 from heli_jax.numbers import terse
 from heli_jax.regular_file import open_regular
@@ -63,10 +63,9 @@ def require_free(experiment: Experiment, wanted: Mapping[str, Wanted]) -> None:
     """Refuse wanted sds of what is not estimated."""
     fit = experiment.config.fit
     free = [] if fit is None else [*fit.free, *["time_shift"] * fit.nuisance.time_shift]
-    for name in wanted:
-        if not all(n in free for n in re.split(r"[/*]", name, maxsplit=1)):
-            known = ", ".join(free)
-            raise InputError(f"--for: {name!r:.60} is not free, expected {known}, or a quotient")
+    with located("--for"):
+        for name in wanted:
+            exponents(name, free)
 
 
 # Sources of bytes: a growing file, standard input, or messages as rows of a table.

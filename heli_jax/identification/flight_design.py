@@ -24,6 +24,7 @@ from heli_jax.identification.design.information import Experiment, Feedback, pla
 from heli_jax.identification.design.library import Manoeuvre, manoeuvres
 from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.noise_covariance import first_noise, likely_gusts
+from heli_jax.identification.identifiability.verdict import exponents
 from heli_jax.identification.problem import Free, Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Solution, layout_of
@@ -118,8 +119,6 @@ class Design(NamedTuple):
             ValueError: a factor is no free parameter.
         """
         powers = exponents(product, tuple(rated.sd))
-        if powers is None:
-            raise ValueError(f"expected a parameter or a product, got criterion {product}")
         if not np.isfinite(rated.value):
             return math.inf
         # Repeated flights are independent, so their information adds up.
@@ -247,10 +246,11 @@ def _check(
     for name, value in (*sizes, *limits.motion.items()):
         if not value > 0:
             raise ValueError(f"limits: {name}: expected more than zero, got {value:g}")
-    try:
-        exponents(criterion, tuple(problem.free))
-    except ValueError as e:
-        raise ValueError(f"criterion: expected D, A, E, or a product; {e}") from e
+    if criterion not in CRITERIA:
+        try:
+            exponents(criterion, tuple(problem.free))
+        except ValueError as e:
+            raise ValueError(f"criterion: expected D, A, E, or a product; {e}") from e
     if len(differences) != len(problem.training):
         raise ValueError(
             f"differences: expected one for each of {len(problem.training)} flights, got "
@@ -264,28 +264,6 @@ def _check(
                 raise ValueError(
                     f"differences: {name}: expected the lowest value first, got {low:g}, {high:g}"
                 )
-
-
-def exponents(criterion: str, free: Sequence[str]) -> Float[np.ndarray, " p"] | None:
-    """Return the exponents of a product such as `a/Ixx`; None for a criterion by letter.
-
-    Raises:
-        ValueError: a factor is no free parameter.
-    """
-    if criterion in CRITERIA:
-        return None
-    powers = np.zeros(len(free))
-    for i, part in enumerate(criterion.split("/")):
-        for name in part.split("*"):
-            if name.strip() == "1" and i == 0:
-                continue
-            if name.strip() not in free:
-                raise ValueError(
-                    f"expected {', '.join(free)} or a product such as {'/'.join(free[:2])}, got "
-                    f"{criterion!r}"
-                )
-            powers[free.index(name.strip())] += -1.0 if i else 1.0
-    return powers
 
 
 def _points(problem: Problem, z: np.ndarray, vehicles: int, seed: int) -> Float[np.ndarray, "v q"]:
@@ -325,7 +303,7 @@ class _Search:
     ) -> None:
         self.experiment, self.limits, self.criterion = experiment, limits, criterion
         problem = experiment.problem
-        self.powers = exponents(criterion, experiment.parameters)
+        self.powers = None if criterion in CRITERIA else exponents(criterion, experiment.parameters)
         p = len(experiment.parameters)
         self.priors = np.square(np.asarray(experiment.vehicles.rows)[:, :p, :p])
         self.flights = problem.training
