@@ -158,7 +158,7 @@ def autopilot_files(run: Any) -> dict[str, str]:
     settings, flight = run.config.config.design, run.problem.training[0]
     assert settings is not None
     files: dict[str, str] = {}
-    chirps = [r for r in run.design.library if r.manoeuvre and r.manoeuvre.kind == "chirp"]
+    chirp = next((r for r in run.design.library if r.manoeuvre.kind == "chirp"), None)
     duration = flight.n_samples * flight.dt / len(settings.inputs)
     shares = []
     for name, limit in settings.inputs.items():
@@ -166,16 +166,16 @@ def autopilot_files(run: Any) -> dict[str, str]:
         if limit.full_stick is not None:
             own = run.design.optimum.inputs[0][name]
             shares.append((name, scale * own / limit.full_stick))
-        if not chirps or chirps[0].manoeuvre is None:
+        if chirp is None:
             continue
-        size, chirp = float(np.max(np.abs(chirps[0].inputs[0][name]))), chirps[0].manoeuvre
+        size, band = float(np.max(np.abs(chirp.inputs[0][name]))), chirp.manoeuvre.settings["band"]
         if limit.ardupilot is not None:
             # Mixer axes take shares of full output, the others degrees.
             size_there = size if limit.ardupilot.startswith("mixer") else math.degrees(size)
-            text = ardupilot_parameters(chirp, limit.ardupilot, size_there, duration)
+            text = ardupilot_parameters(band, limit.ardupilot, size_there, duration)
             files[f"ardupilot-{name}.param"] = text
         if limit.betaflight is not None:
-            text = betaflight_commands(chirp, limit.betaflight, math.degrees(size), duration)
+            text = betaflight_commands(band, limit.betaflight, math.degrees(size), duration)
             files[f"betaflight-{name}.txt"] = text
     if shares:
         files["input.lua"] = transmitter_script(flight.dt, shares)
@@ -218,7 +218,7 @@ def _finite(value: float) -> float | None:
 def _draw(run: Any, i: int) -> Chart:
     """Draw the excitations and the limited motion of a run."""
     flight, model = run.problem.training[i], run.problem.model
-    t, motion = np.arange(flight.n_samples) * flight.dt, run.design.motion[i]
+    t, motion = np.arange(flight.n_samples) * flight.dt, run.design.optimum.motion[i]
     settings = run.config.config.design
     assert settings is not None
     panels = []

@@ -129,8 +129,8 @@ listed."""
 class Signal(NamedTuple):
     """Transforms of an input, and its samples at the ends of the blocks."""
 
-    lines: Complex[Array, "K F"]
-    ends: Float[Array, "r F"]
+    lines: Complex[Array | np.ndarray, "K F"]
+    ends: Float[Array | np.ndarray, "r F"]
     """Samples about the first one of each block, less those about the next one's, over sqrt(N)."""
 
 
