@@ -123,26 +123,27 @@ def _messages(
         raise InputError(f"mavlink:{device}: cannot be opened ({e})") from e
     kinds = sorted({n.partition(".")[0] for n in names})
     scale = units.factor(time.unit, "s")
-    yield (",".join([time.name, *names]) + "\n").encode()
-    while not stopped():
-        message = link.recv_match(type=kinds, blocking=not until_end, timeout=_PAUSE)
-        if message is None:
-            if until_end:
-                return
-            yield b""
-            continue
-        stamp = getattr(message, "time_boot_ms", None)
-        seconds = (
-            1e-3 * stamp if stamp is not None else 1e-6 * getattr(message, "time_usec", np.nan)
-        )
-        if not np.isfinite(seconds):
-            raise InputError(f"mavlink:{device}: {message.get_type()} has no time")
-        cells = []
-        for n in names:
-            kind, _, field = n.partition(".")
-            value = getattr(message, field, None) if kind == message.get_type() else None
-            cells.append("" if value is None else repr(float(value)))
-        yield (",".join([repr(seconds / scale), *cells]) + "\n").encode()
+    with contextlib.closing(link):
+        yield (",".join([time.name, *names]) + "\n").encode()
+        while not stopped():
+            message = link.recv_match(type=kinds, blocking=not until_end, timeout=_PAUSE)
+            if message is None:
+                if until_end:
+                    return
+                yield b""
+                continue
+            stamp = getattr(message, "time_boot_ms", None)
+            seconds = (
+                1e-3 * stamp if stamp is not None else 1e-6 * getattr(message, "time_usec", np.nan)
+            )
+            if not np.isfinite(seconds):
+                raise InputError(f"mavlink:{device}: {message.get_type()} has no time")
+            cells = []
+            for n in names:
+                kind, _, field = n.partition(".")
+                value = getattr(message, field, None) if kind == message.get_type() else None
+                cells.append("" if value is None else repr(float(value)))
+            yield (",".join([repr(seconds / scale), *cells]) + "\n").encode()
 
 
 # From rows to samples.
