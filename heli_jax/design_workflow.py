@@ -28,6 +28,8 @@ class DesignRun(NamedTuple):
     """A design with its configuration."""
 
     config: Experiment
+    settings: FlightDesignConfig
+    """Section `design` of the configuration."""
     problem: Problem
     limits: Limits
     design: Design
@@ -100,7 +102,8 @@ def run_design(
             max_steps=settings.max_steps,
             progress=progress,
         )
-    run = DesignRun(config, problem, limits, found, asked, None if out is None else Path(out))
+    place = None if out is None else Path(out)
+    run = DesignRun(config, settings, problem, limits, found, asked, place)
     if run.directory is not None:
         _write(run, run.directory)
     return run

@@ -18,7 +18,7 @@ import numpy as np
 
 from heli_jax import config as configuration
 from heli_jax import naming, units
-from heli_jax.cli.terminal import plain_text, print_table, print_text
+from heli_jax.cli.terminal import print_table, print_text
 from heli_jax.cli.wanted import Wanted
 from heli_jax.config import Experiment
 from heli_jax.config.logs import clock_signal, first_signals, require_flights, with_log
@@ -31,15 +31,13 @@ from heli_jax.identification.problem import Problem
 from heli_jax.numbers import terse
 from heli_jax.regular_file import open_regular
 from heli_jax.stream import Known, Sample, State, estimate, follow, init
-from heli_jax.stream.rows import Grid, Rows, Sorter
+from heli_jax.stream.rows import BRIDGED, Grid, Rows, Sorter
 from heli_jax.stream.steps import BLOCK
 
 _PIECE, _TOGETHER = 1 << 18, 64
 """Bytes that are read at once, and samples that one program takes."""
 _PAUSE, _EVERY = 0.1, 0.5
 """Pause before more is read, and time between two screens [s]."""
-_GAP = 3.5
-"""Step from which on a log is split for the fit [usual steps]."""
 
 
 @contextlib.contextmanager
@@ -253,7 +251,7 @@ class Follower:
             near = np.abs(steps / usual - np.round(steps / usual)).max() < 0.1
             flight = flight.model_copy(update={"rate": 1.0 / usual})
             even = bool(near)
-        if steps.max() > _GAP * usual:
+        if steps.max() > BRIDGED * usual:
             flight = flight.model_copy(update={"gaps": "split"})
         config = experiment.config.model_copy(update={"flights": [flight]})
         return experiment._replace(config=config), even
@@ -331,42 +329,14 @@ def lines_of(follower: Follower) -> list[str]:
     return lines
 
 
-class _Screen:
-    """One screen that is drawn anew, or without a terminal a line for each estimate."""
-
-    def __init__(self, follower: Follower, wanted: Mapping[str, Wanted]) -> None:
-        self.follower, self.wanted, self.live = follower, wanted, None
-
-    def __enter__(self) -> "_Screen":
-        if sys.stdout.isatty():
-            from rich.live import Live
-
-            self.live = Live(get_renderable=self._drawn, auto_refresh=False)
-            self.live.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self.live is not None:
-            self.live.stop()
-
-    def _drawn(self) -> Any:
-        from rich.console import Group
-        from rich.table import Table
-        from rich.text import Text
-
-        table = Table(*HEAD, box=None, pad_edge=False)
-        for row in rows_of(self.follower, self.wanted):
-            table.add_row(*(Text(plain_text(cell)) for cell in row))
-        return Group(table, *(Text(plain_text(line)) for line in lines_of(self.follower)))
-
-    def show(self, *, changed: bool) -> None:
-        if self.live is not None:
-            self.live.refresh()
-        elif changed:
-            print_table(HEAD, rows_of(self.follower, self.wanted))
-            for line in lines_of(self.follower):
-                print_text(line)
-            sys.stdout.flush()
+def _show(follower: Follower, wanted: Mapping[str, Wanted]) -> None:
+    """Print what is known, on a terminal in place of what was printed before."""
+    if sys.stdout.isatty():
+        sys.stdout.write("\x1b[H\x1b[J")
+    print_table(HEAD, rows_of(follower, wanted))
+    for line in lines_of(follower):
+        print_text(line)
+    sys.stdout.flush()
 
 
 def run_stream(
@@ -397,15 +367,15 @@ def run_stream(
     follower = Follower(experiment, place, log, block or BLOCK)
     shown = 0.0
     arrives = received(place, until_end, stopped, follower.time, follower.names)
-    with _Screen(follower, wanted) as screen:
-        for data in arrives:
-            follower.take(data)
-            changed = follower.update()
-            if changed or time.monotonic() - shown > _EVERY:
-                screen.show(changed=changed)
-                shown = time.monotonic()
-        follower.finish()
-        screen.show(changed=follower.update())
+    for data in arrives:
+        follower.take(data)
+        due = sys.stdout.isatty() and time.monotonic() - shown > _EVERY
+        if follower.update() or due:
+            _show(follower, wanted)
+            shown = time.monotonic()
+    follower.finish()
+    if follower.update():
+        _show(follower, wanted)
     if not log.exists():
         raise InputError(f"{place}: no whole rows were received, expected a table with a header")
     return follower.as_fitted(log)[0]

@@ -2,9 +2,8 @@
 
 import functools
 import math
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,7 +25,8 @@ from heli_jax.report.page import filled, picture
 from heli_jax.report.style import label
 from heli_jax.report.tables import Table
 
-# `run` is a DesignRun of `heli_jax.design_workflow`, which imports this module.
+if TYPE_CHECKING:
+    from heli_jax.design_workflow import DesignRun
 
 _FILES = ("design.json", "input.csv")
 _GAIN = 1e-3
@@ -35,13 +35,7 @@ _ROWS = 12
 """Manoeuvres of the library in a table."""
 
 
-def verdict(rated: Rated) -> str:
-    """Return in words which parameters a manoeuvre determines."""
-    lost = rated.undetermined
-    return f"not determined: {', '.join(lost)}" if lost else "all determined"
-
-
-def manoeuvres_table(run: Any, most: int = _ROWS) -> Table:
+def manoeuvres_table(run: "DesignRun", most: int = _ROWS) -> Table:
     """Return the optimum, the user's inputs and the best of the library, a row each."""
     design = run.design
     names = list(dict.fromkeys([*products(run), *design.optimum.sd]))
@@ -60,7 +54,7 @@ def manoeuvres_table(run: Any, most: int = _ROWS) -> Table:
     return Table((*head, "least margin"), rows)
 
 
-def products(run: Any) -> list[str]:
+def products(run: "DesignRun") -> list[str]:
     """Return the criterion and the wanted products, if they are products."""
     asked = [] if run.design.criterion in CRITERIA else [run.design.criterion]
     return [*asked, *run.wanted]
@@ -70,7 +64,7 @@ def _percent(share: float) -> str:
     return f"{number(100.0 * share, 2)} %"
 
 
-def summary(run: Any) -> str:
+def summary(run: "DesignRun") -> str:
     """Return what the design gains, in a sentence."""
     design = run.design
     best, optimum = design.library[0], design.optimum
@@ -83,7 +77,16 @@ def summary(run: Any) -> str:
     return f"The optimised input lowers {what} by {_percent(gain)} against {best.words}."
 
 
-def write_design(folder: Path, run: Any, config: str) -> None:
+def known_differences(run: "DesignRun") -> list[str]:
+    """Return the differences that the design chose, a sentence for each run that has some."""
+    return [
+        f"Run {i + 1}: {', '.join(f'{n} = {number(v)}' for n, v in own.items())}"
+        for i, own in enumerate(run.design.optimum.known)
+        if own
+    ]
+
+
+def write_design(folder: Path, run: "DesignRun", config: str) -> None:
     """Write design.json, input.csv, report.html and figures/ of a design."""
     columns = input_columns(run)
     write_table(folder / "input.csv", columns)
@@ -103,10 +106,7 @@ def write_design(folder: Path, run: Any, config: str) -> None:
         summary=summary(run),
         doubts=doubts(run),
         table_of=manoeuvres_table(run),
-        known=[
-            ", ".join(f"{n} = {number(v)}" for n, v in own.items())
-            for own in run.design.optimum.known
-        ],
+        known=known_differences(run),
         pictures=[p for p in pictures if p is not None],
         numbers=numbers.content(),
         origin=origin(config, (*_FILES, *played)),
@@ -114,7 +114,7 @@ def write_design(folder: Path, run: Any, config: str) -> None:
     (folder / "report.html").write_text(page, encoding="utf-8")
 
 
-def doubts(run: Any) -> list[str]:
+def doubts(run: "DesignRun") -> list[str]:
     """Return what limits the trust in a design."""
     design, found = run.design, []
     if not design.converged:
@@ -132,10 +132,8 @@ def doubts(run: Any) -> list[str]:
     return found
 
 
-def input_columns(run: Any) -> dict[str, np.ndarray]:
+def input_columns(run: "DesignRun") -> dict[str, np.ndarray]:
     """Return time and excitations in the units of `design.inputs`, one run after another."""
-    settings = run.config.config.design
-    assert settings is not None
     parts: list[dict[str, Any]] = []
     for i, (flight, own) in enumerate(
         zip(run.problem.training, run.design.optimum.inputs, strict=True)
@@ -144,19 +142,18 @@ def input_columns(run: Any) -> dict[str, np.ndarray]:
         if len(run.problem.training) > 1:
             part = {"run": np.full(flight.n_samples, i + 1)} | part
         for name, limit in run.limits.inputs.items():
-            scale = settings.inputs[name].amplitude / limit.amplitude
+            scale = run.settings.inputs[name].amplitude / limit.amplitude
             part[name] = scale * own[name]
         parts.append(part)
     return {n: np.concatenate([p[n] for p in parts]) for n in parts[0]}
 
 
-def autopilot_files(run: Any) -> dict[str, str]:
+def autopilot_files(run: "DesignRun") -> dict[str, str]:
     """Return by name the files of the first run for autopilots and transmitters.
 
     Autopilots play the best chirp of the library, a transmitter the optimised input.
     """
-    settings, flight = run.config.config.design, run.problem.training[0]
-    assert settings is not None
+    settings, flight = run.settings, run.problem.training[0]
     files: dict[str, str] = {}
     chirp = next((r for r in run.design.library if r.manoeuvre.kind == "chirp"), None)
     duration = flight.n_samples * flight.dt / len(settings.inputs)
@@ -182,7 +179,7 @@ def autopilot_files(run: Any) -> dict[str, str]:
     return files
 
 
-def _content(run: Any) -> dict[str, Any]:
+def _content(run: "DesignRun") -> dict[str, Any]:
     design = run.design
 
     def of(rated: Rated) -> dict[str, Any]:
@@ -215,15 +212,13 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _draw(run: Any, i: int) -> Chart:
+def _draw(run: "DesignRun", i: int) -> Chart:
     """Draw the excitations and the limited motion of a run."""
     flight, model = run.problem.training[i], run.problem.model
     t, motion = np.arange(flight.n_samples) * flight.dt, run.design.optimum.motion[i]
-    settings = run.config.config.design
-    assert settings is not None
     panels = []
     for name, limit in run.limits.inputs.items():
-        own, point = run.design.optimum.inputs[i][name], settings.inputs[name].set_point
+        own, point = run.design.optimum.inputs[i][name], run.settings.inputs[name].set_point
         unit = naming.unit(model.Inputs, name) if point is None else naming.unit(model.State, point)
         panels.append(
             panel(
@@ -233,24 +228,20 @@ def _draw(run: Any, i: int) -> Chart:
                 levels=(-limit.amplitude, limit.amplitude),
             )
         )
-    units = naming_units(run)
+    records = {n: r for r in (model.State, model.Outputs) for n in naming.names(r)}
     for name, most in run.limits.motion.items():
         series = [samples("", t, motion[name], style.BLUE, 0.9)]
         ends = (-1.1 * most, 1.1 * most)
         panels.append(
-            panel(label(name, units[name]), series, 1.0, limits=ends, levels=(-most, most))
+            panel(
+                label(name, naming.unit(records[name], name)),
+                series,
+                1.0,
+                limits=ends,
+                levels=(-most, most),
+            )
         )
     title = f"Optimised input and motion, {flight.name}"
     return Chart(
         title, "time [s]", time_limits(t), tuple(panels), "Lines: the limits.", of=flight.name
     )
-
-
-def naming_units(run: Any) -> Mapping[str, str | None]:
-    """Return the units of states and outputs."""
-    model = run.problem.model
-    return {
-        n: naming.unit(record, n)
-        for record in (model.State, model.Outputs)
-        for n in naming.names(record)
-    }

@@ -19,10 +19,6 @@ WAIT = 1.0
 """Time for which later lines may still come before earlier ones [s]."""
 _HEAD = 4
 """Fewest lines in which the names of the columns are searched."""
-_BRIDGED = 3.5
-"""Longest step that is bridged [usual steps]: three lost samples."""
-_LONGEST = 10.0
-"""Length to which gaps are shortened [usual steps]; they end a block in any case."""
 
 
 class Rows(NamedTuple):
@@ -123,6 +119,12 @@ class Sorter:
         return held.part(0, n)
 
 
+BRIDGED = 3.5
+"""Longest step that is bridged [usual steps]: three lost samples."""
+_LONGEST = 10.0
+"""Length to which gaps are shortened [usual steps]; they end a block in any case."""
+
+
 class Clocked(NamedTuple):
     """Samples of one signal, SI."""
 
@@ -133,7 +135,7 @@ class Clocked(NamedTuple):
 class Grid:
     """Puts sorted rows on a flight's uniform grid: inputs as they act, outputs by straight lines.
 
-    Steps of up to `_BRIDGED` usual ones are bridged. Longer gaps are missing samples.
+    Steps of up to `BRIDGED` usual ones are bridged. Longer gaps are missing samples.
     """
 
     def __init__(self, flight: Flight, names: Sequence[str], first: Rows, *, even: bool) -> None:
@@ -188,7 +190,7 @@ class Grid:
                 values = values[min(old.values.size, 1) :]
             self._tails[key] = Clocked(np.r_[old.seconds, seconds[seen]], np.r_[old.values, values])
         ends = [t.seconds[-1] if t.seconds.size else 0.0 for t in self._tails.values()]
-        known = min(ends) if last else max(ends) - _BRIDGED * max(self._usual.values())
+        known = min(ends) if last else max(ends) - BRIDGED * max(self._usual.values())
         stop = int(np.floor(known / self.dt + 1e-6)) + 1
         times = self.dt * np.arange(self._next, max(stop, self._next))
         made = {key: self._sampled(key, times) for key in self._tails}
@@ -234,7 +236,7 @@ class Grid:
         after = np.minimum(before + 1, t.size - 1)
         exact = (before >= 0) & (np.abs(t[np.maximum(before, 0)] - times) <= near)
         inside = (before >= 0) & (before + 1 < t.size)
-        short = t[after] - t[np.maximum(before, 0)] <= _BRIDGED * self._usual[key]
+        short = t[after] - t[np.maximum(before, 0)] <= BRIDGED * self._usual[key]
         held = key[1] == "input" and self._hold[key[0]] == "zero-order"
         between = v[np.maximum(before, 0)] if held else np.interp(times, t, v)
         made = np.where(exact, v[np.maximum(before, 0)], between)
