@@ -134,7 +134,7 @@ def test_an_interrupt_of_the_intervals_keeps_the_fit(config, tmp_path, monkeypat
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    asked = heli_jax.load_config(config, {"fit.intervals.profile": True})
+    asked = heli_jax.load_config(config, {"fit.intervals.profile": ["Ixx"]})
     out = tmp_path / "run"
     with monkeypatch.context() as patch:
         patch.setattr("heli_jax.workflow.intervals", interrupted)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import yaml
 
-from heli_jax import load_fit
+from heli_jax import load_config, load_fit
 from heli_jax.cli import main
-from heli_jax.cli.stream import received
+from heli_jax.cli.stream import Follower, received
 from heli_jax.cli.wanted import Wanted, wanted_of
 from heli_jax.errors import InputError
 from heli_jax.flights import Signal
@@ -53,6 +53,46 @@ def test_a_damaged_stream_ends_as_the_fit_of_the_log(bench, tmp_path, capsys):
     assert main(["fit", str(bench), "--out", str(tmp_path / "fit")]) == 0
     ours, batch = (estimates_in(tmp_path / n) for n in ("run", "fit"))
     assert ours == pytest.approx(batch, rel=1e-12)
+
+
+@pytest.fixture
+def followed(bench, tmp_path):
+    """Follow lines of a table in pieces; return the follower."""
+
+    def follow(name, lines, pieces=9):
+        follower = Follower(load_config(bench), "stream.csv", tmp_path / f"{name}.csv", 8.0)
+        for part in np.array_split(np.array(lines, object), pieces):
+            follower.take("".join(part).encode())
+            follower.update()
+        follower.finish()
+        follower.update(last=True)
+        return follower
+
+    return follow
+
+
+def test_a_gap_costs_its_block_alone(bench, followed):
+    head, *rows = (bench.parent / "bench.csv").read_text().splitlines(keepends=True)
+    whole = followed("whole", [head, *rows])
+    assert (int(whole.state.samples), int(whole.state.missing)) == (len(rows), 0)
+    assert int(whole.state.blocks) == len(rows) // 400
+    # Two seconds are lost in the second block, and the next one begins after them.
+    torn = followed("torn", [head, *rows[:500], *rows[600:]])
+    assert (int(torn.state.samples), int(torn.state.missing)) == (len(rows) - 99, 1)
+    assert int(torn.state.blocks) == 1 + (len(rows) - 600) // 400
+    value, sd = whole.known.estimates["Ixx"][:2]
+    assert abs(torn.known.estimates["Ixx"].value - value) < 4.0 * sd
+
+
+def test_clocks_of_two_messages(bench, followed):
+    head, *rows = (bench.parent / "bench.csv").read_text().splitlines(keepends=True)
+    whole = followed("whole", [head, *rows]).known.estimates["Ixx"]
+    cells = [row.rstrip("\n").split(",") for row in rows]
+    assert head.count(",") == 2
+    # The output is logged 3 ms after the input, in a row of its own.
+    both = [f"{t},{u},\n{float(t) + 0.003:.4f},,{y}\n" for t, u, y in cells]
+    one = followed("both", [head, *both]).known.estimates["Ixx"]
+    assert one.value == pytest.approx(whole.value, rel=0.1)
 
 
 @pytest.mark.parametrize(
