@@ -261,10 +261,12 @@ def _model(layout: Layout, data: Data, u: Unknowns) -> tuple[Matrices, Sources]:
     return Matrices(Ad, B, C[rows], D[rows]), Sources(U, held)
 
 
-def _problem(problem: Problem) -> Problem:
-    """Return the problem without the unknowns of single flights, which blocks do not have."""
+@functools.lru_cache(maxsize=8)
+def _search(problem: Problem, samples: int, ahead: int) -> Search:
+    """Return the search of a problem on blocks, with data that lack their signals."""
+    # Blocks have no unknowns of single flights.
     bare = problem.nuisance._replace(initial_state=False, bias=False, input_offset=False)
-    return dataclasses.replace(
+    of_blocks = dataclasses.replace(
         problem,
         method="frequency-error",
         flights=(problem.training[0],),
@@ -274,17 +276,11 @@ def _problem(problem: Problem) -> Problem:
         fixed_noise=(),
         instrument=(),
     )
-
-
-@functools.lru_cache(maxsize=8)
-def _search(problem: Problem, samples: int, ahead: int) -> Search:
-    """Return the search of a problem on blocks, with data that lack their signals."""
-    of_blocks = _problem(problem)
-    layout, facts = (
+    layout = dataclasses.replace(
         layout_of(of_blocks, of_blocks.training),
-        BlockFacts(_Block(0, 0, samples), ahead),
+        objective=_OBJECTIVE,
+        flight_facts=(BlockFacts(_Block(0, 0, samples), ahead),),
     )
-    layout = dataclasses.replace(layout, objective=_OBJECTIVE, flight_facts=(facts,))
     return Search(of_blocks, layout, data_of(of_blocks, of_blocks.training), _STEPS)
 
 
@@ -299,15 +295,16 @@ _WEAK = 0.01
 
 
 def estimate(problem: Problem, state: State, before: Known | None = None) -> Known | None:
-    """Return what the completed blocks determine; None without any.
+    """Return what the completed blocks determine; `before` until all outputs move in them.
 
     Args:
         problem: that of `init`.
         before: result of an earlier call.
     """
     done = blocks_of(state)
-    if not done.count:
-        return None
+    measured = len(problem.training[0].outputs)
+    if not np.any(done.lines[:, -measured:], axis=(0, 2)).all():
+        return before
     search = _search(problem, state.length, state.ahead)
     search = search._replace(data=_with_blocks(search, done, state.length))
     if before is None:
