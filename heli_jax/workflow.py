@@ -123,9 +123,10 @@ def run_fit(
     with recorded() as seconds:
         seconds["loading"] = time.perf_counter() - began
         run = _fit_run(config, progress, began)
-        if keeps := out is not None and _takes_long(run):
+        kept = None if out is None or not _takes_long(run) else Path(out)
+        if kept is not None:
             with stage("writing the fit", name="report before further intervals"):
-                _write(_interrupted(run), Path(out), page=False)
+                _write(_interrupted(run), kept, page=False)
             progress(f"the fit is in {out}; further intervals will be added to it")
         further = _supplementary(run.config, run.problem, run.fit, progress)
         run = replace(run, supplementary=further)
@@ -134,7 +135,7 @@ def run_fit(
         return run
     progress("writing the report")
     with stage("writing the report"):
-        return _write(run, Path(out), replaces=keeps)
+        return _write(run, Path(out), replaces=kept is not None)
 
 
 def _takes_long(run: FitRun) -> bool:

@@ -155,7 +155,8 @@ def autopilot_files(run: "DesignRun") -> dict[str, str]:
     """
     settings, flight = run.settings, run.problem.training[0]
     files: dict[str, str] = {}
-    chirp = next((r for r in run.design.library if r.manoeuvre.kind == "chirp"), None)
+    rated = [(r.inputs[0], r.manoeuvre) for r in run.design.library if r.manoeuvre]
+    chirp = next((one for one in rated if one[1].kind == "chirp"), None)
     duration = flight.n_samples * flight.dt / len(settings.inputs)
     shares = []
     for name, limit in settings.inputs.items():
@@ -165,7 +166,7 @@ def autopilot_files(run: "DesignRun") -> dict[str, str]:
             shares.append((name, scale * own / limit.full_stick))
         if chirp is None:
             continue
-        size, band = float(np.max(np.abs(chirp.inputs[0][name]))), chirp.manoeuvre.settings["band"]
+        size, band = float(np.max(np.abs(chirp[0][name]))), chirp[1].settings["band"]
         if limit.ardupilot is not None:
             # Mixer axes take shares of full output, the others degrees.
             size_there = size if limit.ardupilot.startswith("mixer") else math.degrees(size)
