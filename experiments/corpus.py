@@ -162,10 +162,10 @@ def run_group(
     import jax
     from corpus_cases import cases
 
-    from heli_jax.cli import commands
+    from heli_jax.cli.jax_settings import prepare_jax
 
     # 64 bit before any trace, since cases of Problems do not use the command line.
-    commands._prepare_jax()
+    prepare_jax()
     known, done = {c.name: c for c in cases(Path(shared))}, []
     for name, how in entries:
         with way(how) if way and how else contextlib.nullcontext({}) as added:

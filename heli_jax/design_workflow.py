@@ -16,7 +16,8 @@ from heli_jax.dynamics.model import require_constants, zeros
 from heli_jax.errors import InputError, located, require_known
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.design.information import Feedback
-from heli_jax.identification.flight_design import Design, InputLimit, Limits, design, exponents
+from heli_jax.identification.flight_design import Design, InputLimit, Limits, design
+from heli_jax.identification.identifiability.verdict import exponents
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import layout_of
 from heli_jax.simulation.simulate import simulate, substeps_for
@@ -27,6 +28,8 @@ class DesignRun(NamedTuple):
     """A design with its configuration."""
 
     config: Experiment
+    settings: FlightDesignConfig
+    """Section `design` of the configuration."""
     problem: Problem
     limits: Limits
     design: Design
@@ -99,8 +102,8 @@ def run_design(
             max_steps=settings.max_steps,
             progress=progress,
         )
-        found.needed(found.optimum, asked)  # refuses a criterion in place of a name
-    run = DesignRun(config, problem, limits, found, asked, None if out is None else Path(out))
+    place = None if out is None else Path(out)
+    run = DesignRun(config, settings, problem, limits, found, asked, place)
     if run.directory is not None:
         _write(run, run.directory)
     return run

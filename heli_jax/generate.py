@@ -25,7 +25,7 @@ from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.naming import Record
 from heli_jax.simulation import events
-from heli_jax.simulation.inputs import Shape, excitation
+from heli_jax.simulation.inputs import excitation
 from heli_jax.simulation.simulate import simulate, substeps_for
 from heli_jax.simulation.trajectory import Trajectory
 from heli_jax.sweeps.spec import Trimmed
@@ -67,10 +67,11 @@ def _stick_inputs(
         si = naming.unit(record, name) or "1"
         scale = _factor_to_si(stick.unit or si, si, f"{where}.inputs.{name}.unit")
         place = (together.index(name), len(together)) if name in together else (0, 1)
-        shape = Shape(stick.step, stick.pause, stick.hold, stick.band, stick.fade, place)
         limits = {"amplitude": scale * stick.amplitude, "rate": scale * (stick.rate or np.inf)}
         with located(f"{where}.inputs.{name}"):
-            out[name] = excitation(stick.kind, n, dt, rng, shape, **limits)
+            out[name] = excitation(
+                stick.kind, n, dt, rng, {**dict(stick), "place": place}, **limits
+            )
     return out
 
 

@@ -87,8 +87,11 @@ def require_writable(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def whole(path: Path) -> Iterator[Path]:
+def whole(path: Path, *, replaces: bool = False) -> Iterator[Path]:
     """Yield a temporary directory beside `path`, renamed to it at the end, or removed on failure.
+
+    Args:
+        replaces: True if it takes the place of an earlier directory of this process.
 
     Raises:
         InputError: it cannot be written.
@@ -101,6 +104,10 @@ def whole(path: Path) -> Iterator[Path]:
         temporary.mkdir(mode=0o700)
         yield temporary
         temporary.chmod(0o755)  # so far only its owner had access
+        if replaces:
+            # From here on an interrupt leaves the new directory, which is complete.
+            _unfinished.discard(temporary)
+            shutil.rmtree(path, ignore_errors=True)
         # rename replaces an empty directory, and nothing else.
         os.rename(temporary, path)
     except OSError as e:

@@ -18,7 +18,7 @@ from heli_jax.config.frequency import missing_handling, requested_handling
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.logs import log_notes
 from heli_jax.errors import InputError, located, require_kind
-from heli_jax.finding import Finding, without_repeats
+from heli_jax.finding import Finding, note, without_repeats
 from heli_jax.identification.equation_error.rls import Baseline, baseline
 from heli_jax.identification.fit import check, fit, rates
 from heli_jax.identification.problem import Problem
@@ -123,16 +123,41 @@ def run_fit(
     with recorded() as seconds:
         seconds["loading"] = time.perf_counter() - began
         run = _fit_run(config, progress, began)
+        kept = None if out is None or not _takes_long(run) else Path(out)
+        if kept is not None:
+            with stage("writing the fit", name="report before further intervals"):
+                _write(_interrupted(run), kept, page=False)
+            progress(f"the fit is in {out}; further intervals will be added to it")
+        further = _supplementary(run.config, run.problem, run.fit, progress)
+        run = replace(run, supplementary=further)
         run.fit.timing.update(seconds)
     if out is None:
         return run
     progress("writing the report")
     with stage("writing the report"):
-        return _write(run, Path(out))
+        return _write(run, Path(out), replaces=kept is not None)
+
+
+def _takes_long(run: FitRun) -> bool:
+    """True if the configuration asks for many further fits."""
+    options = run.config.config.fit
+    assert options is not None
+    further = options.intervals
+    return bool(
+        further.profile or further.bootstrap or further.nuts or options.compare or options.also
+    )
+
+
+def _interrupted(run: FitRun) -> FitRun:
+    """Return the run as it is if an interrupt ends its further analyses."""
+    words = "The run was interrupted before the further intervals, models or methods requested."
+    findings = (*run.fit.findings, note("uncertainty.interrupted", words))
+    # The times of the run continue.
+    return replace(run, fit=replace(run.fit, findings=findings, timing=dict(run.fit.timing)))
 
 
 def _fit_run(config: Experiment | str | Path, progress: Say, began: float) -> FitRun:
-    """Run `run_fit` without its report."""
+    """Run the fit and the baseline of `run_fit`."""
     with stage("reading the log", name="reading"):
         config = config if isinstance(config, Experiment) else load_config(config)
         # A fit that ignores the study would look like the study's result.
@@ -163,8 +188,7 @@ def _fit_run(config: Experiment | str | Path, progress: Say, began: float) -> Fi
             )
     with stage("recursive least squares", name="rls"):
         rls = _baseline(config, problem, fitted, progress)
-    further = _supplementary(config, problem, fitted, progress)
-    return FitRun(config, problem, fitted, rls, further, began=began)
+    return FitRun(config, problem, fitted, rls, began=began)
 
 
 def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Check:
@@ -287,7 +311,7 @@ def write_report(run: FitRun, out: str | Path, *, page: bool = True) -> FitRun:
     return _write(run, run_directory.free_directory(Path(out)), page=page)
 
 
-def _write(run: FitRun, out: Path, *, page: bool = True) -> FitRun:
+def _write(run: FitRun, out: Path, *, page: bool = True, replaces: bool = False) -> FitRun:
     """Write the run directory."""
     from heli_jax.report.fit_page import Analysis
     from heli_jax.report.fit_page import write_report as write_page
@@ -298,7 +322,7 @@ def _write(run: FitRun, out: Path, *, page: bool = True) -> FitRun:
     # Before the figures, since a configuration that cannot be written fails at once.
     text = as_yaml(configuration.resolved(run.config))
     vehicle, extra = run.config.vehicle, _with_responses(run) if page else run.supplementary
-    with run_directory.whole(out) as folder:
+    with run_directory.whole(out, replaces=replaces) as folder:
         (folder / "config.yaml").write_text(text, encoding="utf-8")
         files.write_signals(folder / "signals.csv", run.fit.signals)
         title = run.config.path.stem

@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from heli_jax import models, run_directory
-from heli_jax.cli import commands, main
+from heli_jax.cli import jax_settings, main
 from heli_jax.errors import InputError
 from heli_jax.linear_models.read import shipped
 
@@ -426,10 +426,10 @@ def test_the_style_of_the_working_folder_is_passed_over(tmp_path):
 def test_what_was_compiled_is_kept_for_its_owner_alone(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     (tmp_path / "heli_jax").mkdir(mode=0o777)
-    assert commands._private_cache() == str(tmp_path / "heli_jax")
+    assert jax_settings._private_cache() == str(tmp_path / "heli_jax")
     assert (tmp_path / "heli_jax").stat().st_mode & 0o777 == 0o700
     monkeypatch.setattr(os, "getuid", lambda: 12345)
-    assert commands._private_cache() is None
+    assert jax_settings._private_cache() is None
 
 
 def test_a_place_that_is_taken_meanwhile_is_refused(tmp_path):

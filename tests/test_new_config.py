@@ -1,10 +1,12 @@
 """`heli-jax new`: guesses for logs with known channels, and the resulting files."""
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from heli_jax import cli, load_config, units, yaml_file
 from heli_jax.config import read_flights
@@ -25,6 +27,7 @@ from heli_jax.new_config.model_choice import vehicle_of
 from heli_jax.new_config.rate import channels_of_preset, common_rate
 from heli_jax.new_config.scales import scaled
 from heli_jax.new_config.signals import is_place
+from tests.flights.log_writers import ulog
 
 T = np.arange(0.0, 20.0, 0.02)
 STICK = np.where(T < 1.0, 0.0, 0.4 * np.sign(np.sin(1.3 * T)))
@@ -299,6 +302,27 @@ def test_no_stick_tilts_a_blade_by_a_radian(most: float, unit: str, scale: float
     series = Series(np.arange(50.0), np.linspace(-most, most, 50))
     found = scaled("aileron", series, "rad", is_input=True)
     assert (found.unit, found.scale) == (unit, scale)
+
+
+def test_an_aeroplanes_commands_have_an_unknown_scale(tmp_path: Path) -> None:
+    clock = [("uint64_t", "timestamp"), ("uint64_t", "timestamp_sample"), ("float[3]", "xyz")]
+    rows = [(5000 * i, 5000 * i, math.sin(i / 9), 0.2, math.cos(i / 7)) for i in range(1, 400)]
+    topics = [(f"vehicle_{n}", 0, clock, rows) for n in ("angular_velocity", "torque_setpoint")]
+    (tmp_path / "plane.ulg").write_bytes(ulog(topics, [("MAV_TYPE", 1)], [("sys_name", "PX4")]))
+    write_config(tmp_path / "plane.ulg", tmp_path / "plane.yaml")
+    content = yaml.safe_load((tmp_path / "plane.yaml").read_text())
+    inputs = content["flights"][0]["signals"]["inputs"]
+    assert {n: (i["unit"], i["scale"]) for n, i in inputs.items()} == {
+        "ail": ("rad", "EDIT"),
+        "rud": ("rad", "EDIT"),
+    }
+    assert inputs["rud"]["invert"]
+    # The preset alone would take full travel for a radian.
+    text = (tmp_path / "plane.yaml").read_text()
+    begin, end = text.index("      inputs:"), text.index("fit:")
+    (tmp_path / "plane.yaml").write_text(text[:begin] + text[end:])
+    with pytest.raises(InputError, match="ail"):
+        read_flights(load_config(tmp_path / "plane.yaml"))
 
 
 @pytest.mark.parametrize(

@@ -130,6 +130,26 @@ def test_check_and_further_intervals(config, run):
     assert set(more.by_parameter["Ixx"]) == {"gaussian", "profile"}
 
 
+def test_an_interrupt_of_the_intervals_keeps_the_fit(config, tmp_path, monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    asked = heli_jax.load_config(config, {"fit.intervals.profile": ["Ixx"]})
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr("heli_jax.workflow.intervals", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            heli_jax.run_fit(asked, out)
+    content = json.loads((out / "fit.json").read_text())
+    assert "uncertainty.interrupted" in [f["code"] for f in content["findings"]]
+    assert all(e.sd > 0 for e in heli_jax.load_fit(out).estimates.values())
+    whole = heli_jax.run_fit(asked, tmp_path / "again")
+    content = json.loads((tmp_path / "again" / "fit.json").read_text())
+    assert "uncertainty.interrupted" not in [f["code"] for f in content["findings"]]
+    assert whole.supplementary.intervals is not None
+    assert (tmp_path / "again" / "report.html").exists()
+
+
 def test_a_sweep_in_memory_and_in_a_directory(config, tmp_path):
     in_memory = heli_jax.run_sweep(config)
     stored = heli_jax.run_sweep(config, tmp_path / "sweep", figures=False)

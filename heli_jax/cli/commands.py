@@ -6,21 +6,18 @@ import json
 import math
 import os
 import shlex
-import shutil
 import sys
-import textwrap
 import time
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from heli_jax import import_path, run_directory
 from heli_jax.cli import terminal
-from heli_jax.cli.terminal import print_page_table, print_table, print_text
+from heli_jax.cli.jax_settings import prepare_jax
+from heli_jax.cli.terminal import print_table, print_text
 from heli_jax.errors import InputError, located
-from heli_jax.numbers import adequacy_of
-from heli_jax.regular_file import read_regular
 from heli_jax.stages import Note
 from heli_jax.versions import version
 
@@ -35,10 +32,6 @@ _EXIT_CODES = (
     "asked, or an interval is not trusted; 4 an optimiser did not converge, the model is not "
     "adequate, or sensors are not compatible; 130 interrupted."
 )
-_LARGEST_FIT = 10**9
-"""Largest fit.json that is read [bytes]."""
-_DEEPEST = 3
-"""Depth to which `runs` searches below its folder [folders]."""
 
 
 def _count(text: str) -> int:
@@ -286,56 +279,6 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _prepare_jax(cpu_devices: int | None = None) -> None:
-    """Set float64 and a compilation cache for all programs. Only entry points call this.
-
-    Args:
-        cpu_devices: number of processors that are devices; default: JAX decides.
-    """
-    # Commands import JAX and its users themselves. It takes seconds, which a wrong option, --help
-    # and `info` do not need.
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
-    # Source locations of traced operations serve only for debugging compiled programs, and take 5 %
-    # of the time of `check`.
-    jax.config.update("jax_include_full_tracebacks_in_locations", False)
-    jax.config.update("jax_traceback_in_locations_limit", 0)
-    # JAX caches only programs that took over a second to compile. A fit has dozens of small ones,
-    # which add up to seconds.
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        jax.config.update("jax_compilation_cache_dir", _private_cache())
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    if cpu_devices is not None:
-        # The number of devices is fixed once JAX is in use.
-        with contextlib.suppress(RuntimeError):
-            jax.config.update("jax_num_cpu_devices", cpu_devices)
-    platforms = os.environ.get("JAX_PLATFORMS", "")
-    if platforms in ("", "cpu"):
-        return
-    try:
-        jax.devices()
-    # JAX raises AssertionError if its plugin for the device is installed but the device is missing.
-    except (RuntimeError, AssertionError) as e:
-        raise InputError(
-            f"JAX_PLATFORMS={platforms}: JAX finds no such device here; use JAX_PLATFORMS=cpu, or "
-            "for an NVIDIA GPU install its driver and the extra gpu: pip install 'heli_jax[gpu]'"
-        ) from e
-
-
-def _private_cache() -> str | None:
-    """Return the cache folder if it is this user's own, since it contains executable code."""
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "heli_jax"
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        folder.chmod(0o700)  # fails for another user's folder, unless run as root
-        owner = folder.stat().st_uid
-    except OSError:
-        return None
-    return str(folder) if getattr(os, "getuid", lambda: owner)() == owner else None
-
-
 def _new_directory(options: argparse.Namespace) -> Path:
     """Return the directory for a run's files, which does not exist yet."""
     out = _directory(options)
@@ -353,7 +296,7 @@ def _fit(options: argparse.Namespace) -> int:
     began = time.perf_counter()  # before the import of JAX, whose seconds count
     if not options.resume:
         _new_directory(options)
-    _prepare_jax()
+    prepare_jax()
     from heli_jax.config.study import read_study
 
     study = read_study(options.config, options.set, options.over)
@@ -387,7 +330,7 @@ def _fit_study(options: argparse.Namespace, study: "Study") -> int:
         raise InputError("--json: prints the fit.json of one fit, and a study has many")
     _require_out(options)
     out = _directory(options)
-    with _dask_client(options.scheduler) as client:
+    with simulations.dask_client(options.scheduler) as client:
         how = {"workers": options.workers, "client": client, "reports": options.reports}
         result = studies.run(study, out, studies.Options(options.resume, **how, say=options.say))
     simulations.print_study(result)
@@ -400,21 +343,6 @@ def _require_out(options: argparse.Namespace) -> None:
         raise InputError("--resume: expected --out DIR too, the directory of the interrupted run")
 
 
-# Any: dask.distributed is an extra, and only `sweeps.cluster` names its classes.
-def _dask_client(scheduler: str | None) -> contextlib.AbstractContextManager[Any]:
-    """Return a dask client of --scheduler, if it is stated."""
-    if scheduler is None:
-        return contextlib.nullcontext()
-    try:
-        from heli_jax.sweeps.cluster import connected
-    except ImportError as e:
-        raise InputError(
-            "--scheduler: dask.distributed is not installed, expected the extra distributed: "
-            "pip install 'heli_jax[distributed]'"
-        ) from e
-    return connected(scheduler)
-
-
 def _discard_output() -> None:
     """Discard output that is not yet printed."""
     if sys.stdout is not None:
@@ -422,7 +350,7 @@ def _discard_output() -> None:
 
 
 def _check(options: argparse.Namespace) -> int:
-    _prepare_jax()
+    prepare_jax()
     from heli_jax import workflow
     from heli_jax.cli import fits
     from heli_jax.report import files
@@ -438,7 +366,7 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _windows(options: argparse.Namespace) -> int:
-    _prepare_jax()
+    prepare_jax()
     from heli_jax import workflow
     from heli_jax.cli import windows
 
@@ -455,7 +383,7 @@ def _design(options: argparse.Namespace) -> int:
     from heli_jax.cli import designs
 
     wanted = designs.wanted_sds(options.wanted)
-    _prepare_jax()
+    prepare_jax()
     from heli_jax import workflow
     from heli_jax.design_workflow import run_design
 
@@ -483,7 +411,7 @@ def _control(options: argparse.Namespace) -> int:
 
 def _compatibility(options: argparse.Namespace) -> int:
     out = _new_directory(options)
-    _prepare_jax()
+    prepare_jax()
     from heli_jax import compatibility
     from heli_jax.cli import fits
 
@@ -496,7 +424,7 @@ def _compatibility(options: argparse.Namespace) -> int:
 
 def _frf(options: argparse.Namespace) -> int:
     out = _new_directory(options)
-    _prepare_jax()
+    prepare_jax()
     from heli_jax import workflow
     from heli_jax.cli import responses
 
@@ -513,7 +441,7 @@ def _stream(options: argparse.Namespace) -> int:
     log = out.with_name(f"{out.name}.csv")
     run_directory.require_free(log)
     run_directory.require_place(log, f"{log}")
-    _prepare_jax()
+    prepare_jax()
     from heli_jax import workflow
     from heli_jax.cli import fits, stream
     from heli_jax.cli.wanted import wanted_of
@@ -543,7 +471,7 @@ def _simulate(options: argparse.Namespace) -> int:
     # Check the place before the simulation.
     if out is not None:
         run_directory.require_place(out, f"--out {out}")
-    _prepare_jax()
+    prepare_jax()
     from heli_jax import config as configuration
     from heli_jax import generate
     from heli_jax.cli import simulations
@@ -567,7 +495,7 @@ def _sweep(options: argparse.Namespace) -> int:
     from heli_jax.numerics.cores import cores
 
     # Each core is a device, unless there are GPUs.
-    _prepare_jax(options.devices or cores())
+    prepare_jax(options.devices or cores())
     import jax
 
     from heli_jax import config as configuration
@@ -575,7 +503,7 @@ def _sweep(options: argparse.Namespace) -> int:
     from heli_jax.cli import simulations
 
     experiment = configuration.load(options.config, options.set)
-    with _dask_client(options.scheduler) as client:
+    with simulations.dask_client(options.scheduler) as client:
         sweep_workflow.run_sweep(
             experiment,
             out,
@@ -645,56 +573,21 @@ def _selection(options: argparse.Namespace) -> "Selection":
 
 
 def _runs(options: argparse.Namespace) -> int:
-    folder = Path(options.directory)
-    if not folder.exists():
-        raise InputError(
-            f"{folder}: does not exist, expected a folder with runs of heli-jax fit: heli-jax "
-            "runs DIR"
-        )
-    if not folder.is_dir():
-        raise InputError(f"{folder}: expected a folder of runs, got a file")
-    listed = sorted(_found(folder), key=lambda run: run["date"])
+    from heli_jax.cli import runs
+
+    listed = runs.listed(Path(options.directory))
     if options.json:
         print(json.dumps(listed, indent=1))
         return DONE
     if not listed:
-        raise InputError(f"{folder}: holds no run of heli-jax fit")
+        raise InputError(f"{options.directory}: holds no run of heli-jax fit")
     keys = ("run", "date", "model", "method", "status", "adequate", "untrusted")
-    rows = [tuple(str(run[k]) for k in keys) for run in listed]
-    print_table(keys, rows)
+    print_table(keys, [tuple(str(run[k]) for k in keys) for run in listed])
     return DONE
 
 
-def _found(folder: Path) -> Iterator[dict[str, Any]]:
-    for path in _files(folder, _DEEPEST):
-        try:
-            content = json.loads(read_regular(path, "the fit.json of a run", _LARGEST_FIT))
-            # The table has no room for the reasons.
-            adequate = adequacy_of(content).partition(" (")[0]
-            row = {k: content[k] for k in ("model", "method", "status")}
-            untrusted = ", ".join(map(str, content.get("untrusted") or ()))
-            date = time.strftime("%Y-%m-%d %H:%M", time.localtime(path.stat().st_mtime))
-        # Another program may have written a fit.json, which is no run.
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-            continue
-        name = str(path.parent.relative_to(folder))
-        yield {"run": name, "date": date, **row, "adequate": adequate, "untrusted": untrusted}
-
-
-def _files(folder: Path, deepest: int) -> Iterator[Path]:
-    # A folder may be listed but not entered. Its entries then have no type.
-    try:
-        inside = sorted(os.scandir(folder), key=lambda entry: entry.name)
-        files = [e.path for e in inside if e.name == "fit.json" and e.is_file()]
-        folders = [e.path for e in inside if e.is_dir(follow_symlinks=False)]
-    except OSError:
-        return
-    yield from map(Path, files)
-    for path in folders if deepest else ():
-        yield from _files(Path(path), deepest - 1)
-
-
 def _compare(options: argparse.Namespace) -> int:
+    from heli_jax.cli import runs
     from heli_jax.report.compared_runs import compare_runs
 
     place = None if options.out is None else Path(options.out)
@@ -702,29 +595,10 @@ def _compare(options: argparse.Namespace) -> int:
     if place is not None and place.suffix.lower() not in endings:
         raise InputError(f"--out {place}: expected a name ending in {', '.join(endings)}")
     compared = compare_runs(options.runs)
-    # Directory names may be wider than a terminal, so runs have numbers.
-    numbered = compared._replace(labels=tuple(str(i + 1) for i in range(len(compared.runs))))
-    for number, row in zip(numbered.labels, compared.verdicts.rows, strict=True):
-        label, model, method, status, verdict, adequate = row
-        print_text(
-            f"{number}: {label}: {model} by {method}, {status}. {verdict} adequate: {adequate}"
-        )
-    print_page_table(numbered.estimates)
-    # Output, flights and metric name a row, also where a narrow terminal splits the table.
-    print_page_table(numbered.agreement, keys=3)
-    for found in numbered.notes:
-        print_text(f"! {found.sentence}")
-    if place is None:
-        return DONE
-    run_directory.require_place(place, f"--out {place}")
-    with run_directory.whole_file(place, f"--out {place}") as temporary:
-        if place.suffix.lower() == ".html":
-            from heli_jax.report.compared_runs import write_page
-
-            write_page(temporary, compared)
-        else:
-            temporary.write_text(compared.to_csv(), encoding="utf-8")
-    options.say(f"wrote {place}")
+    runs.print_compared(compared)
+    if place is not None:
+        runs.write_compared(place, compared)
+        options.say(f"wrote {place}")
     return DONE
 
 
@@ -760,52 +634,21 @@ def _keys(options: argparse.Namespace) -> int:
         if not options.fit and matching(document.fit_keys(), options.pattern):
             hint = f"; it is a key of fit.json: heli-jax keys --fit {shlex.quote(options.pattern)}"
         raise InputError(f"keys: no key and no meaning contains {options.pattern}{hint}")
-    # Longer lines are hard to read.
-    width, indent = min(shutil.get_terminal_size().columns, 100), "    "
-    for key in found:
-        default = key.default and f"default {key.default}"
-        default = "has to be there" if default is None else default
-        # A default of null means only that the key may be left out.
-        default = "optional" if default == "default null" else default
-        head = "; ".join(filter(None, (f"{key.path}: {key.kind}", default)))
-        for text, first in ((head, ""), (key.meaning, indent)):
-            lines = textwrap.wrap(
-                text, width, initial_indent=first, subsequent_indent=indent, break_on_hyphens=False
-            )
-            print(*lines, sep="\n", end="\n" if lines else "")
+    terminal.print_keys(found)
     return DONE
 
 
 def _models(options: argparse.Namespace) -> int:
-    _prepare_jax()
-    from heli_jax import models, summaries
-    from heli_jax.cli.described import described
+    prepare_jax()
+    from heli_jax.cli import models
 
     if options.config is not None:
-        from heli_jax.new_config.design_start import write_design_config
-
         if options.name is None:
             raise InputError("--config: expected the NAME of a linear model too, got none")
-        write_design_config(options.name, Path(options.config))
+        models.write_design_config(options.name, Path(options.config))
         options.say(f"wrote {options.config}; next: heli-jax design {options.config}")
-        return DONE
-    if options.name is None:
-        listed = models.listed()
-        width = max(map(len, listed))
-        lines = [f"{name:{width}}  {words}" for name, words in listed.items()]
-        print(json.dumps(listed, indent=1)) if options.json else print_text("\n".join(lines))
-        return DONE
-    title, tables = described(options.name)
-    if options.json:
-        content = {
-            words: [dict(zip(t.head, row, strict=True)) for row in t.rows]
-            for words, t in tables.items()
-        }
-        print(json.dumps({"model": title, **content}, indent=1))
     else:
-        print_text(title)
-        for words, t in tables.items():
-            print_text(summaries.as_text(words, t.head, t.rows))
+        models.print_models(options.name, as_json=options.json)
     return DONE
 
 

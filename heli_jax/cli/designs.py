@@ -9,8 +9,6 @@ from heli_jax.errors import InputError
 if TYPE_CHECKING:
     from heli_jax.design_workflow import DesignRun
 
-_LARGEST = 10.0
-"""Relative sd that is no wanted one."""
 _ROWS = 5
 """Manoeuvres of the library in the table."""
 
@@ -23,21 +21,19 @@ def wanted_sds(texts: list[str]) -> dict[str, float]:
     """
     wanted = wanted_of(texts)
     for name, one in wanted.items():
-        if not (one.relative and one.sd < _LARGEST):
+        if not one.relative:
             raise InputError(f"--for {name!r:.60}: expected NAME=PERCENT, such as a=2%")
     return {name: one.sd for name, one in wanted.items()}
 
 
 def print_design(run: "DesignRun", *, verbose: bool = False) -> None:
     """Print the design: what it gains, the inputs compared, and doubts."""
-    from heli_jax.report.design import doubts, manoeuvres_table, summary
+    from heli_jax.report.design import doubts, known_differences, manoeuvres_table, summary
 
     print_text(summary(run))
     print_page_table(manoeuvres_table(run, len(run.design.library) if verbose else _ROWS))
-    for i, known in enumerate(run.design.optimum.known):
-        if known:
-            words = ", ".join(f"{n} = {v:.4g}" for n, v in known.items())
-            print_text(f"run {i + 1}: {words}")
+    for words in known_differences(run):
+        print_text(words)
     for words in doubts(run):
         print_text(f"! {words}")
     if run.directory is not None:

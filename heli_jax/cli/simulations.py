@@ -1,5 +1,6 @@
 """Output of `simulate`, `sweep` and studies, without estimation."""
 
+import contextlib
 import json
 import math
 import sys
@@ -11,6 +12,7 @@ import numpy as np
 
 from heli_jax import run_directory
 from heli_jax.cli.terminal import print_table, print_text
+from heli_jax.errors import InputError
 from heli_jax.flights import write as tables
 from heli_jax.numbers import rounded, terse
 
@@ -165,3 +167,18 @@ def _print_scatter(flat: "xr.Dataset", parameters: list[str]) -> None:
     if rows:
         head = ("parameter", "fits", "lowest", "median", "highest", "sd between fits")
         print_table((*head, "median sd of a fit", "unit"), rows)
+
+
+# Any: dask.distributed is an extra, and only `sweeps.cluster` names its classes.
+def dask_client(scheduler: str | None) -> contextlib.AbstractContextManager[Any]:
+    """Return a dask client of --scheduler, if it is stated."""
+    if scheduler is None:
+        return contextlib.nullcontext()
+    try:
+        from heli_jax.sweeps.cluster import connected
+    except ImportError as e:
+        raise InputError(
+            "--scheduler: dask.distributed is not installed, expected the extra distributed: "
+            "pip install 'heli_jax[distributed]'"
+        ) from e
+    return connected(scheduler)

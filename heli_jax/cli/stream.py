@@ -2,14 +2,12 @@
 
 import contextlib
 import os
-import re
 import select
 import signal
 import sys
-import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -19,27 +17,28 @@ import numpy as np
 
 from heli_jax import config as configuration
 from heli_jax import naming, units
-from heli_jax.cli.terminal import plain_text, print_table, print_text
+from heli_jax.cli.terminal import print_table, print_text
 from heli_jax.cli.wanted import Wanted
 from heli_jax.config import Experiment
 from heli_jax.config.logs import clock_signal, first_signals, require_flights, with_log
 from heli_jax.errors import InputError, located
-from heli_jax.flights.flight import Signal
+from heli_jax.flights.flight import Flight, Signal
 from heli_jax.flights.grid import Grid as EvenClock
 from heli_jax.flights.grid import rounding_of, uniform_grid
+from heli_jax.identification.identifiability.verdict import exponents
 from heli_jax.identification.problem import Problem
 from heli_jax.numbers import terse
 from heli_jax.regular_file import open_regular
 from heli_jax.stream import Known, Sample, State, estimate, follow, init
-from heli_jax.stream.rows import Grid, Rows, Sorter
+from heli_jax.stream.rows import Row, Sorter
 from heli_jax.stream.steps import BLOCK
 
 _PIECE, _TOGETHER = 1 << 18, 64
 """Bytes that are read at once, and samples that one program takes."""
+_GAP = 3.5
+"""Step from which on a log is split at its gaps [usual steps]."""
 _PAUSE, _EVERY = 0.1, 0.5
 """Pause before more is read, and time between two screens [s]."""
-_GAP = 3.5
-"""Step from which on a log is split for the fit [usual steps]."""
 
 
 @contextlib.contextmanager
@@ -63,10 +62,9 @@ def require_free(experiment: Experiment, wanted: Mapping[str, Wanted]) -> None:
     """Refuse wanted sds of what is not estimated."""
     fit = experiment.config.fit
     free = [] if fit is None else [*fit.free, *["time_shift"] * fit.nuisance.time_shift]
-    for name in wanted:
-        if not all(n in free for n in re.split(r"[/*]", name, maxsplit=1)):
-            known = ", ".join(free)
-            raise InputError(f"--for: {name!r:.60} is not free, expected {known}, or a quotient")
+    with located("--for"):
+        for name in wanted:
+            exponents(name, free)
 
 
 # Sources of bytes: a growing file, standard input, or messages as rows of a table.
@@ -124,33 +122,34 @@ def _messages(
         raise InputError(f"mavlink:{device}: cannot be opened ({e})") from e
     kinds = sorted({n.partition(".")[0] for n in names})
     scale = units.factor(time.unit, "s")
-    yield (",".join([time.name, *names]) + "\n").encode()
-    while not stopped():
-        message = link.recv_match(type=kinds, blocking=not until_end, timeout=_PAUSE)
-        if message is None:
-            if until_end:
-                return
-            yield b""
-            continue
-        stamp = getattr(message, "time_boot_ms", None)
-        seconds = (
-            1e-3 * stamp if stamp is not None else 1e-6 * getattr(message, "time_usec", np.nan)
-        )
-        if not np.isfinite(seconds):
-            raise InputError(f"mavlink:{device}: {message.get_type()} has no time")
-        cells = []
-        for n in names:
-            kind, _, field = n.partition(".")
-            value = getattr(message, field, None) if kind == message.get_type() else None
-            cells.append("" if value is None else repr(float(value)))
-        yield (",".join([repr(seconds / scale), *cells]) + "\n").encode()
+    with contextlib.closing(link):
+        yield (",".join([time.name, *names]) + "\n").encode()
+        while not stopped():
+            message = link.recv_match(type=kinds, blocking=not until_end, timeout=_PAUSE)
+            if message is None:
+                if until_end:
+                    return
+                yield b""
+                continue
+            stamp = getattr(message, "time_boot_ms", None)
+            seconds = (
+                1e-3 * stamp if stamp is not None else 1e-6 * getattr(message, "time_usec", np.nan)
+            )
+            if not np.isfinite(seconds):
+                raise InputError(f"mavlink:{device}: {message.get_type()} has no time")
+            cells = []
+            for n in names:
+                kind, _, field = n.partition(".")
+                value = getattr(message, field, None) if kind == message.get_type() else None
+                cells.append("" if value is None else repr(float(value)))
+            yield (",".join([repr(seconds / scale), *cells]) + "\n").encode()
 
 
-# From rows to samples.
+# From rows to estimates. When a block must be complete, the log is read anew as a fit reads it.
 
 
 class Follower:
-    """Follows the rows of a table: sorts them, keeps them in a log, and takes their samples."""
+    """Keeps the rows of a table in a log, in order, and estimates from their blocks."""
 
     def __init__(self, experiment: Experiment, place: str, log: Path, block: float) -> None:
         require_flights(experiment)
@@ -161,86 +160,88 @@ class Follower:
                 f"{experiment.path}: flights[0].signals.time: missing, expected the column of "
                 "times of a table"
             )
-        inputs = [s.signal for s in signals.inputs.values() if s.constant is None and s.signal]
-        outputs = [s.signal for s in signals.outputs.values() if s.signal]
-        self.names = list(dict.fromkeys([*inputs, *outputs]))
-        self._inputs = len({*inputs})
+        each = (*signals.inputs.values(), *signals.outputs.values())
+        self.names = list(dict.fromkeys(s.signal for s in each if s.signal))
+        self._has_inputs = any(s.signal for s in signals.inputs.values())
         self.experiment, self.time, self.log, self.block = experiment, clock, log, block
         self.sorter = Sorter(place, clock, self.names)
         self.problem: Problem | None = None
         self.state: State | None = None
         self.known: Known | None = None
-        self._first, self._stamps = Rows(np.zeros(0), np.zeros((0, len(self.names))), []), []
-        self._length, self._grid = block, None
+        self._stamps: list[float] = []
+        self._due, self._taken = block, np.nan
         # States are large, so each step writes over the one before.
         self._follow = jax.jit(follow, donate_argnums=0)
 
     def take(self, data: bytes) -> None:
         """Take further bytes."""
-        self._rows(self.sorter.take(data))
+        self._keep(self.sorter.take(data))
 
     def finish(self) -> None:
         """Take what was held back for later rows."""
-        self._rows(self.sorter.take(b""))
-        self._rows(self.sorter.finish(), last=True)
+        self._keep(self.sorter.take(b""))
+        self._keep(self.sorter.finish())
 
-    def _rows(self, rows: Rows, *, last: bool = False) -> None:
-        if rows.lines:
-            self.log.parent.mkdir(parents=True, exist_ok=True)
-            with self.log.open("ab") as file:
-                head = b"" if self._stamps else self.sorter.head
-                file.write(head + b"\n".join(rows.lines) + b"\n")
-            self._stamps.append(rows.seconds)
-        if self._grid is None:
-            old = self._first
-            self._first = Rows(
-                np.concatenate([old.seconds, rows.seconds]),
-                np.concatenate([old.values, rows.values]),
-                old.lines + rows.lines,
-            )
-            if not self._begin(last):
-                return
-            assert self._grid is not None
-            rows, self._first = self._first, self._first._replace(lines=[])
-        self._samples(self._grid.take(rows, last=last))
+    def _keep(self, rows: list[Row]) -> None:
+        if not rows:
+            return
+        self.log.parent.mkdir(parents=True, exist_ok=True)
+        with self.log.open("ab") as file:
+            file.write(b"" if self._stamps else self.sorter.head)
+            file.writelines(line + b"\n" for _, line in rows)
+        self._stamps += [seconds for seconds, _ in rows]
 
-    def _begin(self, last: bool) -> bool:
-        """Make the problem of the first rows once they are long enough; return if it is made."""
-        seconds = self._first.seconds
-        if not seconds.size or not (last or seconds[-1] - seconds[0] >= self._length):
-            return False
-        n = int(np.searchsorted(seconds, seconds[0] + self._length, side="right"))
-        first = self._first.part(0, n)
-        moves = [np.unique(v[np.isfinite(v)]).size > 1 for v in first.values.T]
-        begun = any(moves[self._inputs :]) and any([not self._inputs, *moves[: self._inputs]])
-        if not last and not begun:
-            # On the ground nothing moves yet.
-            self._length += self.block
-            return False
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "first.csv"
-            path.write_bytes(self.sorter.head + b"\n".join(first.lines) + b"\n")
-            experiment, even = self.as_fitted(path, seconds[:n])
-            try:
-                problem = configuration.problem(experiment)
-            except InputError as e:
-                raise InputError(str(e).replace(str(path), self.sorter.path)) from e
-        with located(f"{self.experiment.path}: fit"):
-            problem = configuration.by_method(experiment, problem, "frequency-error")
-            self.state = init(problem, block=self.block)
-        self.problem = problem
-        self._grid = Grid(problem.training[0], self.names, first, even=even)
-        return True
-
-    def as_fitted(self, path: Path, seconds: np.ndarray | None = None) -> tuple[Experiment, bool]:
-        """Return the configuration with a log in place of its own, and if its clock is even.
+    def update(self, *, last: bool = False) -> bool:
+        """Estimate anew if a block was completed since; return if so.
 
         Args:
-            path: the log.
-            seconds: its times (N,) [s]; default: those of all rows.
+            last: True if no row follows.
         """
-        seconds = np.concatenate(self._stamps) if seconds is None else seconds
-        experiment = with_log(self.experiment, str(path))
+        elapsed = self._stamps[-1] - self._stamps[0] if self._stamps else 0.0
+        if not self._stamps or (elapsed < self._due and not last):
+            return False
+        self._due = elapsed + self.block
+        try:
+            flights = self._read(last)
+        except InputError as e:
+            raise InputError(str(e).replace(str(self.log), self.sorter.path)) from e
+        if self.problem is None or self.state is None:
+            return False
+        self._samples(flights)
+        left = self.state.length - int(self.state.within) + self.state.inputs.shape[0]
+        self._due = elapsed + left * self.state.dt
+        before = 0 if self.known is None else self.known.blocks
+        if int(self.state.blocks) == before:
+            return False
+        self.known = estimate(self.problem, self.state, self.known)
+        return True
+
+    def _read(self, last: bool) -> Sequence[Flight]:
+        """Return the flights of the log; make the problem once they move."""
+        experiment = self.as_fitted()
+        config = experiment.config
+        whole = config.flights[0].model_copy(update={"window": None})
+        experiment = experiment._replace(config=config.model_copy(update={"flights": [whole]}))
+        flights = configuration.read_flights(experiment)
+
+        def moves(signals: Iterable[np.ndarray]) -> bool:
+            return any(np.unique(v[np.isfinite(v)]).size > 1 for v in signals)
+
+        begun = moves(v for f in flights for v in f.outputs.values())
+        if self._has_inputs:
+            begun = begun and moves(v for f in flights for v in f.inputs.values())
+        # On the ground nothing moves yet.
+        if self.problem is None and (last or begun):
+            problem = configuration.problem(experiment)
+            with located(f"{self.experiment.path}: fit"):
+                self.problem = configuration.by_method(experiment, problem, "frequency-error")
+                self.state = init(self.problem, block=self.block)
+        return flights
+
+    def as_fitted(self) -> Experiment:
+        """Return the configuration with what was received as its log."""
+        seconds = np.array(self._stamps)
+        experiment = with_log(self.experiment, str(self.log))
         flight = experiment.config.flights[0]
         distinct = np.unique(seconds)
         if distinct.size < 2:
@@ -248,34 +249,41 @@ class Follower:
         steps = np.diff(distinct)
         usual = float(np.median(steps))
         clock = uniform_grid(distinct, rounding_of(distinct)) if distinct.size > 2 else None
-        even = flight.rate is None and distinct.size == seconds.size
-        if even and not isinstance(clock, EvenClock):
-            near = np.abs(steps / usual - np.round(steps / usual)).max() < 0.1
-            flight = flight.model_copy(update={"rate": 1.0 / usual})
-            even = bool(near)
+        even = distinct.size == seconds.size and isinstance(clock, EvenClock)
+        if flight.rate is None and not even:
+            # The grid stays when a first gap makes the clock uneven.
+            step = usual if self.problem is None else self.problem.training[0].dt
+            flight = flight.model_copy(update={"rate": 1.0 / step})
         if steps.max() > _GAP * usual:
             flight = flight.model_copy(update={"gaps": "split"})
         config = experiment.config.model_copy(update={"flights": [flight]})
-        return experiment._replace(config=config), even
+        return experiment._replace(config=config)
 
-    def _samples(self, samples: Sample) -> None:
-        assert self.state is not None
-        at, count = 0, len(samples.inputs)
-        while at < count:
-            n = _TOGETHER if count - at >= _TOGETHER else 1
-            piece = Sample(*(jnp.asarray(v[at : at + n]) for v in samples))
-            self.state, _ = self._follow(self.state, piece)
-            at += n
-
-    def update(self) -> bool:
-        """Estimate anew if a block was completed since; return if so."""
-        if self.state is None or self.problem is None:
-            return False
-        before = 0 if self.known is None else self.known.blocks
-        if int(self.state.blocks) == before:
-            return False
-        self.known = estimate(self.problem, self.state, self.known)
-        return True
+    def _samples(self, flights: Sequence[Flight]) -> None:
+        """Take the samples after the last one that was taken, a missing one for each gap."""
+        assert self.problem is not None
+        inputs = naming.names(self.problem.model.Inputs)
+        outputs = sorted(self.problem.training[0].outputs)
+        for flight in flights:
+            seconds = flight.t0 + flight.dt * np.arange(flight.n_samples)
+            new = ~(seconds < self._taken + 0.5 * flight.dt)
+            if not new.any():
+                continue
+            missing = np.full(flight.n_samples, np.nan)
+            samples = Sample(
+                np.stack([flight.inputs[n] for n in inputs], axis=1)[new],
+                np.stack([flight.outputs.get(n, missing) for n in outputs], axis=1)[new],
+            )
+            if seconds[new][0] > self._taken + 1.5 * flight.dt:
+                gap = Sample(*(np.full((1, v.shape[1]), np.nan) for v in samples))
+                samples = Sample(*map(np.concatenate, zip(gap, samples, strict=True)))
+            self._taken = float(seconds[-1])
+            at, count = 0, len(samples.inputs)
+            while at < count:
+                n = _TOGETHER if count - at >= _TOGETHER else 1
+                piece = Sample(*(jnp.asarray(v[at : at + n]) for v in samples))
+                self.state, _ = self._follow(self.state, piece)
+                at += n
 
 
 # The screen.
@@ -321,7 +329,7 @@ def lines_of(follower: Follower) -> list[str]:
         return ["waiting for the first seconds in which all signals move"]
     samples = int(state.samples)
     lines = [
-        f"{samples} samples, {samples * state.dt:.1f} s; {int(state.missing)} missing, "
+        f"{samples} samples, {samples * state.dt:.1f} s; {int(state.missing)} gaps, "
         f"{sorter.late} too late, {sorter.repeated} repeated; {int(state.blocks)} blocks of "
         f"{state.length * state.dt:.3g} s"
     ]
@@ -331,42 +339,14 @@ def lines_of(follower: Follower) -> list[str]:
     return lines
 
 
-class _Screen:
-    """One screen that is drawn anew, or without a terminal a line for each estimate."""
-
-    def __init__(self, follower: Follower, wanted: Mapping[str, Wanted]) -> None:
-        self.follower, self.wanted, self.live = follower, wanted, None
-
-    def __enter__(self) -> "_Screen":
-        if sys.stdout.isatty():
-            from rich.live import Live
-
-            self.live = Live(get_renderable=self._drawn, auto_refresh=False)
-            self.live.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self.live is not None:
-            self.live.stop()
-
-    def _drawn(self) -> Any:
-        from rich.console import Group
-        from rich.table import Table
-        from rich.text import Text
-
-        table = Table(*HEAD, box=None, pad_edge=False)
-        for row in rows_of(self.follower, self.wanted):
-            table.add_row(*(Text(plain_text(cell)) for cell in row))
-        return Group(table, *(Text(plain_text(line)) for line in lines_of(self.follower)))
-
-    def show(self, *, changed: bool) -> None:
-        if self.live is not None:
-            self.live.refresh()
-        elif changed:
-            print_table(HEAD, rows_of(self.follower, self.wanted))
-            for line in lines_of(self.follower):
-                print_text(line)
-            sys.stdout.flush()
+def _show(follower: Follower, wanted: Mapping[str, Wanted]) -> None:
+    """Print what is known, on a terminal in place of what was printed before."""
+    if sys.stdout.isatty():
+        sys.stdout.write("\x1b[H\x1b[J")
+    print_table(HEAD, rows_of(follower, wanted))
+    for line in lines_of(follower):
+        print_text(line)
+    sys.stdout.flush()
 
 
 def run_stream(
@@ -397,15 +377,15 @@ def run_stream(
     follower = Follower(experiment, place, log, block or BLOCK)
     shown = 0.0
     arrives = received(place, until_end, stopped, follower.time, follower.names)
-    with _Screen(follower, wanted) as screen:
-        for data in arrives:
-            follower.take(data)
-            changed = follower.update()
-            if changed or time.monotonic() - shown > _EVERY:
-                screen.show(changed=changed)
-                shown = time.monotonic()
-        follower.finish()
-        screen.show(changed=follower.update())
+    for data in arrives:
+        follower.take(data)
+        due = sys.stdout.isatty() and time.monotonic() - shown > _EVERY
+        if follower.update() or due:
+            _show(follower, wanted)
+            shown = time.monotonic()
+    follower.finish()
+    if follower.update(last=True):
+        _show(follower, wanted)
     if not log.exists():
         raise InputError(f"{place}: no whole rows were received, expected a table with a header")
-    return follower.as_fitted(log)[0]
+    return follower.as_fitted()

@@ -16,6 +16,7 @@ from typing import Any, TextIO
 from heli_jax import stages
 from heli_jax.errors import shortened
 from heli_jax.numbers import plain_cell, terminal_sentence
+from heli_jax.schema_keys import Key
 from heli_jax.stages import Note, Stage
 
 type _Row = tuple[str, ...]
@@ -213,3 +214,20 @@ def _time(seconds: float) -> str:
     if seconds < 100:
         return f"{seconds:.0f} s"
     return f"{seconds // 3600:.0f}:{seconds // 60 % 60:02.0f}:{seconds % 60:02.0f}"
+
+
+def print_keys(found: Sequence[Key]) -> None:
+    """Print keys of a file with their meaning."""
+    # Longer lines are hard to read.
+    width, indent = min(shutil.get_terminal_size().columns, 100), "    "
+    for key in found:
+        default = key.default and f"default {key.default}"
+        default = "has to be there" if default is None else default
+        # A default of null means only that the key may be left out.
+        default = "optional" if default == "default null" else default
+        head = "; ".join(filter(None, (f"{key.path}: {key.kind}", default)))
+        for text, first in ((head, ""), (key.meaning, indent)):
+            lines = textwrap.wrap(
+                text, width, initial_indent=first, subsequent_indent=indent, break_on_hyphens=False
+            )
+            print(*lines, sep="\n", end="\n" if lines else "")

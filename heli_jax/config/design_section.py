@@ -4,22 +4,14 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from heli_jax.config.section import Section
+from heli_jax.config.run_sections import ExcitedConfig
+from heli_jax.config.section import Finite, Positive, Section
 from heli_jax.identification.design.autopilots import ARDUPILOT
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
-
-class DesignedInputConfig(Section):
+class DesignedInputConfig(ExcitedConfig):
     """Limits of an input that is excited."""
 
-    amplitude: Positive
-    """largest deflection, in `unit`"""
-    rate: Positive | None = None
-    """largest rate of change, in `unit` a second; default: steps"""
-    unit: str | None = None
-    """unit; default the model's SI unit"""
     set_point: str | None = None
     """state of `feedback` to whose set point the excitation is added, in the state's unit; default:
     it is added to the input itself"""

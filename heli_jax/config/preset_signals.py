@@ -164,6 +164,9 @@ class _Search(NamedTuple):
         if chosen is None:
             problem = f"{name}: {why}, expected it by name"
             raise InputError(f"{self.where}.inputs: {problem}{self.channels_in_words()}")
+        if chosen.unit == "1" and naming.unit(model.Inputs, name) not in (None, "1"):
+            problem = f"{name}: the preset has parts of full travel, and the model another unit"
+            raise InputError(f"{self.where}.inputs: {problem}, expected it by name with a scale")
         # Two inversions cancel.
         return Alternative(**{**vars(chosen), "invert": chosen.invert != known.invert})
 

@@ -5,21 +5,26 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from heli_jax.config.section import Finite, Positive, Section
+from heli_jax.simulation.inputs import KINDS
 
 
-class StickConfig(Section):
-    """Movement of one input in a simulation."""
+class ExcitedConfig(Section):
+    """Limits of an excitation."""
 
-    kind: Literal["random-steps", "doublet", "3-2-1-1", "prbs", "chirp", "multisine", "neutral"] = (
-        "random-steps"
-    )
-    """kind of motion"""
     amplitude: Positive
     """largest deflection, in `unit`"""
     unit: str | None = None
     """unit; default the model's SI unit"""
     rate: Positive | None = None
-    """largest rate of change, in `unit` a second; steps become ramps, sines smaller"""
+    """largest rate of change, in `unit` a second; steps become ramps, sines smaller; default:
+    none"""
+
+
+class StickConfig(ExcitedConfig):
+    """Movement of one input in a simulation."""
+
+    kind: Literal[tuple(k.name for k in KINDS)] = "random-steps"  # pyright: ignore[reportInvalidTypeForm]
+    """kind of motion"""
     hold: tuple[Positive, Positive] = (0.3, 2.0)
     """shortest and longest step of random-steps [s]"""
     step: Positive = 0.3

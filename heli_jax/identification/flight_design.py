@@ -20,10 +20,11 @@ from jaxtyping import Array, Float
 from heli_jax import naming
 from heli_jax.errors import nearest
 from heli_jax.identification.design.accuracy import DETERMINES, unstated_gusts
-from heli_jax.identification.design.information import Experiment, Feedback, planned
+from heli_jax.identification.design.information import Experiment, Feedback, Outcome, planned
 from heli_jax.identification.design.library import Manoeuvre, manoeuvres
 from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.noise_covariance import first_noise, likely_gusts
+from heli_jax.identification.identifiability.verdict import exponents
 from heli_jax.identification.problem import Free, Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Solution, layout_of
@@ -78,6 +79,8 @@ class Rated(NamedTuple):
     """1 - largest value over limit, by limit."""
     covariance: Float[np.ndarray, "v p p"]
     """Covariance of the parameters in relative coordinates, for each vehicle."""
+    motion: tuple[dict[str, np.ndarray], ...]
+    """Outputs and states (N,) of the first vehicle in calm air, by flight, SI."""
     manoeuvre: Manoeuvre | None = None
     """Manoeuvre of the library that it is, if any."""
 
@@ -96,8 +99,6 @@ class Design(NamedTuple):
     library: tuple[Rated, ...]
     """The best first."""
     optimum: Rated
-    motion: tuple[dict[str, np.ndarray], ...]
-    """Outputs and states (N,) of the optimum in calm air, by flight, SI."""
     own: Rated | None
     """The user's inputs, if any."""
     converged: bool
@@ -118,8 +119,6 @@ class Design(NamedTuple):
             ValueError: a factor is no free parameter.
         """
         powers = exponents(product, tuple(rated.sd))
-        if powers is None:
-            raise ValueError(f"expected a parameter or a product, got criterion {product}")
         if not np.isfinite(rated.value):
             return math.inf
         # Repeated flights are independent, so their information adds up.
@@ -216,7 +215,6 @@ def design(
         duration=sum(f.duration for f in problem.training),
         library=tuple(rated),
         optimum=optimum,
-        motion=search.motion(optimum),
         own=None if own is None else search.own(own),
         converged=converged,
         steps=steps,
@@ -247,10 +245,11 @@ def _check(
     for name, value in (*sizes, *limits.motion.items()):
         if not value > 0:
             raise ValueError(f"limits: {name}: expected more than zero, got {value:g}")
-    try:
-        exponents(criterion, tuple(problem.free))
-    except ValueError as e:
-        raise ValueError(f"criterion: expected D, A, E, or a product; {e}") from e
+    if criterion not in CRITERIA:
+        try:
+            exponents(criterion, tuple(problem.free))
+        except ValueError as e:
+            raise ValueError(f"criterion: expected D, A, E, or a product; {e}") from e
     if len(differences) != len(problem.training):
         raise ValueError(
             f"differences: expected one for each of {len(problem.training)} flights, got "
@@ -264,28 +263,6 @@ def _check(
                 raise ValueError(
                     f"differences: {name}: expected the lowest value first, got {low:g}, {high:g}"
                 )
-
-
-def exponents(criterion: str, free: Sequence[str]) -> Float[np.ndarray, " p"] | None:
-    """Return the exponents of a product such as `a/Ixx`; None for a criterion by letter.
-
-    Raises:
-        ValueError: a factor is no free parameter.
-    """
-    if criterion in CRITERIA:
-        return None
-    powers = np.zeros(len(free))
-    for i, part in enumerate(criterion.split("/")):
-        for name in part.split("*"):
-            if name.strip() == "1" and i == 0:
-                continue
-            if name.strip() not in free:
-                raise ValueError(
-                    f"expected {', '.join(free)} or a product such as {'/'.join(free[:2])}, got "
-                    f"{criterion!r}"
-                )
-            powers[free.index(name.strip())] += -1.0 if i else 1.0
-    return powers
 
 
 def _points(problem: Problem, z: np.ndarray, vehicles: int, seed: int) -> Float[np.ndarray, "v q"]:
@@ -325,7 +302,7 @@ class _Search:
     ) -> None:
         self.experiment, self.limits, self.criterion = experiment, limits, criterion
         problem = experiment.problem
-        self.powers = exponents(criterion, experiment.parameters)
+        self.powers = None if criterion in CRITERIA else exponents(criterion, experiment.parameters)
         p = len(experiment.parameters)
         self.priors = np.square(np.asarray(experiment.vehicles.rows)[:, :p, :p])
         self.flights = problem.training
@@ -353,8 +330,7 @@ class _Search:
             self.places.append(by_input)
         self.nodes, self.size = at, at + len(self.varied)
         self.rated = jax.jit(self._rated)
-        self.smooth = jax.jit(self._smooth_ratios)
-        self.augmented = jax.jit(jax.value_and_grad(self._augmented))
+        self.augmented = jax.jit(jax.value_and_grad(self._augmented, has_aux=True))
 
     def excitations(self, x: Any) -> tuple[dict[str, Any], ...]:
         """Return the excitations (N,) by flight and input, SI."""
@@ -402,49 +378,30 @@ class _Search:
             return 0.5 * jnp.log(jnp.trace(C) / p)
         return 0.5 * jnp.log(jnp.linalg.eigvalsh(C)[-1])
 
-    def _value(self, x: Array) -> Array:
-        inputs, known = self.inputs(self.excitations(x)), self.known(x)
-        return jnp.mean(jax.vmap(self._of_covariance)(self.experiment.covariances(inputs, known)))
-
-    def _rated(self, inputs: Any, known: Any) -> tuple[Array, Array, dict[str, Array]]:
-        """Return the criterion, the covariances, and the largest motion."""
-        C = self.experiment.covariances(inputs, known)
-        value = jnp.mean(jax.vmap(self._of_covariance)(C))
-        return value, C, self._largest(inputs, known, jnp.max)
-
-    def _largest(
-        self, inputs: Any, known: Any, largest: Callable[[Array], Array]
-    ) -> dict[str, Array]:
-        """Return the largest |motion| over its limit, over all flights and vehicles."""
-        if not self.limits.motion:
-            return {}
-
-        def of_one(vehicle: Any) -> Any:
-            return self.experiment.flown(vehicle, inputs, known).motion
-
-        motion = jax.vmap(of_one)(self.experiment.vehicles)
-        return {
-            n: largest(jnp.concatenate([jnp.abs(m[n]).ravel() for m in motion]) / limit)
+    def _rated(
+        self, inputs: Any, known: Any, largest: Callable[[Array], Array] = jnp.max
+    ) -> tuple[Array, Outcome, Float[Array, " m"]]:
+        """Return the criterion, what the vehicles do, and the largest |motion| over its limit, over
+        all flights and vehicles."""
+        outcome = self.experiment.outcome(inputs, known)
+        value = jnp.mean(jax.vmap(self._of_covariance)(outcome.covariance))
+        ratios = [
+            largest(jnp.concatenate([jnp.abs(m[n]).ravel() for m in outcome.motion]) / limit)
             for n, limit in self.limits.motion.items()
-        }
+        ]
+        return value, outcome, jnp.array(ratios, value.dtype)
 
-    def _smooth_ratios(self, x: Array) -> Array:
-        inputs, known = self.inputs(self.excitations(x)), self.known(x)
+    def _augmented(self, x: Array, multipliers: Array, penalty: Array) -> tuple[Array, Array]:
+        """Return the criterion with an augmented Lagrangian of the limits, and their excess."""
 
         def smooth(ratios: Array) -> Array:
             return jax.scipy.special.logsumexp(_SHARP * ratios) / _SHARP
 
-        return jnp.stack(list(self._largest(inputs, known, smooth).values()))
-
-    def _augmented(self, x: Array, multipliers: Array, penalty: Array) -> Array:
-        """Return the criterion with an augmented Lagrangian of the limits."""
-        if not self.limits.motion:
-            return self._value(x)
-        excess = self._smooth_ratios(x) - 1.0
-        active = jnp.maximum(multipliers + penalty * excess, 0.0)
-        return self._value(x) + jnp.sum(jnp.square(active) - jnp.square(multipliers)) / (
-            2.0 * penalty
-        )
+        inputs, known = self.inputs(self.excitations(x)), self.known(x)
+        value, _, ratios = self._rated(inputs, known, smooth)
+        active = jnp.maximum(multipliers + penalty * (ratios - 1.0), 0.0)
+        added = jnp.sum(jnp.square(active) - jnp.square(multipliers)) / (2.0 * penalty)
+        return value + added, ratios - 1.0
 
     def rate(self, words: str, excitations: tuple[dict[str, np.ndarray], ...], known: Any) -> Rated:
         """Return a manoeuvre, made smaller until its motion is within the limits."""
@@ -462,20 +419,16 @@ class _Search:
         self, words: str, excitations: tuple[dict[str, np.ndarray], ...], known: Any
     ) -> Rated:
         """Return excitations with the accuracy they give, and their margins."""
-        value, C, ratios = jax.device_get(self.rated(self.inputs(excitations), known))
+        value, (C, motion), ratios = jax.device_get(self.rated(self.inputs(excitations), known))
         if not np.isfinite(C).all():
             value, C = np.inf, np.full(C.shape, np.inf)
         sd = np.sqrt(np.max(C.diagonal(axis1=1, axis2=2), axis=0))
         sd = {n: float(v) for n, v in zip(self.experiment.parameters, sd, strict=True)}
-        margins = {n: 1.0 - float(v) for n, v in ratios.items()} | self._input_margins(excitations)
+        margins = {n: 1.0 - float(v) for n, v in zip(self.limits.motion, ratios, strict=True)}
+        margins |= self._input_margins(excitations)
         known = tuple({n: float(v) for n, v in own.items()} for own in known)
-        return Rated(words, excitations, known, float(value), sd, margins, C)
-
-    def motion(self, rated: Rated) -> tuple[dict[str, np.ndarray], ...]:
-        """Return the outputs and states of the first vehicle."""
-        first = jax.tree.map(lambda v: v[0], self.experiment.vehicles)
-        flown = self.experiment.flown(first, self.inputs(rated.inputs), rated.known)
-        return jax.device_get(flown.motion)
+        first = tuple({n: v[0] for n, v in of_flight.items()} for of_flight in motion)
+        return Rated(words, excitations, known, float(value), sd, margins, C, first)
 
     def _input_margins(self, excitations: tuple[dict[str, np.ndarray], ...]) -> dict[str, float]:
         margins = {}
@@ -525,9 +478,14 @@ class _Search:
                 x[at] = 0.5 * own[name][k] / self.limits.inputs[name].amplitude
         bounds = [(-1.0, 1.0)] * self.nodes + [(0.0, 1.0)] * len(self.varied)
         multipliers, penalty, steps, before = np.zeros(len(self.limits.motion)), 10.0, 0, np.inf
+
+        def cost(x: np.ndarray, *lagrangian: Any) -> tuple[float, np.ndarray]:
+            (value, _), slope = self.augmented(x, *lagrangian)
+            return float(value), np.asarray(slope, float)
+
         for _ in range(_ROUNDS):
             found = minimize(
-                lambda x, *rest: tuple(np.asarray(v, float) for v in self.augmented(x, *rest)),
+                cost,
                 x,
                 args=(multipliers, penalty),
                 jac=True,
@@ -538,7 +496,7 @@ class _Search:
             x, steps = found.x, steps + int(found.nit)
             if not multipliers.size:
                 break
-            excess = np.asarray(self.smooth(x)) - 1.0
+            excess = np.asarray(self.augmented(x, multipliers, penalty)[0][1])
             value = float(found.fun)
             if steps >= max_steps or (
                 np.all(excess < _TOLERANCE) and abs(before - value) < _TOLERANCE

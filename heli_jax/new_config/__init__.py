@@ -88,6 +88,7 @@ def write_config(
         others=[f"{name}: {meaning}" for name, meaning in others],
         preset_outputs=from_preset,
         filtered=filtered,
+        unscaled={} if preset is None else text.unscaled_inputs(preset, chosen.model, read),
     )
     for path, words in {out: content, **paths}.items():
         with whole_file(path, str(path)) as temporary:

@@ -4,6 +4,7 @@ import json
 import math
 import re
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 from heli_jax import naming
@@ -11,7 +12,7 @@ from heli_jax.config.firmware_filters import logged_filters
 from heli_jax.dynamics.model import axes_of, vehicle_constants
 from heli_jax.flights.clock import ROWS
 from heli_jax.flights.describe import TimeInfo
-from heli_jax.flights.preset import Alternative, choose, model_outputs, preset
+from heli_jax.flights.preset import Alternative, choose, model_inputs, model_outputs, preset
 from heli_jax.new_config.guess import Guess
 from heli_jax.new_config.logs import Log
 from heli_jax.new_config.rate import two_digits
@@ -72,6 +73,23 @@ def filtered_outputs(
     return result
 
 
+def unscaled_inputs(name: str, model: Any, log: Log) -> dict[str, Alternative]:
+    """Return the inputs that a preset has in parts of full travel, and the model as an angle.
+
+    Args:
+        name: name of the preset.
+    """
+    table, known, found = preset(name).signals, model_inputs(), dict[str, Alternative]()
+    for n in naming.names(model.Inputs):
+        if log.autopilot is None or n not in known or naming.unit(model.Inputs, n) in (None, "1"):
+            continue
+        chosen = choose(log.autopilot, table.get(known[n].command, ()))
+        if chosen is not None and chosen.unit == "1":
+            # Two inversions cancel.
+            found[n] = replace(chosen, invert=chosen.invert != known[n].invert)
+    return found
+
+
 class Chosen(NamedTuple):
     """The model, its name in a configuration, and the reason if it was not stated."""
 
@@ -120,6 +138,7 @@ def configuration(
     others: Sequence[str] = (),
     preset_outputs: Sequence[str] = (),
     filtered: Mapping[str, Filtered] = {},
+    unscaled: Mapping[str, Alternative] = {},
 ) -> str:
     """Return the configuration as text.
 
@@ -134,6 +153,7 @@ def configuration(
         others: other models of the axis.
         preset_outputs: outputs to take from the preset; all if empty.
         filtered: filtered outputs of the preset.
+        unscaled: inputs of the preset as from `unscaled_inputs`.
     """
     lines = [
         f"# Made from {_comment(log)}. Check the lines marked GUESS.",
@@ -151,7 +171,7 @@ def configuration(
     if preset is not None:
         lines += [
             "    # window: auto               # or [first, last] s: the most informative parts",
-            *_preset(preset, preset_outputs, filtered),
+            *_preset(chosen.model, preset, preset_outputs, filtered, unscaled),
         ]
     else:
         assert signals is not None
@@ -284,9 +304,15 @@ def _time(time: TimeInfo) -> str:
     return f"      time: {{{counter}rate: {time.counted:.10g}}}"
 
 
-def _preset(preset: str, outputs: Sequence[str], filtered: Mapping[str, Filtered]) -> list[str]:
+def _preset(
+    model: Any,
+    preset: str,
+    outputs: Sequence[str],
+    filtered: Mapping[str, Filtered],
+    unscaled: Mapping[str, Alternative],
+) -> list[str]:
     known = "# heli-jax info shows the channels"
-    if not outputs and not filtered:
+    if not outputs and not filtered and not unscaled:
         return [f"    signals: {{preset: {preset}}}   {known}"]
     lines = [f"    signals:                     {known}", f"      preset: {preset}"]
     if outputs:
@@ -295,16 +321,29 @@ def _preset(preset: str, outputs: Sequence[str], filtered: Mapping[str, Filtered
             "      # and filter-error assumes white noise.",
             f"      preset_outputs: [{', '.join(outputs)}]",
         ]
+    if unscaled:
+        lines.append("      inputs:")
+    for name, signal in unscaled.items():
+        unit = naming.unit(model.Inputs, name) or "1"
+        signal = replace(signal, unit=unit)
+        lines += [
+            f"        # {name}: the log has parts of full travel; scale: {unit} at full travel",
+            f"        {name}: {{{', '.join(_keys(signal))}, scale: {EDIT}}}",
+        ]
     if filtered:
         lines.append("      outputs:                   # with the autopilot's filters in the model")
     for name, (signal, settings) in filtered.items():
-        keys = [f"signal: {_value(signal.channel)}", f"unit: {_value(signal.unit)}"]
-        keys += [f"offset: {signal.offset:g}"] * bool(signal.offset)
-        keys += [f"scale: {signal.scale:g}"] * (signal.scale != 1.0)
-        keys += ["invert: true"] * signal.invert
+        keys = [*_keys(signal), *[f"scale: {signal.scale:g}"] * (signal.scale != 1.0)]
         lines.append(f"        # {name}: {_comment(settings)}")
         lines.append(f"        {name}: {{{', '.join(keys)}, filter: from log}}")
     return lines
+
+
+def _keys(signal: Alternative) -> list[str]:
+    """Return the keys of a signal without its scale."""
+    keys = [f"signal: {_value(signal.channel)}", f"unit: {_value(signal.unit)}"]
+    keys += [f"offset: {signal.offset:g}"] * bool(signal.offset)
+    return keys + ["invert: true"] * signal.invert
 
 
 def _left_out(wandering: Mapping[str, Guess]) -> list[str]:

@@ -2,7 +2,6 @@
 
 import functools
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,12 +32,6 @@ _GAIN = 1e-3
 """Share of the sd below which an optimum is no better than the library."""
 _ROWS = 12
 """Manoeuvres of the library in a table."""
-
-
-def verdict(rated: Rated) -> str:
-    """Return in words which parameters a manoeuvre determines."""
-    lost = rated.undetermined
-    return f"not determined: {', '.join(lost)}" if lost else "all determined"
 
 
 def manoeuvres_table(run: Any, most: int = _ROWS) -> Table:
@@ -83,6 +76,15 @@ def summary(run: Any) -> str:
     return f"The optimised input lowers {what} by {_percent(gain)} against {best.words}."
 
 
+def known_differences(run: Any) -> list[str]:
+    """Return the differences that the design chose, a sentence for each run that has some."""
+    return [
+        f"Run {i + 1}: {', '.join(f'{n} = {number(v)}' for n, v in own.items())}"
+        for i, own in enumerate(run.design.optimum.known)
+        if own
+    ]
+
+
 def write_design(folder: Path, run: Any, config: str) -> None:
     """Write design.json, input.csv, report.html and figures/ of a design."""
     columns = input_columns(run)
@@ -103,10 +105,7 @@ def write_design(folder: Path, run: Any, config: str) -> None:
         summary=summary(run),
         doubts=doubts(run),
         table_of=manoeuvres_table(run),
-        known=[
-            ", ".join(f"{n} = {number(v)}" for n, v in own.items())
-            for own in run.design.optimum.known
-        ],
+        known=known_differences(run),
         pictures=[p for p in pictures if p is not None],
         numbers=numbers.content(),
         origin=origin(config, (*_FILES, *played)),
@@ -134,8 +133,6 @@ def doubts(run: Any) -> list[str]:
 
 def input_columns(run: Any) -> dict[str, np.ndarray]:
     """Return time and excitations in the units of `design.inputs`, one run after another."""
-    settings = run.config.config.design
-    assert settings is not None
     parts: list[dict[str, Any]] = []
     for i, (flight, own) in enumerate(
         zip(run.problem.training, run.design.optimum.inputs, strict=True)
@@ -144,7 +141,7 @@ def input_columns(run: Any) -> dict[str, np.ndarray]:
         if len(run.problem.training) > 1:
             part = {"run": np.full(flight.n_samples, i + 1)} | part
         for name, limit in run.limits.inputs.items():
-            scale = settings.inputs[name].amplitude / limit.amplitude
+            scale = run.settings.inputs[name].amplitude / limit.amplitude
             part[name] = scale * own[name]
         parts.append(part)
     return {n: np.concatenate([p[n] for p in parts]) for n in parts[0]}
@@ -155,10 +152,10 @@ def autopilot_files(run: Any) -> dict[str, str]:
 
     Autopilots play the best chirp of the library, a transmitter the optimised input.
     """
-    settings, flight = run.config.config.design, run.problem.training[0]
-    assert settings is not None
+    settings, flight = run.settings, run.problem.training[0]
     files: dict[str, str] = {}
-    chirps = [r for r in run.design.library if r.manoeuvre and r.manoeuvre.kind == "chirp"]
+    rated = [(r.inputs[0], r.manoeuvre) for r in run.design.library if r.manoeuvre]
+    chirp = next((one for one in rated if one[1].kind == "chirp"), None)
     duration = flight.n_samples * flight.dt / len(settings.inputs)
     shares = []
     for name, limit in settings.inputs.items():
@@ -166,16 +163,16 @@ def autopilot_files(run: Any) -> dict[str, str]:
         if limit.full_stick is not None:
             own = run.design.optimum.inputs[0][name]
             shares.append((name, scale * own / limit.full_stick))
-        if not chirps or chirps[0].manoeuvre is None:
+        if chirp is None:
             continue
-        size, chirp = float(np.max(np.abs(chirps[0].inputs[0][name]))), chirps[0].manoeuvre
+        size, band = float(np.max(np.abs(chirp[0][name]))), chirp[1].settings["band"]
         if limit.ardupilot is not None:
             # Mixer axes take shares of full output, the others degrees.
             size_there = size if limit.ardupilot.startswith("mixer") else math.degrees(size)
-            text = ardupilot_parameters(chirp, limit.ardupilot, size_there, duration)
+            text = ardupilot_parameters(band, limit.ardupilot, size_there, duration)
             files[f"ardupilot-{name}.param"] = text
         if limit.betaflight is not None:
-            text = betaflight_commands(chirp, limit.betaflight, math.degrees(size), duration)
+            text = betaflight_commands(band, limit.betaflight, math.degrees(size), duration)
             files[f"betaflight-{name}.txt"] = text
     if shares:
         files["input.lua"] = transmitter_script(flight.dt, shares)
@@ -218,12 +215,10 @@ def _finite(value: float) -> float | None:
 def _draw(run: Any, i: int) -> Chart:
     """Draw the excitations and the limited motion of a run."""
     flight, model = run.problem.training[i], run.problem.model
-    t, motion = np.arange(flight.n_samples) * flight.dt, run.design.motion[i]
-    settings = run.config.config.design
-    assert settings is not None
+    t, motion = np.arange(flight.n_samples) * flight.dt, run.design.optimum.motion[i]
     panels = []
     for name, limit in run.limits.inputs.items():
-        own, point = run.design.optimum.inputs[i][name], settings.inputs[name].set_point
+        own, point = run.design.optimum.inputs[i][name], run.settings.inputs[name].set_point
         unit = naming.unit(model.Inputs, name) if point is None else naming.unit(model.State, point)
         panels.append(
             panel(
@@ -233,24 +228,20 @@ def _draw(run: Any, i: int) -> Chart:
                 levels=(-limit.amplitude, limit.amplitude),
             )
         )
-    units = naming_units(run)
+    records = {n: r for r in (model.State, model.Outputs) for n in naming.names(r)}
     for name, most in run.limits.motion.items():
         series = [samples("", t, motion[name], style.BLUE, 0.9)]
         ends = (-1.1 * most, 1.1 * most)
         panels.append(
-            panel(label(name, units[name]), series, 1.0, limits=ends, levels=(-most, most))
+            panel(
+                label(name, naming.unit(records[name], name)),
+                series,
+                1.0,
+                limits=ends,
+                levels=(-most, most),
+            )
         )
     title = f"Optimised input and motion, {flight.name}"
     return Chart(
         title, "time [s]", time_limits(t), tuple(panels), "Lines: the limits.", of=flight.name
     )
-
-
-def naming_units(run: Any) -> Mapping[str, str | None]:
-    """Return the units of states and outputs."""
-    model = run.problem.model
-    return {
-        n: naming.unit(record, n)
-        for record in (model.State, model.Outputs)
-        for n in naming.names(record)
-    }

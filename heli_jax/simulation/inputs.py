@@ -5,30 +5,14 @@ and Morelli (2006) for orthogonal multisines; Tischler and Remple (2012) for fre
 fades; Plaetschke and Schulz (1979) for multistep inputs; Golomb (1967) for shift registers.
 """
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 type Samples = Float[np.ndarray, " n"]
-
-
-class Shape(NamedTuple):
-    """Settings of an excitation; each kind uses those that its function names."""
-
-    step: float = 0.3
-    """Shortest step [s]."""
-    pause: float = 2.0
-    """Neutral time between two manoeuvres [s]."""
-    hold: tuple[float, float] = (0.3, 2.0)
-    """Shortest and longest random step [s]."""
-    band: tuple[float, float] = (0.05, 5.0)
-    """Lowest and highest frequency [Hz]."""
-    fade: float = 0.0
-    """Time in which a chirp grows at its begin and fades at its end [s]."""
-    place: tuple[int, int] = (0, 1)
-    """Place of the input among those that are excited together, and their number."""
 
 
 def random_steps(n: int, dt: float, rng: np.random.Generator, hold: tuple[float, float]) -> Samples:
@@ -195,22 +179,32 @@ class Kind(NamedTuple):
     """One excitation of the library."""
 
     name: str
-    make: Callable[[int, float, np.random.Generator, Shape], Samples]
-    """Samples of a number, a sample time [s] and the settings."""
-    smooth: bool
+    make: Callable[..., Samples]
+    """Samples of a number, a sample time [s], a generator and the settings."""
+    settings: tuple[str, ...] = ()
+    """Keywords of `make`: keys of `simulate.inputs`, and the place as in `multisine`."""
+    smooth: bool = False
     """True for sines; a limited rate lowers their amplitude, but turns steps into ramps."""
 
 
 KINDS = (
-    Kind("random-steps", lambda n, dt, rng, s: random_steps(n, dt, rng, s.hold), smooth=False),
-    Kind("doublet", lambda n, dt, rng, s: multistep(n, dt, rng, s.step, s.pause, DOUBLET), False),
-    Kind("3-2-1-1", lambda n, dt, rng, s: multistep(n, dt, rng, s.step, s.pause), smooth=False),
-    Kind("prbs", lambda n, dt, rng, s: prbs(n, dt, rng, s.step), smooth=False),
-    Kind("chirp", lambda n, dt, rng, s: chirp(n, dt, s.band[0], s.band[1], s.fade), smooth=True),
-    Kind("multisine", lambda n, dt, rng, s: multisine(n, dt, s.band, s.place), smooth=True),
-    Kind("neutral", lambda n, dt, rng, s: np.zeros(n), smooth=False),
+    Kind("random-steps", random_steps, ("hold",)),
+    Kind("doublet", partial(multistep, pattern=DOUBLET), ("step", "pause")),
+    Kind("3-2-1-1", multistep, ("step", "pause")),
+    Kind("prbs", prbs, ("step",)),
+    Kind(
+        "chirp",
+        lambda n, dt, _, band, fade: chirp(n, dt, band[0], band[1], fade),
+        ("band", "fade"),
+        smooth=True,
+    ),
+    Kind(
+        "multisine", lambda n, dt, _, **of: multisine(n, dt, **of), ("band", "place"), smooth=True
+    ),
+    Kind("neutral", lambda n, dt, _: np.zeros(n)),
 )
-"""All excitations. To add one: a function and its entry."""
+"""All excitations of `simulate`, configurations and designs. To add one: a function and its
+entry."""
 
 
 def excitation(
@@ -218,7 +212,7 @@ def excitation(
     n: int,
     dt: float,
     rng: np.random.Generator,
-    shape: Shape,
+    settings: Mapping[str, Any],
     *,
     amplitude: float = 1.0,
     rate: float = np.inf,
@@ -229,16 +223,15 @@ def excitation(
         kind: name in `KINDS`.
         n: number of samples.
         dt: sample time [s].
+        settings: those of the kind; others are ignored.
         amplitude: largest deflection.
         rate: largest rate of change [deflection/s].
 
     Raises:
-        ValueError: an unknown kind, or a band without a line.
+        ValueError: a band without a line.
     """
-    found = next((k for k in KINDS if k.name == kind), None)
-    if found is None:
-        raise ValueError(f"kind: got {kind!r}, expected one of {', '.join(k.name for k in KINDS)}")
-    u = amplitude * found.make(n, dt, rng, shape)
+    [found] = [k for k in KINDS if k.name == kind]
+    u = amplitude * found.make(n, dt, rng, **{k: settings[k] for k in found.settings})
     fastest = float(np.max(np.abs(np.diff(u)), initial=0.0)) / dt
     if fastest <= rate:
         return u

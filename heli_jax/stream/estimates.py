@@ -1,15 +1,15 @@
 """Estimates with intervals from the Fourier sums of a stream, by maximum likelihood in frequency.
 
-Each completed block is a record of `identification/estimation/frequency_error.py`: its ends are
-projected out, and the noise's spectrum is estimated from the residual of all blocks. A call begins
-at the estimates of the call before, and takes milliseconds.
+Each completed block is a record of `identification/estimation/frequency_error.py`: optimiser,
+spectrum of the noise and ends are those of frequency error. A call begins at the estimates of the
+call before, and takes milliseconds.
 """
 
 import dataclasses
 import functools
 import itertools
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +18,15 @@ from jaxtyping import Array, Complex, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
+from heli_jax.identification.design.information import covariance
 from heli_jax.identification.estimation.data import data_of, start_vector
-from heli_jax.identification.estimation.frequency_error import products_of_record
+from heli_jax.identification.estimation.evaluation import named
+from heli_jax.identification.estimation.frequency_error import (
+    FrequencyError,
+    NoiseErrors,
+    products_of_record,
+    rows_of_products,
+)
 from heli_jax.identification.estimation.frequency_lines import (
     Matrices,
     Record,
@@ -27,29 +34,27 @@ from heli_jax.identification.estimation.frequency_lines import (
     at_each_line,
     ends_of,
     modelled,
+    shared_of,
 )
-from heli_jax.identification.estimation.frequency_noise import (
-    inverse_roots,
-    smoothed,
-    whitening_by,
-)
-from heli_jax.identification.estimation.residual import prior_rows
-from heli_jax.identification.identifiability.verdict import Z95
+from heli_jax.identification.estimation.frequency_noise import inverse_roots, smoothed
+from heli_jax.identification.estimation.multistart import Search
+from heli_jax.identification.estimation.noise_covariance import relax_noise_covariance
+from heli_jax.identification.estimation.residual import Residuals, residual_and_jacobian
+from heli_jax.identification.identifiability.analysis import relative_slopes, unknowns_of
+from heli_jax.identification.identifiability.verdict import Z95, exponents
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns import transforms
-from heli_jax.identification.unknowns.layout import Data, Layout, layout_of, unpack
+from heli_jax.identification.unknowns.layout import (
+    Data,
+    Layout,
+    Noise,
+    Unknowns,
+    layout_of,
+    unpack,
+)
 from heli_jax.numerics.jitted import jitted
 from heli_jax.simulation.discretize import discretize
 from heli_jax.simulation.hold import delays_of
-from heli_jax.stream.steps import LINES, State, blocks_of
-
-
-class _Block(Record):
-    """The lines of a block, at most `LINES`."""
-
-    @property
-    def lines(self) -> int:
-        return min((self.samples - 1) // 2, LINES)
+from heli_jax.stream.steps import LINES, Blocks, State, blocks_of
 
 
 class Estimated(NamedTuple):
@@ -70,28 +75,28 @@ class Known(NamedTuple):
     """Covariance relative to the values."""
     z: Float[np.ndarray, " q"]
     """Coordinates of the estimates, where the next call begins."""
-    covariance: Float[np.ndarray, "q q"]
-    """In these coordinates."""
-    whitening: Complex[np.ndarray, "K p p"]
-    """Inverse root of the noise's spectrum."""
+    noise: Noise
     coherence: dict[tuple[str, str], float]
     """By input and output: part of the output's power that follows the input."""
     blocks: int
     """Blocks completed so far."""
 
     def of(self, name: str) -> Estimated | None:
-        """Return the estimate of a parameter, of a product `a*If` or a quotient `a/If`; None if
-        there is none."""
+        """Return the estimate of a parameter, or of a product such as `a/If`; None if there is
+        none."""
         if name in self.estimates:
             return self.estimates[name]
-        mark = "/" if "/" in name else "*"
-        pair, sign = name.split(mark), -1.0 if mark == "/" else 1.0
-        if len(pair) != 2 or not all(n in self.estimates for n in pair):
+        try:
+            powers = exponents(name, tuple(self.estimates))
+        except ValueError:
             return None
-        i, j = (list(self.estimates).index(n) for n in pair)
-        C = self.relative
-        sd = float(np.sqrt(max(C[i, i] + C[j, j] + 2.0 * sign * C[i, j], 0.0)))
-        value = self.estimates[pair[0]].value * self.estimates[pair[1]].value ** sign
+        return self._product(powers)
+
+    def _product(self, powers: np.ndarray) -> Estimated:
+        values = np.array([one.value for one in self.estimates.values()])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            value = float(np.prod(values**powers))
+        sd = float(np.sqrt(max(powers @ self.relative @ powers, 0.0)))
         factor = float(np.exp(min(Z95 * sd, 700.0)))
         return Estimated(value, abs(value) * sd, *sorted((value / factor, value * factor)))
 
@@ -103,10 +108,11 @@ class Known(NamedTuple):
     def combinations(self) -> dict[str, Estimated]:
         """Return the products and quotients that are determined far better than their factors."""
         made, own = {}, np.sqrt(np.diag(self.relative))
+        unit = np.eye(len(own))
         for (i, a), (j, b) in itertools.combinations(enumerate(self.estimates), 2):
-            for name in (f"{b}/{a}", f"{a}*{b}"):
-                one = self.of(name)
-                if one is not None and one.sd < _BETTER * min(own[i], own[j]) * abs(one.value):
+            for name, sign in ((f"{b}/{a}", -1.0), (f"{a}*{b}", 1.0)):
+                one = self._product(unit[j] + sign * unit[i])
+                if one.sd < _BETTER * min(own[i], own[j]) * abs(one.value):
                     made[name] = one
         return made
 
@@ -116,51 +122,95 @@ _BETTER = 0.5
 listed."""
 
 
-class _Frame(NamedTuple):
-    """Parts of a problem that the estimates need."""
-
-    layout: Layout
-    data: Data
-    linear: tuple[bool, ...]
-    """True for each input that is linear between samples; () if none is."""
+# Frequency error on the sums of blocks. A layout has one flight, with all blocks as its records.
+# Its inputs are `Signal`s, and its outputs transforms (K, F).
 
 
-@functools.lru_cache(maxsize=8)
-def _frame(problem: Problem) -> _Frame:
-    """Return a problem without the unknowns of single flights, which blocks do not have."""
-    flight, nuisance = problem.training[0], problem.nuisance
-    bare = nuisance._replace(initial_state=False, bias=False, input_offset=False)
-    of_lines = dataclasses.replace(
-        problem,
-        method="frequency-error",
-        flights=(flight,),
-        nuisance=bare,
-        window=None,
-        continuity=None,
-        fixed_noise=(),
-        instrument=(),
-    )
-    layout = layout_of(of_lines, of_lines.training)
-    moving = tuple(flight.hold[n] == "linear" for n in naming.names(problem.model.Inputs))
-    return _Frame(layout, data_of(of_lines, of_lines.training), moving if any(moving) else ())
+class Signal(NamedTuple):
+    """Transforms of an input, and its samples at the ends of the blocks."""
+
+    lines: Complex[Array | np.ndarray, "K F"]
+    ends: Float[Array | np.ndarray, "r F"]
+    """Samples about the first one of each block, less those about the next one's, over sqrt(N)."""
 
 
-class _Lines(NamedTuple):
-    """Transforms of all blocks."""
+class _Block(Record):
+    """The lines of a block, at most `LINES`."""
 
-    inputs: Complex[Array, "K m F"]
-    outputs: Complex[Array, "K p F"]
-    ends: Float[Array, "r m F"]
-    """Inputs about the first sample of each block, less those about the next one's, over
-    sqrt(N)."""
+    @property
+    def lines(self) -> int:
+        return min((self.samples - 1) // 2, LINES)
 
 
-def _model(
-    frame: _Frame, block: _Block, ahead: int, lines: _Lines, z: Float[Array, " q"]
-) -> tuple[Matrices, Sources]:
+class BlockFacts(NamedTuple):
+    """Facts of the blocks that are fixed before tracing."""
+
+    record: _Block
+    ahead: int
+    """As in `State`."""
+
+
+class BlockError(FrequencyError):
+    """Frequency error on the Fourier sums of blocks."""
+
+    def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
+        """Return a row for each unknown of interest, and one for the rest of the errors."""
+        v, unknowns = shared_of(u)
+
+        def model(v: Array, by_instrument: bool) -> tuple[Matrices, Sources]:
+            return _model(layout, data, unknowns(v))
+
+        record, W = layout.flight_facts[0].record, noise.whitening[0]
+        products = products_of_record(model, v, record, W, _outputs(data))
+        return Residuals(rows_of_products(products, v), None)
+
+    def noise_errors(
+        self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
+    ) -> NoiseErrors:
+        """Return the errors of the completed blocks."""
+        errors, vehicle, lost = jax.device_get(_errors(layout, data, noise, z))
+        errors = [e for e in np.moveaxis(errors, 2, 0) if np.any(e)]
+        # The ends take most of the power at the lowest lines, where gusts are.
+        left = len(errors) * errors[0].shape[1] * np.sum(2.0 * (1.0 - lost))
+        power = (1.0 - np.minimum(lost, _MOST_LOST)) * max(1.0 - z.size / left, 0.1)
+        errors = [e / np.sqrt(power)[:, None] for e in errors]
+        samples = layout.flight_facts[0].record.samples
+        return NoiseErrors(errors, [0] * len(errors), vehicle, samples)
+
+    def finish(
+        self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
+    ) -> Float[Array, " q"]:
+        """Return z: blocks have no unknowns of their own."""
+        return z
+
+
+_MOST_LOST = 0.8
+"""Largest part of a line's power that counts as taken by the ends."""
+
+
+def _outputs(data: Data) -> Complex[Array, "K p F"]:
+    return jnp.stack([jnp.asarray(y) for y in data.flights[0].outputs.values()], axis=1)
+
+
+@jitted
+def _errors(
+    layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
+) -> tuple[Complex[Array, "K p F"], Matrices, Float[Array, " K"]]:
+    """Return the errors without the effects of the ends, the model, and the part of the errors'
+    power that these effects take."""
+    record, y = layout.flight_facts[0].record, _outputs(data)
+    m, at = _model(layout, data, unpack(layout, data, z))
+    ends = ends_of(m, record, noise.whitening[0], at, y)
+    made = at_each_line(partial(modelled, m), ends.R, at._replace(ends=ends.inputs))
+    lost = jnp.mean(jnp.sum(ends.Q**2, axis=1).reshape(record.lines, -1), axis=1)
+    return y - made, m, lost
+
+
+def _model(layout: Layout, data: Data, u: Unknowns) -> tuple[Matrices, Sources]:
     """Return the discretised model, and the transforms of what drives it."""
-    layout, data, linear = frame
-    u, flight = unpack(layout, data, z), data.flights[0]
+    block, ahead = layout.flight_facts[0]
+    flight, linear = data.flights[0], tuple(hold == "linear" for hold in layout.holds[0])
+    linear = linear if any(linear) else ()
     params = layout.model.Params(**{**data.base, **u.params, **flight.known})
     delays = delays_of(layout.model, params, u.shift, flight.dt)
     Ad, *taps = discretize(layout.model, params, flight.dt, delays, linear)
@@ -171,7 +221,8 @@ def _model(
         of = [delays.group(i) for i in range(len(names))]
         whole = [0 if g is None else delays.whole[g] for g in of]
         rest = [0.0 if g is None else delays.rest[g] for g in of]
-    omega, kind = jnp.asarray(np.angle(block.z)), lines.inputs.dtype
+    signals = list[Signal](naming.asdict(flight.inputs).values())
+    omega, kind = jnp.asarray(np.angle(block.z)), signals[0].lines.dtype
 
     def turned(samples: Array) -> Array:
         angle = omega[:, None] * samples.astype(omega.dtype)
@@ -180,15 +231,14 @@ def _model(
     def lagged(more: int) -> Array:
         """Return the transforms of the inputs as they were `more` samples before."""
         columns = []
-        lags = np.arange(lines.ends.shape[0]) - ahead
-        for i, n in enumerate(names):
-            lag = whole[i] + more
-            column = lines.inputs[:, i]
+        for n, v, own in zip(names, signals, whole, strict=True):
+            lag, column = own + more, jnp.asarray(v.lines)
+            lags = np.arange(v.ends.shape[0]) - ahead
             if not (isinstance(lag, int) and lag == 0):
                 # A shifted block begins and ends with other samples.
                 sign = jnp.where((lags >= 1) & (lags <= lag), 1.0, 0.0)
                 sign = jnp.where((lags <= 0) & (lags > lag), -1.0, sign)
-                other = (sign[:, None] * lines.ends[:, i]).astype(kind)
+                other = (sign[:, None] * v.ends).astype(kind)
                 column = column + turned(jnp.asarray(lags)[None, :]) @ other
                 column = turned(-jnp.asarray(lag)[None, None]) * column
             columns.append(column * u.gains[n].astype(kind) if n in u.gains else column)
@@ -211,195 +261,129 @@ def _model(
     return Matrices(Ad, B, C[rows], D[rows]), Sources(U, held)
 
 
-# Any: arrays of NumPy or JAX.
-@jitted
-def _products(
-    frame: _Frame, block: tuple[int, int], lines: _Lines, W: Any, z: Any
-) -> tuple[Array, Array, Array]:
-    """Return e'e, J'e and J'J of whitened errors and priors."""
-    record, ahead = _Block(0, 0, block[0]), block[1]
-
-    def model(z: Array, by_instrument: bool) -> tuple[Matrices, Sources]:
-        return _model(frame, record, ahead, lines, z)
-
-    ee, Je, JJ, _ = products_of_record(model, z, record, W, lines.outputs)
-    layout, data = frame.layout, frame.data
-    r, J = prior_rows(layout, data, z), jax.jacfwd(partial(prior_rows, layout, data))(z)
-    return ee + r @ r, Je + J.T @ r, JJ + J.T @ J
-
-
-@jitted
-def _errors(
-    frame: _Frame, block: tuple[int, int], lines: _Lines, W: Any, z: Any
-) -> tuple[Complex[Array, "K p F"], Matrices, Array]:
-    """Return the errors without the effects of the ends, the model, and the part (K,) of the
-    errors' power that these effects take."""
-    record = _Block(0, 0, block[0])
-    m, at = _model(frame, record, block[1], lines, z)
-    ends = ends_of(m, record, W, at, lines.outputs)
-    made = at_each_line(partial(modelled, m), ends.R, at._replace(ends=ends.inputs))
-    return (
-        lines.outputs - made,
-        m,
-        jnp.mean(jnp.sum(ends.Q**2, axis=1).reshape(record.lines, -1), 1),
+@functools.lru_cache(maxsize=8)
+def _search(problem: Problem, samples: int, ahead: int) -> Search:
+    """Return the search of a problem on blocks, with data that lack their signals."""
+    # Blocks have no unknowns of single flights.
+    bare = problem.nuisance._replace(initial_state=False, bias=False, input_offset=False)
+    of_blocks = dataclasses.replace(
+        problem,
+        method="frequency-error",
+        flights=(problem.training[0],),
+        nuisance=bare,
+        window=None,
+        continuity=None,
+        fixed_noise=(),
+        instrument=(),
     )
+    layout = dataclasses.replace(
+        layout_of(of_blocks, of_blocks.training),
+        objective=_OBJECTIVE,
+        flight_facts=(BlockFacts(_Block(0, 0, samples), ahead),),
+    )
+    return Search(of_blocks, layout, data_of(of_blocks, of_blocks.training), _STEPS)
 
 
-@jitted
-def _values(frame: _Frame, z: Any) -> tuple[Array, Array]:
-    """Return the parameters, gains and shift, and their derivatives by z."""
-
-    def values(z: Array) -> Array:
-        u = unpack(frame.layout, frame.data, z)
-        shift = [] if u.shift is None else [u.shift]
-        return jnp.stack([*u.params.values(), *u.gains.values(), *shift])
-
-    return values(z), jnp.diagonal(jax.jacfwd(values)(z))
-
-
-_ROUNDS, _STEPS = 8, 12
-"""Most estimates of the noise's spectrum, and most steps for each."""
+_OBJECTIVE = BlockError()
+_STEPS = 50
+"""Most steps of the optimiser for each estimate of the noise's spectrum."""
 _FEW = 0.15
 """Widening of the intervals after one block, and the n-th part of it after n blocks: the weights
 are estimated from the same blocks. Measured by experiments/stream.py."""
-_MOST_LOST = 0.8
-"""Largest part of a line's power that counts as taken by the ends."""
-_STILL = 0.03
-"""Change of all estimates [sd] that ends the search."""
+_WEAK = 0.01
+"""Row of each unknown, so that a covariance exists: an sd of 100 times its value."""
 
 
 def estimate(problem: Problem, state: State, before: Known | None = None) -> Known | None:
-    """Return what the completed blocks determine; None without any.
+    """Return what the completed blocks determine; `before` until all outputs move in them.
 
     Args:
         problem: that of `init`.
         before: result of an earlier call.
     """
     done = blocks_of(state)
-    if not done.count:
-        return None
-    frame, m = _frame(problem), len(naming.names(problem.model.Inputs))
-    scale = 1.0 / np.sqrt(state.length)
-    lines = _Lines(*map(jnp.asarray, (done.lines[:, :m], done.lines[:, m:], scale * done.ends)))
-    block = (state.length, state.ahead)
+    measured = len(problem.training[0].outputs)
+    if not np.any(done.lines[:, -measured:], axis=(0, 2)).all():
+        return before
+    search = _search(problem, state.length, state.ahead)
+    search = search._replace(data=_with_blocks(search, done, state.length))
     if before is None:
-        z = np.asarray(start_vector(frame.layout, frame.data, problem))
-        # As frequency error begins: each signal alone, as if all of it were noise.
-        S = smoothed([done.lines[:, m:, i] for i in range(done.count)])[0]
-        W = inverse_roots(S * np.eye(S.shape[1]))
+        z = start_vector(search.layout, search.data, problem)
+        noise = _first_noise(search.layout, done)
     else:
-        z, W = before.z, before.whitening
-    for _ in range(_ROUNDS):
-        began = z
-        z, covariance = _search(frame, block, lines, W, z)
-        errors, vehicle, lost = jax.device_get(_errors(frame, block, lines, W, z))
-        # The ends take most of the power at the lowest lines, where gusts are.
-        left = done.count * errors.shape[1] * np.sum(2.0 * (1.0 - lost))
-        power = (1.0 - np.minimum(lost, _MOST_LOST)) * max(1.0 - z.size / left, 0.1)
-        errors = errors / np.sqrt(power)[:, None, None]
-        W = whitening_by(vehicle, [errors[:, :, i] for i in range(done.count)], state.length)[0]
-        moved = (z - began) / np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-        if before is not None and np.max(np.abs(moved)) < _STILL:
-            break
-        before = before or Known({}, covariance, z, covariance, W, {}, 0)
-    _, _, information = jax.device_get(_products(frame, block, lines, W, z))
-    P = np.asarray(jax.jacfwd(partial(prior_rows, frame.layout, frame.data))(jnp.asarray(z)))
-    data = (information - P.T @ P) / (1.0 + _FEW / done.count) ** 2
-    covariance = _inverse(data + P.T @ P)
+        z, noise = before.z, before.noise
+    [best] = search.run(noise, np.asarray(z)[None])
+    found = relax_noise_covariance(search, noise, best)
+    estimates, relative = _accuracy(search, found.noise, found.best.z, done.count)
     return Known(
-        *_named(frame, z, covariance),
-        z,
-        covariance,
-        W,
-        _coherence(problem, frame.layout.outputs[0], lines, done.count),
+        estimates,
+        relative,
+        np.asarray(found.best.z),
+        found.noise,
+        _coherence(search, done),
         int(state.blocks),
     )
 
 
-def _inverse(information: np.ndarray) -> np.ndarray:
-    """Return the inverse of a positive semidefinite matrix; huge where it is singular."""
-    size = np.sqrt(_positive(np.diag(information)))
-    values, vectors = np.linalg.eigh(information / np.outer(size, size))
-    V = vectors / np.sqrt(np.maximum(values, 1e-14)) / size[:, None]
-    return V @ V.T
+def _with_blocks(search: Search, done: Blocks, samples: int) -> Data:
+    """Return the data with the transforms of the blocks as the signals of their flight."""
+    model, ends = search.problem.model, done.ends / np.sqrt(samples)
+    names = naming.names(model.Inputs)
+    inputs = {n: Signal(done.lines[:, i], ends[:, i]) for i, n in enumerate(names)}
+    outputs = {n: done.lines[:, len(names) + j] for j, n in enumerate(search.layout.outputs[0])}
+    [flight] = search.data.flights
+    flight = flight._replace(inputs=model.Inputs(**inputs), outputs=outputs)
+    return search.data._replace(flights=(flight,))
 
 
-def _positive(diagonal: np.ndarray) -> np.ndarray:
-    """Return a diagonal without zeros, of unknowns without effect."""
-    return np.maximum(diagonal, max(1e-16 * diagonal.max(), 1e-100))
+def _first_noise(layout: Layout, done: Blocks) -> Noise:
+    """Return the spectrum of each signal alone, as if all of it were noise."""
+    y = done.lines[:, -len(layout.outputs[0]) :, : done.count]
+    S = smoothed(list(np.moveaxis(y, 2, 0)))[0]
+    rms = np.sqrt(np.mean(np.abs(y) ** 2, axis=(0, 2)))
+    sd = dict(zip(layout.outputs[0], rms, strict=True))
+    return Noise((sd,), np.zeros(()), (inverse_roots(S * np.eye(S.shape[1])),))
 
 
-def _search(
-    frame: _Frame, block: tuple[int, int], lines: _Lines, W: np.ndarray, z: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the optimum from z with fixed noise, by Levenberg-Marquardt, and its covariance."""
-    data = frame.data
-    limits = np.array(
-        [
-            transforms.coordinate_limits(kind, *(np.asarray(v) for v in of))
-            for kind, *of in zip(frame.layout.kinds, data.sign, data.low, data.high, strict=True)
-        ]
-    )
-    k, damping = len(limits), 1e-4
-    cost, g, H = jax.device_get(_products(frame, block, lines, W, z))
-    for _ in range(_STEPS):
-        D = np.diag(_positive(np.diag(H)))
-        move = -np.linalg.solve(H + damping * D, g)
-        trial = z + np.clip(move, -1.0, 1.0)
-        trial[:k] = np.clip(trial[:k], *limits.T)
-        tried = jax.device_get(_products(frame, block, lines, W, trial))
-        if not tried[0] <= cost * (1.0 + 1e-12):
-            damping = max(10.0 * damping, 1e-6)
-            if damping > 1e8:
-                break
-            continue
-        moved, gained = trial - z, cost - tried[0]
-        z, (cost, g, H), damping = trial, tried, 0.1 * damping
-        if moved @ H @ moved < 1e-4 or gained < 1e-9 * cost:
-            break
-    return z, _inverse(H)
-
-
-def _named(
-    frame: _Frame, z: np.ndarray, covariance: np.ndarray
-) -> tuple[dict[str, Estimated], np.ndarray]:
+def _accuracy(
+    search: Search, noise: Noise, z: Float[Array, " q"], count: int
+) -> tuple[dict[str, Estimated], Float[np.ndarray, "q q"]]:
     """Return the estimates by name, and their covariance relative to the values."""
-    values, slopes = jax.device_get(_values(frame, z))
-    sds = np.sqrt(np.diag(covariance))
-    ends = [jax.device_get(_values(frame, z + side * Z95 * sds)[0]) for side in (-1.0, 1.0)]
-    made = {
+    layout, data, problem = search.layout, search.data, search.problem
+    J = np.array(residual_and_jacobian(layout, data, noise, z).J)
+    J[: len(J) - len(layout.free)] /= 1.0 + _FEW / count
+    values, slopes = map(np.asarray, named(layout, data, z))
+    unknowns = unknowns_of(problem, layout, values)
+    scales = relative_slopes(unknowns, slopes)
+    C = np.asarray(covariance(jnp.asarray(np.vstack([J * scales, _WEAK * np.eye(z.size)]))))
+    sds = np.sqrt(np.diag(C)) * np.abs(scales)
+    ends = [np.asarray(named(layout, data, z + side * Z95 * sds)[0]) for side in (-1.0, 1.0)]
+    estimates = {
         n: Estimated(float(v), float(abs(s) * sd), *sorted((float(a), float(b))))
-        for n, v, s, sd, a, b in zip(
-            frame.layout.of_interest, values, slopes, sds, *ends, strict=True
-        )
+        for n, v, s, sd, a, b in zip(layout.of_interest, values, slopes, sds, *ends, strict=True)
     }
-    over = slopes / np.where(values == 0, np.inf, values)
-    return made, covariance * np.outer(over, over)
+    over = scales * slopes / np.where(values == 0, np.inf, values)
+    return estimates, C * np.outer(over, over)
 
 
 _AVERAGES = 12
 """Least lines and blocks in a coherence."""
 
 
-def _coherence(
-    problem: Problem, outputs: tuple[str, ...], lines: _Lines, count: int
-) -> dict[tuple[str, str], float]:
+def _coherence(search: Search, done: Blocks) -> dict[tuple[str, str], float]:
     """Return, by input and output, the part of the output's power that follows the input."""
-
-    def hann(v: np.ndarray) -> np.ndarray:
-        return v[1:-1] - 0.5 * (v[2:] + v[:-2])
-
-    u, y = (hann(np.asarray(v)[..., :count]) for v in (lines.inputs, lines.outputs))
-    width = -(-_AVERAGES // count)
-    first = np.arange(0, len(u), width)
+    # The window of Hann.
+    v = done.lines[..., : done.count]
+    v = v[1:-1] - 0.5 * (v[2:] + v[:-2])
+    first = np.arange(0, len(v), -(-_AVERAGES // done.count))
 
     def power(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return np.add.reduceat(np.sum(np.conj(a) * b, axis=-1), first, axis=0)
 
-    made = {}
-    for i, name in enumerate(naming.names(problem.model.Inputs)):
-        for j, output in enumerate(outputs):
-            uu, yy = (np.real(power(v, v)) for v in (u[:, i], y[:, j]))
-            follows = np.abs(power(u[:, i], y[:, j])) ** 2 / np.where(uu > 0, uu, np.inf)
+    made, names = {}, naming.names(search.problem.model.Inputs)
+    for i, name in enumerate(names):
+        for j, output in enumerate(search.layout.outputs[0], len(names)):
+            uu, yy = (np.real(power(v[:, k], v[:, k])) for k in (i, j))
+            follows = np.abs(power(v[:, i], v[:, j])) ** 2 / np.where(uu > 0, uu, np.inf)
             made[name, output] = float(np.sum(follows) / max(np.sum(yy), 1e-300))
     return made

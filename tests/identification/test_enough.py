@@ -12,7 +12,7 @@ from heli_jax.analysis.flight_responses import Settings, flight_responses
 from heli_jax.dynamics.onboard.filters import Filter
 from heli_jax.flights import Signal, read_flight
 from heli_jax.flights.signal_facts import signal_facts
-from heli_jax.identification.design.next_flight import plan_next_flight
+from heli_jax.identification.design.library import plan_next_flight
 from heli_jax.identification.diagnostics.record import of_rates
 from heli_jax.identification.fit import check, fit
 from heli_jax.identification.validation.logging_rate import input_rate

@@ -6,7 +6,6 @@ import pytest
 from heli_jax.config import StickConfig
 from heli_jax.simulation.inputs import (
     KINDS,
-    Shape,
     chirp,
     excitation,
     multisine,
@@ -91,8 +90,8 @@ def test_multisines_of_several_inputs_are_orthogonal():
 def test_every_kind_keeps_its_limits(kind):
     assert StickConfig(kind=kind, amplitude=1.0).kind == kind
     rng = np.random.default_rng(0)
-    shape = Shape(band=(0.1, 2.0))
-    u = excitation(kind, 2000, 0.01, rng, shape, amplitude=0.3, rate=1.5)
+    settings = {**dict(StickConfig(amplitude=1.0, band=(0.1, 2.0))), "place": (0, 1)}
+    u = excitation(kind, 2000, 0.01, rng, settings, amplitude=0.3, rate=1.5)
     assert u.shape == (2000,)
     assert np.max(np.abs(u)) <= 0.3 + 1e-12
     assert np.max(np.abs(np.diff(u))) <= 1.5 * 0.01 + 1e-12

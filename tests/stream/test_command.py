@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import yaml
 
-from heli_jax import load_fit
+from heli_jax import load_config, load_fit
 from heli_jax.cli import main
-from heli_jax.cli.stream import received
+from heli_jax.cli.stream import Follower, received
 from heli_jax.cli.wanted import Wanted, wanted_of
 from heli_jax.errors import InputError
 from heli_jax.flights import Signal
@@ -53,6 +53,39 @@ def test_a_damaged_stream_ends_as_the_fit_of_the_log(bench, tmp_path, capsys):
     assert main(["fit", str(bench), "--out", str(tmp_path / "fit")]) == 0
     ours, batch = (estimates_in(tmp_path / n) for n in ("run", "fit"))
     assert ours == pytest.approx(batch, rel=1e-12)
+
+
+def followed(experiment, log, lines):
+    """Return the follower of lines of a table, which come in pieces."""
+    follower = Follower(experiment, "stream.csv", log, 12.0)
+    for part in np.array_split(np.array(lines, object), 9):
+        follower.take("".join(part).encode())
+        follower.update()
+    follower.finish()
+    follower.update(last=True)
+    one, true = follower.known.estimates["Ixx"], float(experiment.vehicle.params.Ixx)
+    assert abs(one.value - true) < 3.0 * one.sd
+    return follower.state
+
+
+def test_a_gap_costs_its_block_alone(bench, tmp_path):
+    head, *rows = (bench.parent / "bench.csv").read_text().splitlines(keepends=True)
+    # 1.2 s are lost in the second block, and the next one begins after them.
+    lines = [head, *rows[:700], *rows[760:]]
+    state = followed(load_config(bench), tmp_path / "run.csv", lines)
+    assert (int(state.samples), int(state.missing)) == (len(rows) - 59, 1)
+    assert int(state.blocks) == 3
+
+
+def test_clocks_of_two_messages(bench, tmp_path):
+    head, *rows = (bench.parent / "bench.csv").read_text().splitlines(keepends=True)
+    cells = [row.rstrip().split(",") for row in rows]
+    # The output is logged 3 ms after the input, in a row of its own.
+    lines = [f"{t},{u},\n{float(t) + 0.003:.4f},,{y}\n" for t, u, y in cells]
+    experiment = load_config(bench, {"flights.0.rate": 50})
+    state = followed(experiment, tmp_path / "run.csv", [head, *lines])
+    assert int(state.samples) == pytest.approx(len(rows), abs=2)
+    assert (int(state.missing), int(state.blocks)) == (0, 3)
 
 
 @pytest.mark.parametrize(

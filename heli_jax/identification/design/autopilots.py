@@ -9,8 +9,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from heli_jax.identification.design.library import Manoeuvre
-
 _PLACES = {"input": 1, "rate": 7, "mixer": 10}
 ARDUPILOT = {
     f"{place}-{axis}": first + i
@@ -24,16 +22,19 @@ _FULL = 1024
 """Full deflection of EdgeTX."""
 
 
-def ardupilot_parameters(manoeuvre: Manoeuvre, axis: str, magnitude: float, duration: float) -> str:
+def ardupilot_parameters(
+    band: tuple[float, float], axis: str, magnitude: float, duration: float
+) -> str:
     """Return a parameter file for a chirp of ArduPilot's mode SYSTEMID.
 
     Args:
+        band: lowest and highest frequency [Hz].
         axis: key of `ARDUPILOT`.
         magnitude: deflection: degrees for input, degrees a second for rate, 0 to 1 for mixer axes.
         duration: duration of the chirp [s].
     """
-    low, high = manoeuvre.shape.band
-    fade = max(manoeuvre.shape.fade, 0.05 * duration)
+    low, high = band
+    fade = 0.05 * duration
     lines = {
         "SID_AXIS": ARDUPILOT[axis],
         "SID_MAGNITUDE": f"{magnitude:.4g}",
@@ -46,15 +47,18 @@ def ardupilot_parameters(manoeuvre: Manoeuvre, axis: str, magnitude: float, dura
     return "".join(f"{name},{value}\n" for name, value in lines.items())
 
 
-def betaflight_commands(manoeuvre: Manoeuvre, axis: str, amplitude: float, duration: float) -> str:
+def betaflight_commands(
+    band: tuple[float, float], axis: str, amplitude: float, duration: float
+) -> str:
     """Return commands of Betaflight's command line for its mode CHIRP.
 
     Args:
+        band: lowest and highest frequency [Hz].
         axis: roll, pitch or yaw.
         amplitude: largest set point [deg/s].
         duration: duration of the chirp [s].
     """
-    low, high = manoeuvre.shape.band
+    low, high = band
     lines = {
         f"chirp_amplitude_{axis}": f"{amplitude:.0f}",
         "chirp_frequency_start_deci_hz": f"{max(1.0, 10.0 * low):.0f}",

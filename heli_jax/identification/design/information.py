@@ -75,6 +75,15 @@ class Vehicle(NamedTuple):
     """Rows of information that no input changes: priors, gusts, other flights (r, q)."""
 
 
+class Outcome(NamedTuple):
+    """Accuracy and motion of a vehicle; with a leading axis, of several."""
+
+    covariance: Float[Array, "*v p p"]
+    """Of the parameters, in relative coordinates."""
+    motion: tuple[dict[str, Array], ...]
+    """As in `Flown`."""
+
+
 class Experiment(NamedTuple):
     """A planned experiment: everything except its inputs."""
 
@@ -92,10 +101,8 @@ class Experiment(NamedTuple):
         """Parameters of interest, the first in every covariance."""
         return self.layout.of_interest
 
-    def covariances(
-        self, inputs: tuple[Any, ...], known: tuple[dict[str, Any], ...]
-    ) -> Float[Array, "v p p"]:
-        """Return the covariance of the parameters in relative coordinates, for each vehicle.
+    def outcome(self, inputs: tuple[Any, ...], known: tuple[dict[str, Any], ...]) -> Outcome:
+        """Return the accuracy and the motion, for each vehicle.
 
         Args:
             inputs: the model's Inputs (N,) of each flight, SI; with feedback what is given to it.
@@ -103,9 +110,10 @@ class Experiment(NamedTuple):
         """
         p = len(self.parameters)
 
-        def of_one(vehicle: Vehicle) -> Array:
-            rows = self._rows(vehicle, self.flown(vehicle, inputs, known).data)
-            return covariance(jnp.concatenate([rows, vehicle.rows]))[:p, :p]
+        def of_one(vehicle: Vehicle) -> Outcome:
+            flown = self.flown(vehicle, inputs, known)
+            rows = jnp.concatenate([self._rows(vehicle, flown.data), vehicle.rows])
+            return Outcome(covariance(rows)[:p, :p], flown.motion)
 
         return jax.vmap(of_one)(self.vehicles)
 

@@ -14,7 +14,7 @@ from heli_jax.flights.flight import labels
 from heli_jax.flights.marks import written_again
 from heli_jax.flights.signal_facts import DROP_SHARE, RAIL_SHARE, STUCK_SECONDS
 from heli_jax.identification.design.accuracy import unstated_gusts
-from heli_jax.identification.design.next_flight import plan_next_flight
+from heli_jax.identification.design.library import plan_next_flight
 from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.diagnostics.outliers import outliers
 from heli_jax.identification.problem import Problem

@@ -19,6 +19,7 @@ Sources: Pintelon and Schoukens (2012), chapters 6, 9 and 10; Klein and Morelli 
 """
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -84,6 +85,18 @@ from heli_jax.identification.unknowns.layout import (
     Solution,
     Unknowns,
 )
+
+
+class NoiseErrors(NamedTuple):
+    """Errors from which the noise's spectrum is estimated."""
+
+    errors: list[Complex[np.ndarray, "K p"]]
+    """By record, enlarged by the degrees of freedom that the unknowns take."""
+    flights: list[int]
+    """Flight of each record."""
+    model: Matrices
+    samples: int | None = None
+    """N of every record, if its lines end below the Nyquist frequency."""
 
 
 class FrequencyError(Objective):
@@ -162,18 +175,25 @@ class FrequencyError(Objective):
 
         return noise._replace(whitening=tuple(whitening(r) for r in records_of(layout)))
 
-    def relax(
+    def noise_errors(
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
-    ) -> tuple[Float[Array, " q"], Noise]:
-        """Return the spectrum of the errors, smoothed over frequency and flights."""
+    ) -> NoiseErrors:
+        """Return the errors of all records."""
         errors, model = jax.device_get(errors_of_lines(layout, data, noise, z))
         rows = sum(2 * v.size for v in errors)
         freedom = rows / max(rows - len(layout.free), 1)
         errors = [v * freedom**0.5 for v in errors]
+        return NoiseErrors(errors, [record.flight for record in records_of(layout)], model)
+
+    def relax(
+        self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
+    ) -> tuple[Float[Array, " q"], Noise]:
+        """Return the spectrum of the errors, smoothed over frequency and flights."""
+        errors, of_flight, model, samples = self.noise_errors(layout, data, noise, z)
         # Powers of errors that overflow have no spectrum.
         with np.errstate(all="ignore"):
             try:
-                whitening = whitening_by(model, errors)
+                whitening = whitening_by(model, errors, samples)
                 sound = all(np.isfinite(W).all() for W in whitening)
             except np.linalg.LinAlgError:
                 sound = False
@@ -183,7 +203,6 @@ class FrequencyError(Objective):
         if not layout.model.linear:
             z = in_time(layout, data, noise, z)
         logs = -2.0 * np.concatenate(once_a_length(log_determinants, whitening))
-        of_flight = [record.flight for record in records_of(layout)]
         sd = []
         for i, names in enumerate(layout.outputs):
             own = np.concatenate([v for v, f in zip(errors, of_flight, strict=True) if f == i])
@@ -302,7 +321,6 @@ def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Floa
         noise: noise with the whitening of each record.
     """
     v, unknowns = shared_of(u)
-    at = jax.lax.stop_gradient(v)
     instruments, products = data.flights[0].by_instrument is not None, []
     for members in alike(layout, data):
         y = measured(layout, data, members)
@@ -317,9 +335,22 @@ def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Floa
                 return m, sources(record, driving)
 
             of_record = lines_of_flights(record, y)
-            products.append(products_of_record(model, at, record, W, of_record, instruments))
-    ee, Ze, ZZ, ZJ = jax.tree.map(lambda *v: sum(v), *products)
-    S = orthonormal(ZZ)
+            products.append(products_of_record(model, v, record, W, of_record, instruments))
+    return rows_of_products(jax.tree.map(lambda *v: sum(v), *products), v, instruments)
+
+
+type Products = tuple[
+    Float[Array, ""], Float[Array, " q"], Float[Array, "q q"], Float[Array, "q q"]
+]
+"""e'e, Z'e, Z'Z and Z'J."""
+
+
+def rows_of_products(
+    products: Products, v: Float[Array, " q"], instruments: bool = False
+) -> Float[Array, " r"]:
+    """Return the rows of products over all records at v."""
+    ee, Ze, ZZ, ZJ = products
+    at, S = jax.lax.stop_gradient(v), orthonormal(ZZ)
     r, M = S.T @ Ze, S.T @ ZJ
     left = jnp.zeros_like(ee) if instruments else jnp.sqrt(jnp.maximum(ee - r @ r, 0.0))
     r, M, left = jax.lax.stop_gradient((r, M, left))
@@ -334,8 +365,8 @@ def products_of_record(
     W: Complex[Array, "K p p"],
     y: Complex[Array, "K p f"],
     instruments: bool = False,
-) -> tuple[Float[Array, ""], Float[Array, " q"], Float[Array, "q q"], Float[Array, "q q"]]:
-    """Return e'e, Z'e, Z'Z and Z'J over one record of each flight of a group, without its ends.
+) -> Products:
+    """Return the products over one record of each flight of a group, without its ends.
 
     Args:
         model: model and transforms of the inputs by the shared unknowns v, directly or by
@@ -343,6 +374,7 @@ def products_of_record(
         y: transforms of the measured outputs.
         instruments: take the derivatives Z by instrument; else they are J.
     """
+    v = jax.lax.stop_gradient(v)
     m, at = model(v, False)
     ends = ends_of(m, record, W, at, y)
 

@@ -101,7 +101,7 @@ def sum_of_squares(signals: Sequence[Mapping[str, Array | np.ndarray]], noise: N
     """Return the sum of squares of signals (N,) by flight and output, over the sd of their noise;
     NaN is missing."""
     return sum(
-        float(np.nansum(np.square(np.asarray(y) / np.asarray(sd[n]))))
+        float(np.nansum(np.square(np.abs(y) / np.asarray(sd[n]))))
         for by_output, sd in zip(signals, noise.sd, strict=True)
         for n, y in by_output.items()
     )

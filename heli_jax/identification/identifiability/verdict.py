@@ -1,10 +1,12 @@
 """Result of the identifiability analysis, and its sentences."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from heli_jax.identification.unknowns.layout import FlightUnknown
 from heli_jax.messages import listed, sentence
@@ -76,6 +78,26 @@ class Combination(NamedTuple):
         if self.kind == "sum":
             return True
         return 0.0 < self.value <= FACTOR * self.lower95 and self.upper95 <= FACTOR * self.value
+
+
+def exponents(product: str, names: Sequence[str]) -> Float[np.ndarray, " p"]:
+    """Return the exponents of a product such as `a/Ixx` by name.
+
+    Raises:
+        ValueError: a factor is not among the names.
+    """
+    powers = np.zeros(len(names))
+    for i, part in enumerate(product.split("/")):
+        for name in part.split("*"):
+            if name.strip() == "1" and i == 0:
+                continue
+            if name.strip() not in names:
+                raise ValueError(
+                    f"expected {', '.join(names)} or a product such as {'/'.join(names[:2])}, got "
+                    f"{product!r:.60}"
+                )
+            powers[names.index(name.strip())] += -1.0 if i else 1.0
+    return powers
 
 
 class Pair(NamedTuple):

@@ -1,18 +1,89 @@
-"""`heli-jax models NAME --config FILE`: a configuration that designs a flight for a model."""
+"""`heli-jax models`: what a model is, and a configuration that designs a flight for it."""
 
+import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from heli_jax import models, naming
+from heli_jax import models, naming, summaries
 from heli_jax.analysis.linear import eigenmodes
+from heli_jax.cli.terminal import print_text
 from heli_jax.dynamics.jacobians import jacobians
+from heli_jax.dynamics.model import vehicle_constants
 from heli_jax.errors import InputError
 from heli_jax.linear_models.read import linear_model
 from heli_jax.numbers import terse
+from heli_jax.report.tables import Table
 from heli_jax.run_directory import whole_file
+from heli_jax.summaries import Row
 from heli_jax.yaml_file import EDIT
+
+
+def print_models(name: str | None, *, as_json: bool) -> None:
+    """Print the list of models, or what one is."""
+    if name is None:
+        listed = models.listed()
+        width = max(map(len, listed))
+        lines = [f"{one:{width}}  {words}" for one, words in listed.items()]
+        print(json.dumps(listed, indent=1)) if as_json else print_text("\n".join(lines))
+        return
+    title, tables = described(name)
+    if as_json:
+        content = {
+            words: [dict(zip(t.head, row, strict=True)) for row in t.rows]
+            for words, t in tables.items()
+        }
+        print(json.dumps({"model": title, **content}, indent=1))
+        return
+    print_text(title)
+    for words, t in tables.items():
+        print_text(summaries.as_text(words, t.head, t.rows))
+
+
+def described(text: str) -> tuple[str, dict[str, Table]]:
+    """Return name and meaning of a model, and its tables in SI.
+
+    Args:
+        text: name of the model as for `models.by_text`.
+
+    Raises:
+        InputError: there is no such model, or its file is wrong.
+    """
+    model, name = models.by_text(text, "models")
+    linear = linear_model(name["linear"]) if isinstance(name, dict) else None
+    constants = {} if linear is None else linear.vehicle().constants
+    meaning = models.listed().get(str(name), "") if linear is None else linear.content.meaning
+    records = {"states": model.State, "inputs": model.Inputs, "outputs": model.Outputs}
+    head = ("name", "unit", "meaning")
+    tables = {title: Table(head, _rows(record)) for title, record in records.items()}
+    defaults = vehicle_constants(model)
+    sources = {n: c.source for n, c in constants.items()}
+    rows = [
+        (n, terse(defaults[n], 5), *words, sources.get(n, ""))
+        for n, *words in _rows(model.Params)
+        if n in defaults
+    ]
+    head = ("name", "value", "unit", "meaning", "source")
+    tables["parameters"] = Table(head, rows)
+    if linear is not None:
+        modes = [(m, m.eigenvalue.real) for m in eigenmodes(model, linear.vehicle().params)]
+        # Time constant of the envelope; it is negative if the mode grows.
+        cells = [
+            (m.name, *map(terse, (m.frequency, m.damping, -1.0 / real if real else None)))
+            for m, real in modes
+        ]
+        head = ("mode", "frequency [rad/s]", "damping", "time constant [s]")
+        tables["modes"] = Table(head, cells)
+    return f"{model.name}: {meaning}", tables
+
+
+def _rows(record: Any) -> list[Row]:
+    names = naming.names(record)
+    return [(n, naming.unit(record, n) or "", naming.meaning(record, n)) for n in names]
+
+
+# A configuration with guessed limits.
 
 _NOISE = {"rad/s": 0.01, "rad": 0.005, "m/s": 0.1, "m": 0.05, "m/s^2": 0.1}
 """sd of a small vehicle's sensors by unit, a guess."""
