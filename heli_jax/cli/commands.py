@@ -397,7 +397,7 @@ def _design(options: argparse.Namespace) -> int:
 
 def _control(options: argparse.Namespace) -> int:
     out = _new_directory(options)
-    _prepare_jax()
+    prepare_jax()
     from heli_jax import workflow
     from heli_jax.cli import controls
     from heli_jax.control_workflow import run_control
