@@ -14,11 +14,10 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from heli_jax import naming
@@ -36,6 +35,7 @@ DT = 0.02
 """Sample time of the feedback [s]."""
 _ATTITUDE, _RATE = 0.015, 0.0015
 """Cyclic stick per angle [m/rad] and rate [m s/rad]: attitude follows within 0.3 s."""
+_LAG = 0.3
 _HEADING, _YAW_RATE = 1.0, 0.4
 """Yaw stick per heading [1/rad] and yaw rate [s/rad]."""
 _LATERAL = 0.12
@@ -56,7 +56,7 @@ class Limits(NamedTuple):
     """Mean lift coefficient of the blades, 6 C_T / sigma, since the model has no stall."""
     pitch: float = 0.6
     """Pitch angle [rad]."""
-    collective: tuple[float, float] = (-0.15, 0.8)
+    collective: tuple[float, float] = (-0.15, 0.9)
     collective_rate: float = 2.0
     """Largest rate [1/s]."""
     cyclic: float = 0.006
@@ -127,13 +127,14 @@ def along_heading(s: Record) -> tuple[Scalar, Scalar]:
 
 def _bank(s: Record) -> Scalar:
     """Return the bank angle that stops a drift [rad]."""
-    most = _most_tilt(s.z)
+    most = _most_tilt(s)
     return jnp.clip(-_LATERAL * along_heading(s)[1], -most, most)
 
 
-def _most_tilt(height: Scalar) -> Scalar:
+def _most_tilt(s: Record) -> Scalar:
     """Return the largest roll and pitch angle [rad], smaller near the ground."""
-    return jnp.minimum(0.5, _TAIL + jnp.maximum(height, 0.0))
+    # Attitude follows with a lag, so the height is that after the lag.
+    return jnp.minimum(0.5, _TAIL + jnp.maximum(s.z + _LAG * s.dz, 0.0))
 
 
 def lift_coefficient(model: Model, p: Any, s: Record, u: Record) -> Scalar:
@@ -157,9 +158,9 @@ def _lift_scale(p: Any, Omega: Scalar) -> Scalar:
 class Grid(NamedTuple):
     """Discretisation of a landing in time."""
 
-    segments: int = 6
+    segments: int = 4
     """Segments of the multiple shooting, each with its own initial state."""
-    nodes: int = 8
+    nodes: int = 12
     """Intervals of the sticks in a segment, linear in each."""
     samples: int = 5
     """Samples in such an interval."""
@@ -331,6 +332,35 @@ class LandingProblem:
                 rows[k, place + k + 1], rows[k, place + k] = sign, -sign
         return A.reshape(-1, self.size)
 
+    def minimised(self, z: np.ndarray, method: str, **options: Any) -> tuple[np.ndarray, Any]:
+        """Return the optimum and SciPy's result, from the start z.
+
+        Args:
+            method: "SLSQP" or "trust-constr", with its options.
+        """
+        import scipy.optimize  # other functions need not wait for it
+
+        z, free = z.copy(), self.free
+
+        def at(x: np.ndarray) -> Any:
+            z[free] = x
+            return self.evaluated(z)
+
+        def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
+            r, J = at(x)[0]
+            return float(r @ r), 2.0 * (J.T @ r)[free]
+
+        constraints = [
+            {"type": "eq", "fun": lambda x: at(x)[1][0], "jac": lambda x: at(x)[1][1][:, free]},
+            {"type": "ineq", "fun": lambda x: at(x)[2][0], "jac": lambda x: at(x)[2][1][:, free]},
+        ]
+        result = scipy.optimize.minimize(
+            cost, z[free], jac=True, method=method, constraints=constraints, options=options,
+            bounds=scipy.optimize.Bounds(self.low[free], self.high[free]),
+        )  # fmt: skip
+        z[free] = result.x
+        return z, result
+
     def flown(self, z: np.ndarray) -> Trajectory:
         """Return the flight with the sticks of z in one run."""
         n, q = len(self.names), self.grid.intervals
@@ -421,36 +451,10 @@ def land(
         start: flight of the initial guess; default: that of `energy_law`.
         max_steps: limit of the optimiser.
     """
-    import scipy.optimize  # other functions need not wait for it
-
     problem = LandingProblem(model, params, entry, limits, wind, grid)
     if start is None:
         start = fly(model, params, Gains(), entry.state, calm(model, 30.0, wind), limits)
-    z, free = problem.sampled(start), problem.free
-
-    def full(x: np.ndarray) -> np.ndarray:
-        whole = z.copy()
-        whole[free] = x
-        return whole
-
-    def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
-        r, J = problem.evaluated(full(x))[0]
-        return float(r @ r), 2.0 * (J.T @ r)[free]
-
-    constraints = [
-        {
-            "type": kind,
-            "fun": lambda x, i=i: problem.evaluated(full(x))[i][0],
-            "jac": lambda x, i=i: problem.evaluated(full(x))[i][1][:, free],
-        }
-        for i, kind in ((1, "eq"), (2, "ineq"))
-    ]
-    bounds = scipy.optimize.Bounds(problem.low[free], problem.high[free])
-    result = scipy.optimize.minimize(
-        cost, z[free], jac=True, method="SLSQP", bounds=bounds, constraints=constraints,
-        options={"maxiter": max_steps, "ftol": 1e-6},
-    )  # fmt: skip
-    z = full(result.x)
+    z, result = problem.minimised(problem.sampled(start), "SLSQP", maxiter=max_steps, ftol=1e-6)
     _, (equations, _), (inequalities, _) = problem.evaluated(z)
     defect = float(np.max(np.abs(equations)))
     run = jax.device_get(problem.flown(z))
@@ -479,7 +483,9 @@ class Gains(NamedTuple):
     """Sink rate in the glide [m/s]."""
     deceleration: Any = 4.0
     """Vertical deceleration in the flare [m/s^2]."""
-    slowing: Any = 0.6
+    settling: Any = 0.5
+    """Time constant of the last descent [s]."""
+    slowing: Any = 1.0
     """Forward speed over the sink rate in the flare [1]."""
     k_speed: Any = 0.12
     """Pitch angle per error of the speed [rad s/m]."""
@@ -512,13 +518,18 @@ def energy_law(p: Any, gains: Gains, limits: Limits) -> Callable[[Record, Record
         kinetic = 0.5 * p.m * (s.dx**2 + s.dy**2) / full
         lack = jnp.clip(1.0 - rotor - kinetic, 0.0, 1.0)
         a = gains.deceleration * (1.0 + gains.k_energy * lack)
-        sink = jnp.sqrt(_SINK**2 + 2.0 * a * jnp.maximum(s.z, 0.0))
+        # The sink rate falls with the deceleration a, and exponentially near the ground.
+        root = jnp.sqrt((a * gains.settling) ** 2 + 2.0 * a * jnp.maximum(s.z, 0.0))
+        sink = root - a * gains.settling
+        slower = a * (sink + _SINK) / root
         # Forward speed and sink rate reach zero together.
-        ahead = jnp.minimum(gains.speed, gains.slowing * (sink - _SINK))
-        most = _most_tilt(s.z)
-        theta, phi = jnp.clip(gains.k_speed * (forward - ahead), -most, most), _bank(s)
+        ahead = gains.slowing * sink
+        tilt = jnp.where(ahead < gains.speed, gains.slowing * slower / p.g, 0.0)
+        tilt = tilt + gains.k_speed * (forward - jnp.minimum(gains.speed, ahead))
+        most = _most_tilt(s)
+        theta, phi = jnp.clip(tilt, -most, most), _bank(s)
         glide = gains.k_rotor * (rotor - 1.0) + gains.k_glide * (-s.dz - gains.sink)
-        flare = a + gains.k_sink * (-s.dz - sink)
+        flare = slower + gains.k_sink * (-s.dz - sink - _SINK)
         up = jnp.maximum(jnp.maximum(glide, flare), -0.8 * p.g)
         T = p.m * (p.g + up) / (jnp.cos(theta) * jnp.cos(phi))
         T = jnp.minimum(T, limits.lift / 6.0 * _lift_scale(p, s.Omega))
@@ -567,7 +578,7 @@ def fly(
         inputs: the model's Inputs (N,) at `DT`, of which only wind acts: `calm`.
     """
     return simulate(
-        model, params, inputs, dt=DT, initial_state=state,
+        model, params, inputs, dt=DT, substeps=2, initial_state=state,
         feedback=energy_law(params, gains, limits), events={"ground": ground()},
     )  # fmt: skip
 
@@ -607,3 +618,59 @@ def touchdown(params: Any, run: Trajectory) -> Touchdown:
     return Touchdown(
         end.dz, *along_heading(end), end.phi, end.theta, jnp.min(ratio), jnp.max(ratio), end.z
     )
+
+
+def misses(end: Touchdown, limits: Limits = Limits()) -> Float[Array, " 7"]:
+    """Return the errors of a touchdown that `tune` squares and sums: 1 is half of a limit."""
+    low, high = limits.rotor
+    errors = jnp.stack(
+        [
+            2.0 * end.vertical / limits.vertical,
+            2.0 * end.forward / limits.horizontal,
+            2.0 * end.lateral / limits.horizontal,
+            end.pitch / 0.1,
+            jnp.maximum(low + 0.03 - end.slowest, 0.0) / 0.015,
+            jnp.maximum(end.fastest - high + 0.02, 0.0) / 0.01,
+            end.height / 0.2,
+        ]
+    )
+    # A lost flight must not outweigh many that nearly land (Geman and McClure's estimator).
+    return errors / jnp.sqrt(1.0 + (errors / 4.0) ** 2)
+
+
+def tune(
+    model: Model,
+    params: Any,
+    gains: Gains,
+    states: Record,
+    inputs: Record,
+    limits: Limits = Limits(),
+    *,
+    max_steps: int = 30,
+) -> Gains:
+    """Return gains with a smaller sum of squares of `misses`, by SciPy's trust-region least squares.
+
+    Args:
+        states: states (k,) of the entries.
+        inputs: inputs (k, N) at `DT` with the wind of each.
+    """
+
+    import scipy.optimize  # flights need not wait for it
+
+    start = np.array([float(g) for g in gains])
+
+    @jax.jit
+    def residuals(z: Array) -> Array:
+        changed = Gains(*(start * jnp.exp(z)))
+
+        def one(state: Record, u: Record) -> Array:
+            return misses(touchdown(params, fly(model, params, changed, state, u, limits)), limits)
+
+        return jax.vmap(one)(states, inputs).ravel()
+
+    slopes = jax.jit(jax.jacfwd(residuals))
+    result = scipy.optimize.least_squares(
+        lambda z: np.asarray(residuals(z)), np.zeros(start.size), lambda z: np.asarray(slopes(z)),
+        max_nfev=max_steps, ftol=1e-3,
+    )  # fmt: skip
+    return Gains(*(start * np.exp(result.x)).tolist())
