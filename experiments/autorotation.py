@@ -2,13 +2,14 @@
 
     python experiments/autorotation.py [ENTRIES] [--quick] [--out FOLDER]
 
-prints the open-loop optimum from 30 m and 100 m with a check by SciPy's trust-constr, the share of
-ENTRIES in wind that the feedback on energy lands, before and after tuning, and gradients through
-20 s against finite differences. FOLDER has the figures landings.png and height-velocity.png.
+prints the open-loop optimum from 30 m and 100 m with a check by SciPy's trust-constr, gradients
+through 20 s against finite differences, and the share of ENTRIES in wind that the feedback on
+energy lands, with a first guess of its gains, after tuning, and with the gains of the package.
+FOLDER has the figures landings.png and height-velocity.png.
 """
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,85 +18,77 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-import scipy.optimize
 from script import Size, asked
 
 import heli_jax
 from heli_jax import naming
 from heli_jax.control import autorotation as ar
 
-ROOT = Path(__file__).parent.parent
+VEHICLE = Path(__file__).parent.parent / "configs" / "vehicles" / "x-cell-60.yaml"
 SPEED, WIND, GUSTS = 15.0, 4.0, 0.5
 """Highest entry speed and steady wind, and sd of gusts with a time constant of 1 s [m/s]."""
 FIRST_GUESS = ar.Gains(
-    speed=10.0, sink=6.0, deceleration=5.0, settling=0.3, slowing=1.5,
-    k_speed=0.2, k_sink=4.0, k_glide=1.0, k_rotor=6.0, k_energy=0.1,
+    speed=7.5, sink=9.0, deceleration=22.0, settling=0.2, slowing=0.33,
+    k_speed=0.65, k_sink=7.0, k_glide=0.8, k_rotor=6.6, k_energy=0.3,
 )  # fmt: skip
 
 
-class Entries(NamedTuple):
-    """Engine failures; arrays (k,), inputs (k, N)."""
-
-    height: Any
-    speed: Any
-    wind: Any
-    state: Any
-    inputs: Any
-
-
-def entries(model: Any, params: Any, count: int, seed: int) -> Entries:
-    """Return failures at 30 m and 100 m by turns, in steady wind from all directions and gusts."""
-    rng, n = np.random.default_rng(seed), round(24.0 / ar.DT) + 1
-    height = np.where(np.arange(count) % 2, 100.0, 30.0)
-    speed = rng.uniform(0.0, SPEED, count)
-    angle, size = rng.uniform(0.0, 2.0 * np.pi, count), WIND * np.sqrt(rng.uniform(0.0, 1.0, count))
-    wind = np.stack([size * np.cos(angle), size * np.sin(angle)], 1)
-    gusts, keep = np.zeros((count, 3, n)), np.exp(-ar.DT)
-    for k in range(1, n):
-        gusts[..., k] = keep * gusts[..., k - 1]
-        gusts[..., k] += GUSTS * np.sqrt(1.0 - keep**2) * rng.standard_normal((count, 3))
-    entry = failures(model, params, height, speed, wind)
-    air = {f"wind_{a}": gusts[:, i] + (wind[:, i, None] if i < 2 else 0.0) for i, a in enumerate("xyz")}
-    zero = np.zeros((count, n))
-    inputs = model.Inputs(**{k: jnp.asarray(air.get(k, zero)) for k in naming.names(model.Inputs)})
-    return Entries(height, speed, wind, entry.state, inputs)
-
-
 def failures(
-    model: Any, params: Any, height: np.ndarray, speed: np.ndarray, wind: np.ndarray, delay: float = 0.0
+    model: Any, params: Any, height: Any, speed: Any, wind: Any, delay: float = 0.0
 ) -> Any:
-    """Return the entries (k,)."""
+    """Return the states (k,) at which landings begin; `wind` is (k, 2) [m/s]."""
 
     def one(h: Any, v: Any, w: Any) -> Any:
-        return ar.engine_failure(model, params, h, v, wind=(w[0], w[1], 0.0 * h), reaction=delay)
+        return ar.engine_failure(model, params, h, v, (w[0], w[1], 0.0 * h), delay)
 
     entry = jax.jit(jax.vmap(one))(height, speed, wind)
     assert float(jnp.max(entry.residual)) < 1e-8
-    return entry
+    return entry.state
 
 
-def flown(model: Any, params: Any, gains: Any, state: Any, inputs: Any) -> ar.Touchdown:
+def entries(
+    model: Any, params: Any, heights: tuple[float, float], count: int, seed: int
+) -> tuple[np.ndarray, Any, Any]:
+    """Return heights, states and inputs of failures in gusts, and in wind from all directions."""
+    rng, n = np.random.default_rng(seed), round(heights[1] / 4.0 / ar.DT)
+    height = np.where(np.arange(count) % 2, heights[1], heights[0])
+    speed, angle = rng.uniform(0.0, SPEED, count), rng.uniform(0.0, 2.0 * np.pi, count)
+    size = WIND * np.sqrt(rng.uniform(0.0, 1.0, count))
+    wind = np.stack([size * np.cos(angle), size * np.sin(angle)], 1)
+    gusts, keep = np.zeros((count, 3, n)), np.exp(-ar.DT)
+    steps = GUSTS * np.sqrt(1.0 - keep**2) * rng.standard_normal((count, 3, n))
+    for k in range(1, n):
+        gusts[..., k] = keep * gusts[..., k - 1] + steps[..., k]
+    gusts[:, :2] += wind[..., None]
+    air = {f"wind_{a}": gusts[:, i] for i, a in enumerate("xyz")}
+    zero = np.zeros((count, n))
+    inputs = {k: jnp.asarray(air.get(k, zero)) for k in naming.names(model.Inputs)}
+    return height, failures(model, params, height, speed, wind), model.Inputs(**inputs)
+
+
+def touchdowns(model: Any, params: Any, gains: Any, states: Any, inputs: Any) -> ar.Touchdown:
     """Return the touchdowns (k,) of the feedback."""
 
     def one(s: Any, u: Any) -> Any:
         return ar.touchdown(params, ar.fly(model, params, gains, s, u))
 
-    return jax.device_get(jax.jit(jax.vmap(one))(state, inputs))
+    return jax.device_get(jax.jit(jax.vmap(one))(states, inputs))
 
 
-def optimum(model: Any, params: Any, height: float, iterations: int) -> heli_jax.Trajectory:
+def optimum(model: Any, params: Any, height: float, iterations: int) -> Any:
     """Print the optimum after a failure at 8 m/s, and that of trust-constr from another start."""
     entry = ar.engine_failure(model, params, height, 8.0)
     landing = ar.land(model, params, entry)
-    problem = ar.LandingProblem(model, params, entry)
+    problem = ar.LandingProblem(model, params, entry, ar.Limits(), ar.CALM, ar.Grid())
     start = ar.fly(model, params, FIRST_GUESS, entry.state, ar.calm(model, 30.0))
-    _, other = problem.minimised(problem.sampled(start), "trust-constr", maxiter=iterations)
-    end = landing.touchdown
+    z = problem.sampled(start)
+    _, other = problem.minimised(z, "trust-constr", maxiter=iterations)
+    end = jax.tree.map(lambda v: float(v[-1]), landing.trajectory.states)
     print(
-        f"{height:g} m: {'converged' if landing.converged else 'NOT CONVERGED'} in {landing.steps} "
-        f"steps, cost {landing.cost:.5f}, defect {landing.defect:.1e}; touchdown "
-        f"{end['dz']:.3f} m/s vertical, {end['dx']:.3f} m/s forward, pitch {end['theta']:.3f} rad, "
-        f"rotor {end['Omega'] / float(params.Omega):.2f}\n  trust-constr: cost {other.fun:.5f} "
+        f"{height:g} m: {landing.message}, {landing.steps} steps, converged {landing.converged}\n"
+        f"  cost {landing.cost:.5f}, violation {landing.violation:.1e}, touchdown {end.dz:.3f} m/s "
+        f"up, {end.dx:.3f} m/s forward, pitch {end.theta:.3f} rad, rotor "
+        f"{end.Omega / float(params.Omega):.2f}\n  trust-constr: cost {other.fun:.5f} "
         f"({100 * (other.fun / landing.cost - 1):+.2f} %), violation {other.constr_violation:.1e}, "
         f"{other.nit} steps",
         flush=True,
@@ -103,46 +96,38 @@ def optimum(model: Any, params: Any, height: float, iterations: int) -> heli_jax
     return landing.trajectory
 
 
-def shares(ends: ar.Touchdown, heights: np.ndarray) -> str:
-    """Return the shares of good touchdowns in words."""
-    good = np.asarray(ends.good())
-    low, high = (100 * good[heights == h].mean() for h in (30.0, 100.0))
-    return f"{100 * good.mean():.1f} % ({low:.0f} % from 30 m, {high:.0f} % from 100 m)"
-
-
 def gradients(model: Any, params: Any) -> float:
-    """Return the largest relative difference of gradients through 20 s, by the gains."""
-    entry = ar.engine_failure(model, params, 160.0, 5.0)
-    inputs = ar.calm(model, 20.0)
+    """Return the largest relative error of gradients through 20 s by the gains."""
+    entry, inputs = ar.engine_failure(model, params, 200.0, 5.0), ar.calm(model, 20.0)
 
     @jax.jit
     def end(z: Any) -> Any:
-        run = ar.fly(model, params, ar.Gains(*z), entry.state, inputs)
-        return jnp.stack([v[-1] for v in (run.states.z, run.states.dx, run.states.dz, run.states.Omega)])
+        s = ar.fly(model, params, ar.Gains(*z), entry.state, inputs).states
+        return jnp.stack([v[-1] for v in (s.z, s.dx, s.dz, s.Omega)])
 
     z = jnp.asarray([float(g) for g in ar.Gains()])
-    exact, steps = jax.jit(jax.jacfwd(end))(z), 1e-5 * z
+    exact, steps = np.asarray(jax.jit(jax.jacfwd(end))(z)), 1e-5 * z
     differences = [
         (end(z.at[i].add(h)) - end(z.at[i].add(-h))) / (2.0 * h) for i, h in enumerate(steps)
     ]
-    error = np.abs(np.asarray(exact) - np.stack(differences, 1)).max(1)
+    error = np.abs(exact - np.stack(differences, 1)).max(1)
     return float(np.max(error / np.abs(exact).max(1)))
 
 
 def height_velocity(model: Any, params: Any, count: int, out: Path) -> None:
-    """Draw the entries from which the feedback lands, after a reaction of half a second."""
+    """Draw the entries from which the feedback lands, after a reaction time of half a second."""
     heights, speeds = np.geomspace(1.0, 60.0, count), np.linspace(0.0, 20.0, count)
     h, v = (a.ravel() for a in np.meshgrid(heights, speeds, indexing="ij"))
-    entry = failures(model, params, h, v, np.zeros((h.size, 2)), delay=0.5)
-    calm = ar.calm(model, 20.0)
+    states = failures(model, params, h, v, np.zeros((h.size, 2)), delay=0.5)
+    calm = ar.calm(model, 16.0)
     inputs = jax.tree.map(lambda u: jnp.broadcast_to(u, (h.size, u.size)), calm)
-    ends = flown(model, params, ar.Gains(), entry.state, inputs)
+    ends = touchdowns(model, params, ar.Gains(), states, inputs)
     good = np.asarray(ends.good()).reshape(count, count)
-    for i in range(count - 1, -1, -1):
-        print(f"{heights[i]:6.1f} m  " + "".join(".#"[int(not g)] for g in good[i]))
-    print(f"          0 to {speeds[-1]:g} m/s; # has no good touchdown")
+    for height, row in zip(heights[::-1], good[::-1], strict=True):
+        print(f"{height:6.1f} m  " + "".join("#."[int(g)] for g in row))
+    print(f"          0 to {speeds[-1]:g} m/s; # marks entries without a good touchdown")
     figure, axes = plt.subplots(figsize=(6, 4.5), layout="constrained")
-    speed = np.hypot(np.asarray(ends.vertical), np.asarray(ends.forward)).reshape(count, count)
+    speed = np.hypot(np.asarray(ends.up), np.asarray(ends.forward)).reshape(count, count)
     filled = axes.contourf(speeds, heights, np.minimum(speed, 6.0), np.linspace(0, 6, 13))
     axes.contour(speeds, heights, good.astype(float), [0.5], colors="white")
     axes.set(xlabel="speed [m/s]", ylabel="height [m]", yscale="log")
@@ -152,44 +137,41 @@ def height_velocity(model: Any, params: Any, count: int, out: Path) -> None:
 
 def draw(runs: dict[str, Any], params: Any, out: Path) -> None:
     """Draw flights by name."""
+    labels = ("height [m]", "forward [m/s]", "vertical [m/s]", "rotor speed [1]", "collective [1]")
     figure, axes = plt.subplots(5, 1, figsize=(7, 9), sharex=True, layout="constrained")
     for name, run in runs.items():
         n = int(np.searchsorted(run.times, min(float(run.ended), float(run.times[-1])))) + 1
         s, u = run.states, run.inputs
-        for ax, value in zip(
-            axes, (s.z, s.dx, s.dz, s.Omega / params.Omega, u.x_collective), strict=True
-        ):
+        values = (s.z, s.dx, s.dz, s.Omega / params.Omega, u.x_collective)
+        for ax, label, value in zip(axes, labels, values, strict=True):
             ax.plot(run.times[:n], value[:n], label=name)
-    labels = ("height [m]", "forward [m/s]", "vertical [m/s]", "rotor speed [1]", "collective [1]")
-    for ax, label in zip(axes, labels, strict=True):
-        ax.set_ylabel(label)
+            ax.set_ylabel(label)
     axes[0].legend()
     axes[-1].set_xlabel("time [s]")
     figure.savefig(out / "landings.png", dpi=150)
 
 
 def main() -> None:
-    options = asked(
-        __doc__,
-        "eight minutes",
-        Size("entries", 200, 20, "entries in wind"),
-        out="runs/autorotation",
-    )
+    size = Size("entries", 200, 20, "entries in wind")
+    options = asked(__doc__, "eight minutes", size, out="runs/autorotation")
     jax.config.update("jax_enable_x64", True)
     options.out.mkdir(parents=True, exist_ok=True)
-    params = heli_jax.load_vehicle(ROOT / "configs" / "vehicles" / "x-cell-60.yaml")
-    model = heli_jax.models.helicopter(wind=True)
-    runs = {f"optimum from {h:g} m": optimum(model, params, h, 1000) for h in (30.0, 100.0)}
+    params, model = heli_jax.load_vehicle(VEHICLE), heli_jax.models.helicopter(wind=True)
+    runs = {f"optimum, {h:g} m": optimum(model, params, h, 1000) for h in (30.0, 100.0)}
     for h in (30.0, 100.0):
-        entry = ar.engine_failure(model, params, h, 8.0)
-        calm = ar.calm(model, 30.0)
-        runs[f"feedback from {h:g} m"] = ar.fly(model, params, ar.Gains(), entry.state, calm)
+        state = ar.engine_failure(model, params, h, 8.0).state
+        runs[f"feedback, {h:g} m"] = ar.fly(model, params, ar.Gains(), state, ar.calm(model, 30.0))
     draw(runs, params, options.out)
-    print(f"gradients through 20 s: relative difference {gradients(model, params):.1e}", flush=True)
-    tests = entries(model, params, options.entries, 1)
-    for name, gains in {"first guess": FIRST_GUESS, "Gains()": ar.Gains()}.items():
-        ends = flown(model, params, gains, tests.state, tests.inputs)
-        print(f"{name}: {shares(ends, tests.height)} of {options.entries} entries", flush=True)
+    print(f"gradients through 20 s: relative error {gradients(model, params):.1e}", flush=True)
+    height, *flights = entries(model, params, (30.0, 100.0), options.entries, 1)
+    training = entries(model, params, (30.0, 70.0), 48, 0)[1:]
+    tuned = ar.tune(model, params, FIRST_GUESS, *training, max_steps=5 if options.quick else 18)
+    print("tuned:", ", ".join(f"{n} {v:.3g}" for n, v in tuned._asdict().items()))
+    for name, gains in (("first guess", FIRST_GUESS), ("tuned", tuned), ("Gains()", ar.Gains())):
+        good = np.asarray(touchdowns(model, params, gains, *flights).good())
+        low, high = (100 * good[height == h].mean() for h in (30.0, 100.0))
+        share = f"{100 * good.mean():.1f} % ({low:.0f} % from 30 m, {high:.0f} % from 100 m)"
+        print(f"{name}: lands {share} of {options.entries} entries", flush=True)
     height_velocity(model, params, 8 if options.quick else 20, options.out)
 
 
