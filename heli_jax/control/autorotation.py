@@ -162,7 +162,7 @@ class Gains(NamedTuple):
     k_rotor: Any = 6.7
     """Vertical acceleration per relative lack of rotor energy [m/s^2]."""
     k_energy: Any = 0.64
-    """Relative change of the deceleration per relative lack of energy [1]."""
+    """Relative reduction of the deceleration per relative lack of energy [1]."""
 
 
 _SINK = 0.3
@@ -438,12 +438,8 @@ class LandingProblem:
             )
         )
 
-    def minimised(self, z: np.ndarray, method: str, **options: Any) -> tuple[np.ndarray, Any]:
-        """Return the optimum and SciPy's result, from the start z.
-
-        Args:
-            method: "SLSQP" or "trust-constr", with its options.
-        """
+    def minimised(self, z: np.ndarray, steps: int) -> tuple[np.ndarray, Any]:
+        """Return the optimum and SciPy's result, from the start z in at most so many steps."""
         import scipy.optimize  # flights need not wait for it
 
         z, free = z.copy(), self.free
@@ -463,8 +459,8 @@ class LandingProblem:
         ]
         bounds = scipy.optimize.Bounds(self.low[free], self.high[free])
         result = scipy.optimize.minimize(
-            cost, z[free], jac=True, method=method, constraints=constraints, bounds=bounds,
-            options=options,
+            cost, z[free], jac=True, method="SLSQP", constraints=constraints, bounds=bounds,
+            options={"maxiter": steps, "ftol": 1e-6},
         )  # fmt: skip
         z[free] = result.x
         return z, result
@@ -563,7 +559,7 @@ def land(
     problem = LandingProblem(model, params, entry, limits, wind, grid)
     if start is None:
         start = fly(model, params, Gains(), entry.state, calm(model, 30.0, wind), limits)
-    z, result = problem.minimised(problem.sampled(start), "SLSQP", maxiter=max_steps, ftol=1e-6)
+    z, result = problem.minimised(problem.sampled(start), max_steps)
     _, (equations, _), (inequalities, _) = problem.evaluated(z)
     violation = float(max(np.max(np.abs(equations)), -np.min(inequalities)))
     run = problem.flown(z)

@@ -11,6 +11,8 @@ from heli_jax import naming
 from heli_jax.control import autorotation as ar
 from heli_jax.dynamics import aerodynamics as aero
 
+GRID = ar.Grid(2, 6, 12)
+
 
 @pytest.fixture(scope="module")
 def model():
@@ -24,12 +26,12 @@ def params(vehicles_folder):
 
 @pytest.fixture(scope="module")
 def entry(model, params):
-    return ar.engine_failure(model, params, 20.0, 8.0)
+    return ar.engine_failure(model, params, 30.0, 8.0)
 
 
 @pytest.fixture(scope="module")
 def flight(model, params, entry):
-    return jax.device_get(ar.fly(model, params, ar.Gains(), entry.state, ar.calm(model, 10.0)))
+    return jax.device_get(ar.fly(model, params, ar.Gains(), entry.state, ar.calm(model, 14.0)))
 
 
 def test_the_feedback_lands_and_no_energy_appears(params, flight):
@@ -44,7 +46,7 @@ def test_the_feedback_lands_and_no_energy_appears(params, flight):
 
 
 def test_the_programme_has_the_derivatives_of_finite_differences(model, params, entry, flight):
-    problem = ar.LandingProblem(model, params, entry, ar.Limits(), ar.CALM, ar.Grid(2, 4, 5))
+    problem = ar.LandingProblem(model, params, entry, ar.Limits(), ar.CALM, GRID)
     rng = np.random.default_rng(0)
     z = problem.sampled(flight)
     direction = 1e-3 * rng.standard_normal(z.size) * problem.free
@@ -54,8 +56,7 @@ def test_the_programme_has_the_derivatives_of_finite_differences(model, params, 
 
 
 def test_the_optimum_lands_in_scipy_too(model, params, entry, flight):
-    grid = ar.Grid(2, 4, 15)
-    landing = ar.land(model, params, entry, start=flight, grid=grid)
+    landing = ar.land(model, params, entry, start=flight, grid=GRID)
     assert landing.converged
     run = landing.trajectory
     end = jax.tree.map(lambda v: float(v[-1]), run.states)
