@@ -25,8 +25,10 @@ from heli_jax import naming
 from heli_jax.control import autorotation as ar
 
 VEHICLE = Path(__file__).parent.parent / "configs" / "vehicles" / "x-cell-60.yaml"
-SPEED, WIND, GUSTS = 15.0, 4.0, 0.5
+SPEED, WIND, GUSTS = 15.0, 4.0, np.array([0.5, 0.5, 0.25])
 """Highest entry speed and steady wind, and sd of gusts with a time constant of 1 s [m/s]."""
+UNHARMED = ar.Limits(vertical=1.5, horizontal=3.0)
+"""Speeds at touchdown in the height-velocity diagram."""
 FIRST_GUESS = ar.Gains(
     speed=7.5, sink=9.0, deceleration=22.0, settling=0.2, slowing=0.33,
     k_speed=0.65, k_sink=7.0, k_glide=0.8, k_rotor=6.6, k_energy=0.3,
@@ -56,7 +58,7 @@ def entries(
     size = WIND * np.sqrt(rng.uniform(0.0, 1.0, count))
     wind = np.stack([size * np.cos(angle), size * np.sin(angle)], 1)
     gusts, keep = np.zeros((count, 3, n)), np.exp(-ar.DT)
-    steps = GUSTS * np.sqrt(1.0 - keep**2) * rng.standard_normal((count, 3, n))
+    steps = GUSTS[:, None] * np.sqrt(1.0 - keep**2) * rng.standard_normal((count, 3, n))
     for k in range(1, n):
         gusts[..., k] = keep * gusts[..., k - 1] + steps[..., k]
     gusts[:, :2] += wind[..., None]
@@ -72,7 +74,7 @@ def touchdowns(model: Any, params: Any, gains: Any, states: Any, inputs: Any) ->
     def one(s: Any, u: Any) -> Any:
         return ar.touchdown(params, ar.fly(model, params, gains, s, u))
 
-    return jax.device_get(jax.jit(jax.vmap(one))(states, inputs))
+    return jax.device_get(jax.vmap(one)(states, inputs))
 
 
 def optimum(model: Any, params: Any, height: float) -> Any:
@@ -114,19 +116,26 @@ def gradients(model: Any, params: Any) -> float:
 
 
 def height_velocity(model: Any, params: Any, count: int, out: Path) -> None:
-    """Draw the entries from which the feedback lands, after a reaction time of half a second."""
-    heights, speeds = np.geomspace(1.0, 60.0, count), np.linspace(0.0, 20.0, count)
+    """Draw the entries from which one of several feedbacks lands, after 0.5 s without reaction."""
+    heights, speeds = np.geomspace(0.5, 50.0, count), np.linspace(0.0, 20.0, count)
     h, v = (a.ravel() for a in np.meshgrid(heights, speeds, indexing="ij"))
     states = failures(model, params, h, v, np.zeros((h.size, 2)), delay=0.5)
-    calm = ar.calm(model, 16.0)
+    calm = ar.calm(model, 14.0)
     inputs = jax.tree.map(lambda u: jnp.broadcast_to(u, (h.size, u.size)), calm)
-    ends = touchdowns(model, params, ar.Gains(), states, inputs)
-    good = np.asarray(ends.good()).reshape(count, count)
+    good, least = np.zeros(h.size, bool), np.full(h.size, np.inf)
+    for settling in (1.0, 2.0, 4.0):
+        for slowing in (1.0, 3.0, 9.0):
+            g = ar.Gains()
+            g = g._replace(settling=settling * g.settling, slowing=slowing * g.slowing)
+            ends = touchdowns(model, params, g, states, inputs)
+            good |= np.asarray(ends.good(UNHARMED))
+            landed = np.asarray(ends.height) < 1e-3
+            least = np.where(landed, np.minimum(least, np.hypot(ends.up, ends.forward)), least)
+    good, speed = good.reshape(count, count), least.reshape(count, count)
     for height, row in zip(heights[::-1], good[::-1], strict=True):
         print(f"{height:6.1f} m  " + "".join("#."[int(g)] for g in row))
-    print(f"          0 to {speeds[-1]:g} m/s; # marks entries without a good touchdown")
+    print(f"          0 to {speeds[-1]:g} m/s; # marks entries without an unharmed touchdown")
     figure, axes = plt.subplots(figsize=(6, 4.5), layout="constrained")
-    speed = np.hypot(np.asarray(ends.up), np.asarray(ends.forward)).reshape(count, count)
     filled = axes.contourf(speeds, heights, np.minimum(speed, 6.0), np.linspace(0, 6, 13))
     axes.contour(speeds, heights, good.astype(float), [0.5], colors="white")
     axes.set(xlabel="speed [m/s]", ylabel="height [m]", yscale="log")

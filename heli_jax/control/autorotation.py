@@ -221,7 +221,7 @@ def _collective(p: Any, s: Record, T: Scalar) -> Scalar:
 
 def _calm(model: Model, wind: Wind) -> Record:
     """Return the model's Inputs without sticks."""
-    air = dict(zip(("wind_x", "wind_y", "wind_z"), wind, strict=True))
+    air: dict[str, Any] = {f"wind_{a}": w for a, w in zip("xyz", wind, strict=True)}
     return model.Inputs(**{n: air.get(n, 0.0) for n in naming.names(model.Inputs)})
 
 
@@ -250,14 +250,14 @@ def fly(
 class Touchdown(NamedTuple):
     """End of a flight: speeds [m/s], angles [rad], and extremes of the relative rotor speed."""
 
-    up: Array
-    forward: Array
-    right: Array
-    roll: Array
-    pitch: Array
-    slowest: Array
-    fastest: Array
-    height: Array
+    up: Scalar
+    forward: Scalar
+    right: Scalar
+    roll: Scalar
+    pitch: Scalar
+    slowest: Scalar
+    fastest: Scalar
+    height: Scalar
     """Zero on the ground [m]."""
 
     def good(self, limits: Limits = Limits()) -> Bool[Array, "..."]:
@@ -311,10 +311,9 @@ def tune(
 
         return jax.vmap(one)(states, inputs).ravel()
 
-    slopes = jax.jit(jax.jacfwd(residuals))
+    slopes: Any = jax.jit(jax.jacfwd(residuals))  # SciPy's stubs know no function here
     result = scipy.optimize.least_squares(
-        lambda z: np.asarray(residuals(z)), np.zeros(start.size), lambda z: np.asarray(slopes(z)),
-        max_nfev=max_steps, ftol=1e-3,
+        residuals, np.zeros(start.size), slopes, max_nfev=max_steps, ftol=1e-3
     )  # fmt: skip
     return Gains(*(start * np.exp(result.x)).tolist())
 
@@ -357,7 +356,7 @@ _CYCLIC = 0.005
 """Scales of the states, and of the cyclic stick [m]."""
 _ANGLE, _RATE = 0.1, 0.3
 """Angle [rad] and rate [rad/s] at touchdown that cost as much as the speeds of `Limits`."""
-_EFFORT = 0.1
+_EFFORT = 1.0
 """Cost of a second with a stick at its largest rate. It makes the optimum unique."""
 _FEASIBLE = 1e-4
 """Largest scaled violation of a constraint."""
@@ -457,9 +456,9 @@ class LandingProblem:
             {"type": "eq", "fun": lambda x: part(x, 1)[0], "jac": lambda x: part(x, 1)[1]},
             {"type": "ineq", "fun": lambda x: part(x, 2)[0], "jac": lambda x: part(x, 2)[1]},
         ]
-        bounds = scipy.optimize.Bounds(self.low[free], self.high[free])
+        low, high = self.low[free].tolist(), self.high[free].tolist()
         result = scipy.optimize.minimize(
-            cost, z[free], jac=True, method="SLSQP", constraints=constraints, bounds=bounds,
+            cost, z[free], jac=True, method="SLSQP", constraints=constraints, bounds=[*zip(low, high, strict=True)],
             options={"maxiter": steps, "ftol": 1e-6},
         )  # fmt: skip
         z[free] = result.x
@@ -557,9 +556,10 @@ def land(
         max_steps: limit of the optimiser.
     """
     problem = LandingProblem(model, params, entry, limits, wind, grid)
+    guess: Any = start
     if start is None:
-        start = fly(model, params, Gains(), entry.state, calm(model, 30.0, wind), limits)
-    z, result = problem.minimised(problem.sampled(start), max_steps)
+        guess = fly(model, params, Gains(), entry.state, calm(model, 30.0, wind), limits)
+    z, result = problem.minimised(problem.sampled(guess), max_steps)
     _, (equations, _), (inequalities, _) = problem.evaluated(z)
     violation = float(max(np.max(np.abs(equations)), -np.min(inequalities)))
     run = problem.flown(z)
