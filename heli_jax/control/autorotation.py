@@ -311,9 +311,11 @@ def tune(
 
         return jax.vmap(one)(states, inputs).ravel()
 
-    slopes: Any = jax.jit(jax.jacfwd(residuals))  # SciPy's stubs know no function here
+    jacobian = jax.jit(jax.jacfwd(residuals))
+    slopes: Any = lambda z: np.asarray(jacobian(z))  # noqa: E731 (SciPy's stubs know no function)
     result = scipy.optimize.least_squares(
-        residuals, np.zeros(start.size), slopes, max_nfev=max_steps, ftol=1e-3
+        lambda z: np.asarray(residuals(z)), np.zeros(start.size), slopes, max_nfev=max_steps,
+        ftol=1e-3,
     )  # fmt: skip
     return Gains(*(start * np.exp(result.x)).tolist())
 
@@ -456,9 +458,9 @@ class LandingProblem:
             {"type": "eq", "fun": lambda x: part(x, 1)[0], "jac": lambda x: part(x, 1)[1]},
             {"type": "ineq", "fun": lambda x: part(x, 2)[0], "jac": lambda x: part(x, 2)[1]},
         ]
-        low, high = self.low[free].tolist(), self.high[free].tolist()
+        bounds = [*zip(self.low[free], self.high[free], strict=True)]
         result = scipy.optimize.minimize(
-            cost, z[free], jac=True, method="SLSQP", constraints=constraints, bounds=[*zip(low, high, strict=True)],
+            cost, z[free], jac=True, method="SLSQP", constraints=constraints, bounds=bounds,
             options={"maxiter": steps, "ftol": 1e-6},
         )  # fmt: skip
         z[free] = result.x
