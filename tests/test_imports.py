@@ -48,6 +48,7 @@ ALLOWED = {
     "linear_models": {"dynamics", *BASE},
     "simulation": {"dynamics", *BASE},
     "analysis": {"simulation", "dynamics", "flights", *BASE},
+    "control": {"analysis", "simulation", "dynamics", "flights", *BASE},
     "identification": {"fused", "analysis", "simulation", "dynamics", "flights", *BASE},
     "control": {"analysis", "simulation", "dynamics", "flights", *BASE},
     "stream": {"identification", "simulation", "dynamics", "flights", *BASE},
