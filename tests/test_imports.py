@@ -50,7 +50,6 @@ ALLOWED = {
     "analysis": {"simulation", "dynamics", "flights", *BASE},
     "control": {"analysis", "simulation", "dynamics", "flights", *BASE},
     "identification": {"fused", "analysis", "simulation", "dynamics", "flights", *BASE},
-    "control": {"analysis", "simulation", "dynamics", "flights", *BASE},
     "stream": {"identification", "simulation", "dynamics", "flights", *BASE},
     "models": {"linear_models", "dynamics", *BASE},
     "fused": {"numerics"},

@@ -183,3 +183,27 @@ def response(
     z = np.exp(1j * np.asarray(omega) * dt)[:, None, None]
     x = np.linalg.solve(z * np.eye(len(A)) - A - B @ C, b[:, None].astype(complex))
     return x[:, :, 0] @ G[of]
+
+
+_SQUARINGS = 11
+"""Squarings of a closed loop's matrix, 2048 samples."""
+
+
+def growth(loop: SampledLoop, dt: float) -> Float[Array, ""]:
+    """Return the growth of the closed loop's slowest motion [1/s], differentiable.
+
+    It is the change of the norm of A^n from n = 2048 samples to twice as many. Uncontrolled
+    positions and headings count as 0.
+    """
+    A = loop.A + loop.B @ loop.C
+
+    def squared(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
+        S, log = carry
+        S = S @ S
+        size = jnp.sqrt(jnp.sum(S**2) + 1e-300)
+        log = 2.0 * log + jnp.log(size)
+        return (S / size, log), log
+
+    start = A, jnp.zeros((), A.dtype)
+    _, logs = jax.lax.scan(squared, start, None, length=_SQUARINGS + 1)
+    return (logs[-1] - logs[-2]) / (2**_SQUARINGS * dt)

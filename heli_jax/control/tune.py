@@ -29,6 +29,7 @@ from heli_jax.control.loops import (
     Plant,
     SampledLoop,
     frequencies,
+    growth,
     loop_margins,
     loop_responses,
     plant_of,
@@ -40,6 +41,8 @@ from heli_jax.simulation.simulate import simulate, substeps_for
 
 _SHARP = 100.0
 """Sharpness of the smooth minimum of |1 + L| over frequencies and vehicles."""
+_GROWTH = 0.1
+"""Largest growth of a closed loop that is tuned [1/s]; the smooth minimum takes part of it."""
 _DIVERGED = 1e12
 """Square of a deviation over its largest acceptable value that counts as diverged."""
 _WIDEST = 3.0
@@ -136,13 +139,14 @@ def tune(
         return float(f), np.asarray(g)
 
     zero = np.zeros(moved.size)
+    wanted = np.append(np.full(len(commanded(model, controller)), distance), 0.0)
     with np.errstate(over="ignore"):
         found = scipy.optimize.minimize(
             value, zero, jac=True, method="SLSQP",
             bounds=[(-_WIDEST, _WIDEST)] * moved.size,
             constraints={
                 "type": "ineq",
-                "fun": lambda z: np.asarray(apart(jnp.asarray(z))) - distance,
+                "fun": lambda z: np.asarray(apart(jnp.asarray(z))) - wanted,
                 "jac": lambda z: np.asarray(slope(jnp.asarray(z))),
             },
             options={"maxiter": max_steps, "ftol": 1e-5},
@@ -238,17 +242,26 @@ class Tuning:
         gains = {n: jnp.asarray(v, float) for n, v in gains_of(controller).items()}
         return jax.device_get(jax.jit(jax.vmap(lambda p: self.run(p, gains)))(self.vehicles))
 
-    def distances(self, gains: Mapping[str, Array]) -> Float[Array, " m"]:
-        """Return the smooth minimum of |1 + L| over vehicles and frequencies, by command."""
+    def distances(self, gains: Mapping[str, Array]) -> Float[Array, " m+1"]:
+        """Return smooth minima over the vehicles: of |1 + L| by command, then of stability.
+
+        Stability is the limit of growth less the growth of the closed loop [1/s]. The distance
+        alone does not see it, since an unstable loop may be far from -1.
+        """
         controller = with_gains(self.controller, gains)
 
-        def of_one(plant: Plant) -> Array:
+        def of_one(plant: Plant) -> tuple[Array, Array]:
             loop = sampled_loop(self.model, plant, controller)
-            return jnp.abs(1.0 + loop_responses(loop, self.dt, self.omega))
+            apart = jnp.abs(1.0 + loop_responses(loop, self.dt, self.omega))
+            return apart, _GROWTH - growth(loop, self.dt)
 
-        apart = jax.vmap(of_one)(self.plants)
+        apart, stable = jax.vmap(of_one)(self.plants)
         apart = jnp.moveaxis(apart, 1, 0).reshape(apart.shape[1], -1)
-        return -jax.nn.logsumexp(-_SHARP * apart, axis=1) / _SHARP
+
+        def least(values: Array) -> Array:
+            return -jax.nn.logsumexp(-_SHARP * values, axis=-1) / _SHARP
+
+        return jnp.append(least(apart), least(stable))
 
     def responses(self, controller: Controller) -> Complex[np.ndarray, "k m f"]:
         """Return L of all vehicles at every command and frequency."""

@@ -22,7 +22,7 @@ from heli_jax.control.controller import (
     with_gains,
 )
 from heli_jax.control.laws import Cascade, Loop, StateFeedback
-from heli_jax.control.loops import loop_margins, plant_of, response, sampled_loop
+from heli_jax.control.loops import growth, loop_margins, plant_of, response, sampled_loop
 from heli_jax.control.posterior import SteadyFlights
 from heli_jax.control.regulators import lqg, lqr, pid
 from heli_jax.dynamics.model import zeros
@@ -175,6 +175,20 @@ def test_margins_of_a_rate_loop_are_those_of_python_control(roll):
         gm, pm, *_ = control.stability_margins(s, returnall=True)
     assert float(found.gain[0]) == pytest.approx(np.min(np.abs(20 * np.log10(gm))), rel=1e-4)
     assert float(found.phase[0]) == pytest.approx(np.min(np.abs(pm)), rel=1e-4)
+
+
+def test_growth_is_that_of_the_slowest_mode(roll):
+    model, params = roll
+    plant = plant_of(model, params, zeros(model.State), zeros(model.Inputs), DT)
+    for gain in (0.5, 5.0, 60.0):
+        law = Cascade(
+            loops={"lat": (Loop(2.0, signal="phi"), Loop(gain, signal="p"))}, dt=DT,
+            references=("phi",),
+        )  # fmt: skip
+        loop = sampled_loop(model, plant, law)
+        modes = np.linalg.eigvals(np.asarray(loop.A + loop.B @ loop.C))
+        wanted = np.log(np.max(np.abs(modes))) / DT
+        assert float(growth(loop, DT)) == pytest.approx(wanted, abs=0.02)
 
 
 def least_phase(A, b, k):
