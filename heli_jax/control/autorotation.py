@@ -358,7 +358,7 @@ _CYCLIC = 0.005
 """Scales of the states, and of the cyclic stick [m]."""
 _ANGLE, _RATE = 0.1, 0.3
 """Angle [rad] and rate [rad/s] at touchdown that cost as much as the speeds of `Limits`."""
-_EFFORT = 1.0
+_EFFORT = 0.1
 """Cost of a second with a stick at its largest rate. It makes the optimum unique."""
 _FEASIBLE = 1e-4
 """Largest scaled violation of a constraint."""
