@@ -275,6 +275,11 @@ class Tuning:
     def _loops(self, controller: Controller) -> SampledLoop:
         return jax.vmap(lambda plant: sampled_loop(self.model, plant, controller))(self.plants)
 
+    def closed_matrix(self, controller: Controller, k: int) -> np.ndarray:
+        """Return the closed loop's matrix (n, n) of vehicle k, its states first."""
+        loop = self._loops(controller)
+        return np.asarray(loop.A[k] + loop.B[k] @ loop.C[k])
+
     def judged(self, controller: Controller) -> tuple[float, float]:
         """Return the least distance and the share of stable vehicles."""
         stable = np.all([m.stable for m in self.margins(controller)], axis=0)

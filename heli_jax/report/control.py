@@ -55,8 +55,7 @@ def doubts(run: Any) -> list[str]:
     found, tuned = [], run.tuned
     if run.stable < _SHARE:
         found.append(
-            f"{percent(1.0 - run.stable, 1)} of the vehicles are unstable: gentler weights, a "
-            "larger control.distance, or a fit with smaller uncertainty is needed."
+            f"{percent(1.0 - run.stable, 1)} of the vehicles are unstable. {_unstable(run)}"
         )
     if tuned is not None and not tuned.converged:
         found.append(
@@ -87,6 +86,22 @@ def doubts(run: Any) -> list[str]:
                 "law: lqg estimates them."
             )
     return found
+
+
+def _unstable(run: Any) -> str:
+    """Return the growing mode of an unstable vehicle, by participation factors, and a remedy."""
+    at = int(np.argmin(np.all([m.stable for m in run.margins], axis=0)))
+    A = run.tuning.closed_matrix(run.controller, at)
+    size, right = np.linalg.eig(A)
+    left = np.linalg.pinv(right)
+    k = int(np.argmax(np.abs(size)))
+    names = naming.names(run.model.State)
+    share = np.abs(left[k, : len(names)] * right[: len(names), k])
+    rate = np.log(np.abs(size[k])) / run.controller.dt
+    return (
+        f"One grows at {number(float(rate), 2)} 1/s, mostly in {names[int(np.argmax(share))]}: "
+        "feed this state back, or use gentler weights or a larger control.distance."
+    )
 
 
 def margins_table(run: Any) -> Table:
