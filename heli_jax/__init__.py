@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from heli_jax.analysis.lti import c2d as c2d
     from heli_jax.analysis.lti import d2c as d2c
     from heli_jax.analysis.trim import trim as trim
+    from heli_jax.control_workflow import run_control as run_control
     from heli_jax.design_workflow import run_design as run_design
     from heli_jax.dynamics.model import Model as Model
     from heli_jax.flights import Flight as Flight
@@ -69,6 +70,7 @@ _HOMES = {
         "identification.problem": "Problem Free Prior Nuisance",
         "identification.fit": "check fit",
         "identification.flight_design": "InputLimit Limits design",
+        "control_workflow": "run_control",
         "design_workflow": "run_design",
         "identification.equation_error.rls": "rls",
         "analysis.lti": "c2d d2c",

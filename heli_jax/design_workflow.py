@@ -9,9 +9,9 @@ import numpy as np
 
 from heli_jax import config as configuration
 from heli_jax import generate, naming, run_directory, units
-from heli_jax.analysis.pilot import Pilot
 from heli_jax.config import Experiment
 from heli_jax.config.design_section import DesignedInputConfig, FlightDesignConfig
+from heli_jax.control.pilot import Pilot
 from heli_jax.dynamics.model import require_constants, zeros
 from heli_jax.errors import InputError, located, require_known
 from heli_jax.flights.flight import Flight

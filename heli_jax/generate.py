@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming, units
-from heli_jax.analysis.pilot import Pilot, attitude_hold
 from heli_jax.analysis.trim import STICKS, Condition, Trim, is_full_nonlinear, trim
 from heli_jax.config import (
     Experiment,
@@ -18,6 +17,7 @@ from heli_jax.config import (
     read_flights,
     signals,
 )
+from heli_jax.control.pilot import Pilot, attitude_hold
 from heli_jax.dynamics.check_model import cannot_start
 from heli_jax.dynamics.model import Model, require_constants, require_linear, zeros
 from heli_jax.errors import InputError, located, require_known

@@ -48,20 +48,25 @@ ALLOWED = {
     "linear_models": {"dynamics", *BASE},
     "simulation": {"dynamics", *BASE},
     "analysis": {"simulation", "dynamics", "flights", *BASE},
+    "control": {"analysis", "simulation", "dynamics", "flights", *BASE},
     "identification": {"fused", "analysis", "simulation", "dynamics", "flights", *BASE},
     "stream": {"identification", "simulation", "dynamics", "flights", *BASE},
     "models": {"linear_models", "dynamics", *BASE},
     "fused": {"numerics"},
-    "sweeps": {"fused", "analysis", "simulation", "dynamics", "flights", "run_directory", *BASE},
+    "sweeps": {
+        "fused", "control", "analysis", "simulation", "dynamics", "flights", "run_directory", *BASE,
+    },
     "report": {
-        "identification", "sweeps", "analysis", "simulation", "dynamics", "flights", "models",
+        "identification", "sweeps", "control", "analysis", "simulation", "dynamics", "flights",
+        "models",
         *BASE,
     },
 }  # fmt: skip
 # Entry points may import everything below them, but never the command line.
 ENTRY = {
     "config", "generate", "new_model", "run_directory", "workflow", "cli",
-    "compatibility", "design_workflow", "new_config", "studies", "sweep_workflow",
+    "compatibility", "control_workflow", "design_workflow", "new_config", "studies",
+    "sweep_workflow",
     "__init__",
     "__main__",
 }  # fmt: skip

@@ -7,7 +7,7 @@ import scipy.linalg
 
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import StateSpace, jacobians
-from heli_jax.dynamics.model import Model, axes_of
+from heli_jax.dynamics.model import Model, axes_of, require_continuous
 from heli_jax.dynamics.onboard.delays import require_past
 
 # Params, State and Inputs are the user's classes, hence `Any` below.
@@ -44,7 +44,11 @@ def linearize(model: Model, params: Any, state: Any = None, inputs: Any = None) 
     Args:
         state: default: the model's initial state.
         inputs: default: zeros.
+
+    Raises:
+        ValueError: the model contains a controller (see `heli_jax.control.loops`).
     """
+    require_continuous(model, "linearize")
     return Linearization(
         jacobians(model, params, state, inputs),
         naming.names(model.State),
@@ -64,6 +68,7 @@ def modes(model: Model, params: Any, state: Any = None, inputs: Any = None) -> n
         ValueError: the delay of a delay line is negative.
     """
     require_past(model, params)
+    require_continuous(model, "modes")
     eigenvalues = np.linalg.eigvals(np.asarray(jacobians(model, params, state, inputs).A))
     return eigenvalues[np.argsort(np.abs(eigenvalues))]
 

@@ -75,11 +75,14 @@ def modes_of_flight(
 ) -> tuple[np.ndarray, str] | None:
     """Return the eigenvalues (n,) [1/s] of a model linearised for a flight, and the point in words.
 
-    Returns None if the matrices are not finite.
+    Returns None if the matrices are not finite, or for a model with a controller, which acts at
+    samples.
 
     Args:
         params: the model's parameters, SI; known values of the flight replace them.
     """
+    if model.sampled is not None:
+        return None
     here = naming.replace(params, **{n: jnp.asarray(v) for n, v in flight.known.items()})
     # Known values of the flight come first, since an added mass changes the trim.
     at = operating_point(model, here, flight.inputs, flight.outputs, flight.dt, substeps=substeps)

@@ -30,6 +30,8 @@ _POLISH = 3
 _TRIES = 12
 """Number of starts: the first from momentum theory, the others around it."""
 _ROUNDING = 1e-9
+_TRIMMED = 1e-6
+
 _LOWEST = -0.3
 """Lowest collective stick of an upright vehicle."""
 _UPRIGHT = 1.5
@@ -284,6 +286,19 @@ def plausible(result: Trim) -> Bool[Array, "..."] | np.bool_ | bool:
         # In autorotation the collective pitch may be negative.
         return level & (Omega > 0) & (inputs.x_collective > _LOWEST)
     return level & (Omega > 0) & (inputs.x_throttle > 0)
+
+
+def is_trimmed(trim: Trim) -> jax.Array:
+    """True if it is a steady flight within the sticks' travel."""
+    # `trim` raises without a solution; in a batch the element can only be flagged.
+    sound = plausible(trim) & (trim.residual < _TRIMMED)
+    for name, (low, high) in STICKS.items():
+        if not hasattr(trim.inputs, name):
+            continue
+        stick = getattr(trim.inputs, name)
+        # A governor's stick is at its end, which rounding may exceed.
+        sound = sound & (stick >= low - _TRIMMED) & (stick <= high + _TRIMMED)
+    return sound
 
 
 def _check_sticks(

@@ -107,6 +107,10 @@ _COMMANDS = {
         _arg("--for", dest="wanted", action="append", default=[], metavar="NAME=PERCENT",
              help="sd of a parameter that is enough: a=2%% (default: design.wanted)"),
     )),
+    "control": ("gains and margins of a controller over the posterior of a fit", (
+        *_CONFIG, _OUT, _VERBOSE,
+        _arg("--fit", metavar="DIR", help="run directory of a fit (default: control.fit)"),
+    )),
     "frf": ("frequency responses of a log, with coherence and intervals", (
         _OTHER_LOG, *_CONFIG, _OUT,
     )),
@@ -389,6 +393,20 @@ def _design(options: argparse.Namespace) -> int:
     if run.design.optimum.undetermined:
         return NOT_DETERMINED
     return DONE if run.design.converged else NOT_CONVERGED
+
+
+def _control(options: argparse.Namespace) -> int:
+    out = _new_directory(options)
+    prepare_jax()
+    from heli_jax import workflow
+    from heli_jax.cli import controls
+    from heli_jax.control_workflow import run_control
+
+    experiment = workflow.load_config(options.config, options.set)
+    run = run_control(experiment, out, fit=options.fit, progress=options.say)
+    controls.print_control(run, verbose=options.verbose)
+    converged = run.tuned is None or run.tuned.converged
+    return DONE if converged and run.stable == 1.0 else NOT_CONVERGED
 
 
 def _compatibility(options: argparse.Namespace) -> int:

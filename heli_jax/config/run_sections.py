@@ -88,7 +88,7 @@ class SimulateConfig(Section):
     """velocity of the air along x, y and z (up) [m/s]"""
     hold_attitude: bool = False
     """true: add a pilot's attitude feedback, so that a long manoeuvre does not diverge
-    (`heli_jax.analysis.pilot`)"""
+    (`heli_jax.control.pilot`)"""
     ground: Annotated[float, Field(lt=0, allow_inf_nan=False)] | None = None
     """height at which the run ends [m]; it begins at a height of zero"""
 

@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
+from heli_jax.config.control_section import ControlConfig
 from heli_jax.config.design_section import FlightDesignConfig
 from heli_jax.config.disturbance_section import DisturbanceConfig
 from heli_jax.config.frequency_section import FrequencyConfig
@@ -319,5 +320,7 @@ class Config(Section):
     """many runs, for `heli-jax sweep`"""
     design: FlightDesignConfig | None = None
     """inputs that `heli-jax design` computes"""
+    control: ControlConfig | None = None
+    """controller that `heli-jax control` computes"""
     study: dict[str, list[Any]] | None = None
     """lists of values by key in a study of fits: every combination (docs/studies.md)"""

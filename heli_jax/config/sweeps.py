@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from heli_jax import naming, units
-from heli_jax.analysis.pilot import Pilot
 from heli_jax.analysis.trim import Condition
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.logs import read_flights
 from heli_jax.config.problems import disturbed
 from heli_jax.config.run_sections import AxisConfig, DesignConfig, ReduceConfig, SweepConfig
+from heli_jax.control.pilot import Pilot
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError
 from heli_jax.flights.flight import Flight

@@ -80,6 +80,15 @@ class SteadyFlight(NamedTuple):
     """States whose derivatives must be zero."""
 
 
+class Sampled(NamedTuple):
+    """A change of the state at every sample."""
+
+    dt: float
+    """Sample time [s]."""
+    update: Callable[[Any, Any, Any], Any]
+    """update(params, state, inputs): the State after a controller's step."""
+
+
 class Model(eqx.Module):
     r"""Dynamics $\dot x = f(p, x, u)$, $y = h(p, x, u)$ of one vehicle, with named parts.
 
@@ -157,6 +166,8 @@ class Model(eqx.Module):
     """body_rates(state): body rates p, q and r [rad/s] by name, if the axes' rates are derivatives
     of Euler angles; None: the axes' rates are body rates.
     """
+    sampled: Sampled | None = eqx.field(static=True, default=None, kw_only=True)
+    """Step of a controller at each sample (`with_controller`); None without one."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return by_value(self)
@@ -288,6 +299,16 @@ def linear_misfit(model: Model, params: Record) -> float:
         size = np.max(np.abs(summed)) + np.max(np.abs(parts))
         # The sum of the parts is compared, so an offset such as gravity shows as well as curvature.
         return float(np.max(np.abs(summed - parts)) / max(size, 1e-300))
+
+
+def require_continuous(model: Model, purpose: str) -> None:
+    """Raise if a model contains a controller, which acts at samples.
+
+    Raises:
+        ValueError: with the purpose.
+    """
+    if model.sampled is not None:
+        raise ValueError(f"{purpose}: expected the model without its controller, got {model.name}")
 
 
 def require_linear(model: Model, params: Record) -> None:

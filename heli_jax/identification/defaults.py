@@ -53,6 +53,8 @@ def offset_inputs(
     The offset differs from an initial state or bias. The order is that of the model. Throttle and
     collective have no centre. A free constant term in the equations replaces all offsets.
     """
+    if model.sampled is not None:
+        return ()  # the controller counteracts an offset
     centreless = ("x_throttle", "x_collective", "Omega")
     sticks = [n for n in naming.names(model.Inputs) if n not in centreless]
     # The nonlinear model is the complete helicopter, which flies freely.

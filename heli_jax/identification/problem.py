@@ -401,6 +401,8 @@ def _check_flight(flight: Flight, problem: Problem) -> None:
 
 def _check_model(problem: Problem) -> None:
     params, model = problem.start_params(), problem.model
+    if model.sampled is not None:
+        _check_controller(problem, model.sampled.dt)
     for flight in problem.flights:
         # A flight's known parameters may complete the vehicle.
         own = naming.replace(params, **flight.known)
@@ -411,6 +413,20 @@ def _check_model(problem: Problem) -> None:
             if wrong := cannot_start(model, own, first):
                 raise ValueError(wrong)
     require_linear(model, params)
+
+
+def _check_controller(problem: Problem, dt: float) -> None:
+    """Raise if a fit of a closed loop has another method than output error, or another rate."""
+    if problem.noise_model != "white":
+        raise ValueError(
+            f"method: expected output-error for a model with a controller, got {problem.method}"
+        )
+    for flight in problem.flights:
+        if not math.isclose(flight.dt, dt, rel_tol=1e-6):
+            raise ValueError(
+                f"flight {flight.name}: expected a sample time of {dt:g} s, that of the "
+                f"controller, got {flight.dt:g} s"
+            )
 
 
 def _check_free(name: str, free: Free, model: Model) -> None:

@@ -250,7 +250,7 @@ def _by_samples(
     n = jax.tree.leaves(inputs)[0].shape[0]
     args = args.in_scalars()
     # Expressions of the parameters alone are moved out of the loop over time.
-    if args.discrete is None:
+    if args.discrete is None and model.sampled is None:
         values, field = hoisted(model.vector_field, params, x0, at(inputs, 0))
         term = field_term(model, field)
         args = args._replace(params=values)

@@ -70,6 +70,9 @@ def stopped(
     last = jnp.argmax(over)
     k = jnp.clip(last - 1, 0, n - 2)
     x0, x1, u = _pick(states, k), _pick(states, k + 1), _pick(inputs, k)
+    if model.sampled is not None:
+        # The rates after the sample are those with the new command.
+        x0 = model.sampled.update(params, x0, u)
     h = times[k + 1] - times[k]
     u1 = at_end(inputs, k, linear)
     f0, f1 = model.vector_field(params, x0, u), model.vector_field(params, x1, u1)

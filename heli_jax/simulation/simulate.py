@@ -27,7 +27,6 @@ from heli_jax.simulation.events import NO_END, Event, any_over, stopped
 from heli_jax.simulation.hold import Delays, FlightOrInputs, at, at_end, between_samples, delayed
 from heli_jax.simulation.options import DEFAULT, SimulationOptions
 from heli_jax.simulation.solvers import (
-    Adaptive,
     Exact,
     SolverWrapper,
     Stepped,
@@ -129,7 +128,7 @@ def _method_with_extras(
 ) -> tuple[dfx.AbstractSolver, ZeroOrderHoldArgs, dfx.ODETerm]:
     """Return the solver of a run with the extras of `simulate`: feedback and process noise."""
     method, args, term = per_sample(model, params, inputs, options, linear)
-    if isinstance(method, Adaptive) and options.key is not None:
+    if options.controller is not None and options.key is not None:
         # A step of the controller would need noise of another covariance.
         raise ValueError("key: drawing noise needs fixed steps, got a step-size controller")
     if options.feedback is not None:

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, PyTree, Real
 
+from heli_jax.dynamics.model import Sampled
 from heli_jax.errors import nearest
 from heli_jax.naming import Record, Scalar
 from heli_jax.simulation.discretize import Discrete
@@ -351,6 +352,21 @@ class Adaptive(PerSample):
         reached = jax.tree.map(lambda a, b: jnp.where(h > 0, a[-1], b), sol.ys, y0)
         fine = dfx.RESULTS.where(h > 0, sol.result, dfx.RESULTS.successful)
         return reached, fine
+
+
+class AtSamples(SolverWrapper):
+    """A per-sample solver of a model with a controller, which acts before each step."""
+
+    sampled: Sampled = eqx.field(static=True)
+    linear: tuple[bool, ...] = eqx.field(static=True, default=())
+
+    def stepped(
+        self, terms: dfx.AbstractTerm, t0: Time, t1: Time, y0: PyTree, args: ZeroOrderHoldArgs
+    ) -> Stepped:
+        """Integrate one sample from the state after the controller's step."""
+        now = acting_at(args, sample_index(t0), self.linear)
+        y0 = self.sampled.update(args.params, y0, now)
+        return self.solver.stepped(terms, t0, t1, y0, args)
 
 
 # Implicit solvers need a root finder with tolerances, which a name cannot give.

@@ -22,6 +22,7 @@ from heli_jax.simulation.options import SimulationOptions
 from heli_jax.simulation.solvers import (
     RK4,
     Adaptive,
+    AtSamples,
     Exact,
     PerSample,
     RampArgs,
@@ -164,11 +165,28 @@ def per_sample(
     if options.substeps < 1:
         raise ValueError(f"substeps must be at least 1, got {options.substeps}")
     args = ZeroOrderHoldArgs(params, inputs, dt, delays, None)
-    if controller is None:
-        return PerSample(method, options.substeps, linear=linear), args, term
-    adjoint = dfx.DirectAdjoint() if options.adjoint is None else options.adjoint
-    adaptive = Adaptive(method, 1, controller, adjoint, options.max_steps, linear=linear)
-    return adaptive, args, term
+    method = PerSample(method, options.substeps, linear=linear)
+    if controller is not None:
+        adjoint = dfx.DirectAdjoint() if options.adjoint is None else options.adjoint
+        method = Adaptive(method.solver, 1, controller, adjoint, options.max_steps, linear=linear)
+    if model.sampled is not None:
+        # A traced time cannot be compared: a Problem has compared it.
+        _check_sample_time(model.sampled.dt, options.dt)
+        method = AtSamples(method, model.sampled, linear)
+    return method, args, term
+
+
+def _check_sample_time(controller: float, dt: Number) -> None:
+    """Raise if the controller of a model acts at another sample time than the simulation.
+
+    Raises:
+        ValueError: with both times.
+    """
+    if not isinstance(dt, core.Tracer) and not np.allclose(dt, controller, rtol=1e-6, atol=0.0):
+        raise ValueError(
+            f"dt: the controller acts every {controller:g} s, expected the same sample time, got "
+            f"{float(np.ravel(dt)[0]):g} s"
+        )
 
 
 class _Field(eqx.Module):

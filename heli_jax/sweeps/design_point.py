@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
-from heli_jax.analysis.trim import STICKS, Trim, equilibrium, plausible
+from heli_jax.analysis.trim import equilibrium, is_trimmed
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
 from heli_jax.simulation.accumulate import Accumulated, Steps, accumulated, in_steps
@@ -26,7 +26,6 @@ Scalars = dict[str, jax.Array]
 
 # Accelerations [SI] below which a flight is steady. `trim` requires 1e-10 and tries several starts;
 # an element of a batch has one try and may end slightly above.
-_TRIMMED = 1e-6
 
 
 class FlightNumbers(NamedTuple):
@@ -104,26 +103,13 @@ def steady(plan: Plan, numbers: FlightNumbers, values: Scalars) -> InitialTrim:
     )
     # Without a disturbance: a steady flight is in still air or steady wind.
     trim = equilibrium(whole, plain, condition, wind)
-    sound = _is_trimmed(trim)
+    sound = is_trimmed(trim)
     # The states of a disturbance have no trim and keep their own initial values.
     state = naming.replace(plan.model.initial_state(params), **naming.asdict(trim.state))
     share = 1.0 if plan.options.trimmed.sticks else 0.0
     sticks = jax.tree.map(lambda v: jnp.asarray(share * v, dtype), trim.inputs)
     state = jax.tree.map(lambda v: jnp.asarray(v, dtype), state)
     return InitialTrim(state, sticks, sound)
-
-
-def _is_trimmed(trim: Trim) -> jax.Array:
-    """True if it is a steady flight within the sticks' travel."""
-    # `trim` raises without a solution; in a batch the element can only be flagged.
-    sound = plausible(trim) & (trim.residual < _TRIMMED)
-    for name, (low, high) in STICKS.items():
-        if not hasattr(trim.inputs, name):
-            continue
-        stick = getattr(trim.inputs, name)
-        # A governor's stick is at its end, which rounding may exceed.
-        sound = sound & (stick >= low - _TRIMMED) & (stick <= high + _TRIMMED)
-    return sound
 
 
 _Run = tuple[Scalars, dict[str, jax.Array], Any, list[jax.Array]]

@@ -7,8 +7,8 @@ import jax
 import numpy as np
 
 from heli_jax import naming
-from heli_jax.analysis.pilot import Pilot
 from heli_jax.analysis.trim import Condition, is_full_nonlinear
+from heli_jax.control.pilot import Pilot
 from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.model import Model, plain, reads, require_constants, require_linear
 from heli_jax.errors import nearest, require_kind

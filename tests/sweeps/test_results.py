@@ -9,8 +9,8 @@ import pytest
 
 from heli_jax import Flight, Model, linearize, models, naming, simulate, sweep
 from heli_jax.analysis.linear import modes
-from heli_jax.analysis.pilot import attitude_hold
 from heli_jax.analysis.trim import Condition, trim
+from heli_jax.control.pilot import attitude_hold
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.validation.metrics import metrics
 from heli_jax.simulation.accumulate import accumulated

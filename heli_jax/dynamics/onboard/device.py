@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Annotated, Any, NamedTuple
 
 from heli_jax import naming, units
-from heli_jax.dynamics.model import Model, SteadyFlight
+from heli_jax.dynamics.model import Model, SteadyFlight, require_continuous
 from heli_jax.errors import nearest
 from heli_jax.naming import Record, Scalar
 
@@ -46,6 +46,7 @@ class Device(abc.ABC):
 
     def __init__(self, model: Model, parts: Parts) -> None:
         self.model = model
+        require_continuous(model, type(self).__name__.strip("_"))
         # Check first: a name that is taken would silently replace the model's own field.
         _check_new(model, parts)
         title = type(self).__name__.strip("_")

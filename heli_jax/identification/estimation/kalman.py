@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
-from heli_jax.dynamics.model import Model, correlation_of, initial_sd_of
+from heli_jax.dynamics.model import Model, correlation_of, initial_sd_of, require_continuous
 from heli_jax.naming import Scalar
 from heli_jax.numerics.matrix_exponential import product, van_loan
 from heli_jax.simulation.discretize import process_noise
@@ -267,6 +267,7 @@ def filter_start(
     x0 = model.initial_state(params) if begin is None else begin
     dtype = jax.tree.leaves(inputs)[0].dtype
     estimate = naming.ravel(x0, dtype), first_covariance(model, params, dtype)
+    require_continuous(model, "a Kalman filter")
     # Unmeasured outputs are dropped, because each output costs a correction per sample.
     rows = jnp.asarray([naming.names(model.Outputs).index(n) for n in measured])
     y = jnp.stack(list(measured.values()), axis=1)

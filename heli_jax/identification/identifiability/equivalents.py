@@ -367,7 +367,12 @@ class Modes(NamedTuple):
 
 # Params is Any: a record of the model's own class.
 def modes_of(problem: Problem, params: Any, flight: Flight) -> Modes | None:
-    """Return the model's modes at a flight's operating point; None if a matrix is not finite."""
+    """Return the model's modes at a flight's operating point.
+
+    None if a matrix is not finite, or for a model with a controller, which acts at samples.
+    """
+    if problem.model.sampled is not None:
+        return None
     at = operating_point(
         problem.model, params, flight.inputs, flight.outputs, flight.dt, substeps=problem.substeps
     )

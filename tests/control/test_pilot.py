@@ -7,8 +7,8 @@ import pytest
 import scipy.linalg
 
 from heli_jax import load_vehicle, models, naming
-from heli_jax.analysis import pilot as piloting
 from heli_jax.analysis.trim import trim
+from heli_jax.control import pilot as piloting
 from heli_jax.simulation.simulate import simulate
 
 STATES = ("phi", "theta", "psi", "dphi", "dtheta", "dpsi", "beta_roll", "beta_pitch")

@@ -1,0 +1,91 @@
+"""Section `control`: a controller and how it is judged."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from heli_jax.config.run_sections import NoiseConfig, StartConfig
+from heli_jax.config.section import Finite, Positive, Section
+
+
+class AcceptableConfig(Section):
+    """Largest acceptable deviation of a signal or command."""
+
+    most: Positive
+    """deviation from steady flight that costs one, in `unit`"""
+    limit: Positive | None = None
+    """largest command, or output of a loop of pid, in `unit`"""
+    unit: str | None = None
+    """unit; default the model's SI unit"""
+    integral: Positive | None = None
+    """time [s] over which the largest deviation may last: removes the steady error (lqr)"""
+    full_stick: Positive | None = None
+    """command at full output of the autopilot, in `unit`: writes gains for ArduPilot and PX4 (pid)
+    """
+    step: Finite | None = None
+    """step of the set point, in `unit`, that is flown; a number gives the signal a set point"""
+
+
+class GustConfig(Section):
+    """Random change of an input, a first-order process."""
+
+    sd: Positive
+    """standard deviation [SI]"""
+    tau: Positive = 1.0
+    """correlation time [s]"""
+
+
+class ControlConfig(Section):
+    """Controller that `heli-jax control` computes, and its test over the posterior of a fit."""
+
+    law: Literal["lqr", "lqg", "pid"] = "lqr"
+    """lqr: regulator with the true states; lqg: with a Kalman filter of the outputs in `sensors`;
+    pid: the cascades of `loops`"""
+    rate: Positive
+    """steps of the controller a second [Hz]"""
+    signals: dict[str, AcceptableConfig] = {}
+    """outputs and states, by name"""
+    inputs: dict[str, AcceptableConfig]
+    """commanded inputs, by name"""
+    loops: dict[str, dict[str, Positive]] = {}
+    """pid: by input, the crossover [rad/s] of each signal from the outermost loop to the innermost
+    """
+    integral: tuple[str, ...] = ()
+    """pid: signals with an integral"""
+    sensors: dict[str, NoiseConfig] = {}
+    """lqg: measured outputs with the sd of their white noise"""
+    noise: dict[str, Positive] = {}
+    """lqg: square root of the spectral density of white noise [SI times sqrt(s)] at inputs, or of
+    the rates of states"""
+    start: StartConfig = StartConfig()
+    """steady flight of the full helicopter"""
+    gusts: dict[str, GustConfig] = {}
+    """random changes that are flown: of wind_x, wind_y, wind_z (full helicopter), or of any input
+    """
+    duration: Positive = 10.0
+    """length of the simulated flight [s]"""
+    fit: str | None = None
+    """run directory of the fit whose posterior the vehicles are drawn from; default: --fit"""
+    samples: Annotated[int, Field(ge=1, le=10_000)] = 200
+    """vehicles of the posterior for which the controller is judged"""
+    vehicles: Annotated[int, Field(ge=1, le=1000)] = 16
+    """vehicles for which the gains are tuned"""
+    distance: Annotated[float, Field(ge=0, lt=1)] = 0.5
+    """least distance of every loop from -1: 0.5 is a gain margin of 6 dB and a phase margin of 29
+    deg"""
+    max_steps: Annotated[int, Field(ge=0)] = 40
+    """most steps of the tuning; 0: no tuning"""
+    seed: Annotated[int, Field(ge=0)] = 0
+    """seed of vehicles and gusts"""
+
+    @model_validator(mode="after")
+    def _complete(self) -> "ControlConfig":
+        if not self.inputs:
+            raise ValueError("inputs: expected a commanded input, got none")
+        if (self.law == "pid") != bool(self.loops):
+            raise ValueError(f"loops: expected with law: pid alone, got law: {self.law}")
+        if (self.law == "lqg") != bool(self.sensors):
+            raise ValueError(f"sensors: expected with law: lqg alone, got law: {self.law}")
+        for name in set(self.loops) ^ set(self.inputs) if self.loops else ():
+            raise ValueError(f"loops: expected the same names as inputs, got {name!r} in one")
+        return self

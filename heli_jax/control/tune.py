@@ -1,0 +1,291 @@
+"""Gains tuned by gradients through the nonlinear closed loop, for many vehicles at once."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from heli_jax import naming
+from heli_jax.analysis.margins import Margins
+from heli_jax.control.controller import (
+    COMMAND,
+    SET,
+    STATE,
+    Controller,
+    begin,
+    commanded,
+    gains_of,
+    in_loop,
+    measured,
+    require_signals,
+    signals_of,
+    with_controller,
+    with_gains,
+)
+from heli_jax.control.loops import (
+    Plant,
+    SampledLoop,
+    frequencies,
+    growth,
+    loop_margins,
+    loop_responses,
+    plant_of,
+    sampled_loop,
+)
+from heli_jax.dynamics.model import Model
+from heli_jax.simulation.options import REVERSE_MODE
+from heli_jax.simulation.simulate import simulate, substeps_for
+
+_SHARP = 100.0
+"""Sharpness of the smooth minimum of |1 + L| over frequencies and vehicles."""
+_GROWTH = 0.1
+"""Largest growth of a closed loop that is tuned [1/s]; the smooth minimum takes part of it."""
+_DIVERGED = 1e12
+"""Square of a deviation over its largest acceptable value that counts as diverged."""
+_WIDEST = 3.0
+"""Largest change of a gain's logarithm."""
+
+
+class Scenario(NamedTuple):
+    """Flight for which gains are tuned, in deviations from steady flight."""
+
+    inputs: Mapping[str, Any]
+    """Inputs (N,) that no controller commands, such as wind, SI."""
+    set_points: Mapping[str, Any]
+    """Changes of set points (N,) by signal, SI."""
+    samples: int
+
+
+class Flown(NamedTuple):
+    """A flight in closed loop; arrays (N,), vmap adds vehicles."""
+
+    deviations: dict[str, Any]
+    """Signals less their set points, or less their values in steady flight."""
+    commands: dict[str, Any]
+    """Commands as held before each sample."""
+    finite: Any
+    """True if the vehicle did not diverge out of the range of floats."""
+
+
+class Tuned(NamedTuple):
+    """Gains after the optimisation."""
+
+    controller: Any
+    converged: bool
+    """True if the optimiser converged, and all vehicles are stable with the wanted distance."""
+    cost: tuple[float, float]
+    """Cost before and after: mean over vehicles of log(1 + mean square of deviations and commands
+    over their largest acceptable values)."""
+    distance: tuple[float, float]
+    """Least distance |1 + L| before and after, over vehicles, commands and frequencies."""
+    stable: tuple[float, float]
+    """Share of stable vehicles before and after."""
+
+
+def tune(
+    model: Model,
+    vehicles: Any,
+    trimmed: Any,
+    controller: Controller,
+    scenario: Scenario,
+    *,
+    most: Mapping[str, float],
+    distance: float = 0.5,
+    max_steps: int = 50,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Tuned:
+    r"""Return the controller whose gains minimise deviations and effort over a set of vehicles.
+
+    The cost is the mean over the vehicles of $\log(1 + \overline{\sum_j (e_j/m_j)^2 + \sum_i
+    (u_i/m_i)^2})$ of the nonlinear closed loop, so that a diverging vehicle counts without drowning
+    the others. Gains keep their signs. $|1 + L| \ge$ `distance` holds at every command, frequency
+    and vehicle: a gain margin of $-20\log_{10}(1-d)$ dB and a phase margin of $2\arcsin(d/2)$.
+
+    Args:
+        vehicles: the model's Params with arrays (k,), such as draws of a posterior. All start in
+            the steady flight of the first, and have its sticks.
+        trimmed: steady flights with arrays (k,), see `trims_of`.
+        controller: gains to begin with.
+        most: largest acceptable deviation of signals and commands, SI.
+        distance: least distance of L from -1.
+        max_steps: most steps of SLSQP.
+
+    Raises:
+        ValueError: an unknown name, or a controller without gains.
+    """
+    import scipy.optimize  # simulations with a pilot need not wait for it
+
+    problem = Tuning(model, vehicles, trimmed, controller, scenario, dict(most))
+    names = list(gains_of(controller))
+    start = np.asarray([float(v) for v in gains_of(controller).values()])
+    moved = np.flatnonzero(start)
+    if not moved.size:
+        raise ValueError("expected a controller with gains, got none that is not zero")
+
+    def gains(z: Array) -> dict[str, Array]:
+        k = jnp.asarray(start).at[moved].set(start[moved] * jnp.exp(z))
+        return dict(zip(names, k, strict=True))
+
+    cost = jax.jit(jax.value_and_grad(lambda z: problem.cost(gains(z))))
+    apart = jax.jit(lambda z: problem.distances(gains(z)))
+    slope = jax.jit(jax.jacrev(lambda z: problem.distances(gains(z))))
+
+    def value(z: np.ndarray) -> tuple[float, np.ndarray]:
+        f, g = cost(jnp.asarray(z))
+        progress(f"cost {float(f):.4g}")
+        return float(f), np.asarray(g)
+
+    zero = np.zeros(moved.size)
+    wanted = np.append(np.full(len(commanded(model, controller)), distance), 0.0)
+    with np.errstate(over="ignore"):
+        found = scipy.optimize.minimize(
+            value, zero, jac=True, method="SLSQP",
+            bounds=[(-_WIDEST, _WIDEST)] * moved.size,
+            constraints={
+                "type": "ineq",
+                "fun": lambda z: np.asarray(apart(jnp.asarray(z))) - wanted,
+                "jac": lambda z: np.asarray(slope(jnp.asarray(z))),
+            },
+            options={"maxiter": max_steps, "ftol": 1e-5},
+        )  # fmt: skip
+    made = with_gains(controller, gains(jnp.asarray(found.x)))
+    before, after = problem.judged(controller), problem.judged(made)
+    reached = bool(found.success) and after[1] == 1.0 and after[0] >= distance - 1e-3
+    costs = value(zero)[0], value(found.x)[0]
+    return Tuned(made, reached, costs, (before[0], after[0]), (before[1], after[1]))
+
+
+class Tuning:
+    """Cost and distances of a set of vehicles, as functions of the gains."""
+
+    def __init__(
+        self,
+        model: Model,
+        vehicles: Any,
+        trimmed: Any,
+        controller: Controller,
+        scenario: Scenario,
+        most: dict[str, float],
+    ) -> None:
+        model = in_loop(model, commanded(model, controller))
+        known = (*signals_of(model), *naming.names(model.Inputs))
+        require_signals(most, known, f"most: model {model.name} has no signal or input")
+        require_signals(
+            scenario.inputs,
+            naming.names(model.Inputs),
+            f"scenario: model {model.name} has no input",
+        )
+        require_signals(
+            scenario.set_points, controller.references, "scenario: the controller has no set point"
+        )
+        self.model, self.controller, self.dt = model, controller, controller.dt
+        self.closed = with_controller(model, controller)
+        self.vehicles, self.most, self.scenario = vehicles, most, scenario
+        self.plants: Plant = jax.vmap(lambda p, t: plant_of(model, p, t[0], t[1], self.dt))(
+            vehicles, (trimmed.state, trimmed.inputs)
+        )
+        first = jax.tree.map(lambda v: v[0], (vehicles, trimmed.state, trimmed.inputs))
+        state, inputs = begin(
+            self.closed, self.params(first[0], {}), _Flight(*first[1:]), scenario.samples
+        )
+        changed = {**scenario.inputs, **{SET + n: v for n, v in scenario.set_points.items()}}
+        self.begun = state
+        self.inputs = naming.replace(
+            inputs, **{n: getattr(inputs, n) + jnp.asarray(v) for n, v in changed.items()}
+        )
+        self.omega = frequencies(self.dt)
+
+    def params(self, vehicle: Any, gains: Mapping[str, Any]) -> Any:
+        return self.closed.Params(**{**naming.asdict(vehicle), **gains})
+
+    def run(self, vehicle: Any, gains: Mapping[str, Any], **options: Any) -> "Flown":
+        """Return the flight of one vehicle."""
+        params = self.params(vehicle, gains)
+        run = simulate(
+            self.closed, params, self.inputs, dt=self.dt, initial_state=self.begun,
+            substeps=substeps_for(self.dt, self.closed.fastest), **options,
+        )  # fmt: skip
+        signals = jax.vmap(lambda s, u: measured(self.closed, params, s, u))(run.states, run.inputs)
+        first = jax.tree.map(lambda v: v[0], self.inputs)
+        at = measured(self.closed, params, self.begun, first)
+        off = {
+            n: v - getattr(run.inputs, SET + n, at[n])
+            for n, v in signals.items()
+            if not n.startswith((COMMAND, STATE))
+        }
+        held = {n: getattr(run.states, COMMAND + n) for n in commanded(self.model, self.controller)}
+        return Flown(off, held, run.finite)
+
+    def cost(self, gains: Mapping[str, Array]) -> Float[Array, ""]:
+        """Return the mean cost of the vehicles."""
+
+        def of_one(vehicle: Any) -> Array:
+            flown = self.run(vehicle, gains, adjoint=REVERSE_MODE)
+            both = {**flown.deviations, **flown.commands}
+            total = sum((both[n] / size) ** 2 for n, size in self.most.items())
+            # A vehicle that left the range of floats has no gradient; it counts as a large cost.
+            total = jnp.where(jnp.isfinite(total), total, _DIVERGED)
+            return jnp.log1p(jnp.mean(jnp.minimum(total, _DIVERGED)))
+
+        return jnp.mean(jax.vmap(of_one)(self.vehicles))
+
+    def cost_of(self, controller: Controller) -> float:
+        """Return the mean cost of the vehicles with a controller."""
+        gains = {n: jnp.asarray(v, float) for n, v in gains_of(controller).items()}
+        return float(jax.jit(self.cost)(gains))
+
+    def flown(self, controller: Controller) -> "Flown":
+        """Return the flights of all vehicles, NumPy arrays (k, N)."""
+        gains = {n: jnp.asarray(v, float) for n, v in gains_of(controller).items()}
+        return jax.device_get(jax.jit(jax.vmap(lambda p: self.run(p, gains)))(self.vehicles))
+
+    def distances(self, gains: Mapping[str, Array]) -> Float[Array, " m+1"]:
+        """Return smooth minima over the vehicles: of |1 + L| by command, then of stability.
+
+        Stability is the limit of growth less the growth of the closed loop [1/s]. The distance
+        alone does not see it, since an unstable loop may be far from -1.
+        """
+        controller = with_gains(self.controller, gains)
+
+        def of_one(plant: Plant) -> tuple[Array, Array]:
+            loop = sampled_loop(self.model, plant, controller)
+            apart = jnp.abs(1.0 + loop_responses(loop, self.dt, self.omega))
+            return apart, _GROWTH - growth(loop, self.dt)
+
+        apart, stable = jax.vmap(of_one)(self.plants)
+        apart = jnp.moveaxis(apart, 1, 0).reshape(apart.shape[1], -1)
+
+        def least(values: Array) -> Array:
+            return -jax.nn.logsumexp(-_SHARP * values, axis=-1) / _SHARP
+
+        return jnp.append(least(apart), least(stable))
+
+    def responses(self, controller: Controller) -> Complex[np.ndarray, "k m f"]:
+        """Return L of all vehicles at every command and frequency."""
+        respond = jax.vmap(lambda loop: loop_responses(loop, self.dt, self.omega))
+        return np.asarray(respond(self._loops(controller)))
+
+    def margins(self, controller: Controller) -> tuple[Margins, ...]:
+        """Return the margins (k,) of the loop at each command."""
+        return loop_margins(self._loops(controller), self.dt)
+
+    def _loops(self, controller: Controller) -> SampledLoop:
+        return jax.vmap(lambda plant: sampled_loop(self.model, plant, controller))(self.plants)
+
+    def closed_matrix(self, controller: Controller, k: int) -> np.ndarray:
+        """Return the closed loop's matrix (n, n) of vehicle k, its states first."""
+        loop = self._loops(controller)
+        return np.asarray(loop.A[k] + loop.B[k] @ loop.C[k])
+
+    def judged(self, controller: Controller) -> tuple[float, float]:
+        """Return the least distance and the share of stable vehicles."""
+        stable = np.all([m.stable for m in self.margins(controller)], axis=0)
+        return float(np.min(np.abs(1.0 + self.responses(controller)))), float(np.mean(stable))
+
+
+class _Flight(NamedTuple):
+    state: Any
+    inputs: Any

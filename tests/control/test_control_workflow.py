@@ -1,0 +1,174 @@
+"""The command control, vehicles of a posterior, and tuning."""
+
+import csv
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from heli_jax import linear_model, naming
+from heli_jax.cli.commands import main
+from heli_jax.control.posterior import draws, vehicles_of
+from heli_jax.control.regulators import lqr
+from heli_jax.control.tune import Scenario, Tuning, tune
+from heli_jax.identification.result import Estimate
+
+DT = 0.02
+CONFIG = """
+model: {linear: roll-flybarless}
+control:
+  law: %s
+  rate: 50
+  max_steps: %d
+  duration: 2
+  signals:
+    phi: {most: 10, unit: deg, step: 5}
+    p: {most: 1.0}
+  inputs: {lat: {most: 0.05}}
+  gusts: {lat: {sd: 0.005}}
+"""
+
+
+def run(tmp_path, text, *more):
+    config = tmp_path / "control.yaml"
+    config.write_text(text)
+    return main(["control", str(config), "--out", str(tmp_path / "out"), "--quiet", *more])
+
+
+def test_a_regulator_of_a_linear_model_in_one_command(tmp_path, capsys):
+    assert run(tmp_path, CONFIG % ("lqr", 3)) in (0, 4)
+    content = json.loads((tmp_path / "out" / "control.json").read_text())
+    assert content["stable"] == 1.0
+    assert set(content["loops"]) == {"lat"}
+    assert content["tuning"]["cost"][1] <= content["tuning"]["cost"][0]
+    rows = list(csv.reader((tmp_path / "out" / "gains.csv").read_text().splitlines()))
+    assert {n: float(v) for n, v in rows[1:]} == content["gains"]
+    assert (tmp_path / "out" / "report.html").stat().st_size > 10_000
+    assert "stable" in capsys.readouterr().out
+
+
+def test_gains_of_rate_and_angle_loops_for_autopilots(tmp_path):
+    text = """
+model: {linear: roll-flybarless}
+control:
+  law: pid
+  rate: 100
+  max_steps: 0
+  duration: 1
+  signals: {phi: {most: 10, unit: deg, step: 5}}
+  inputs: {lat: {most: 0.05, full_stick: 0.2}}
+  loops: {lat: {phi: 2.0, p: 8.0}}
+"""
+    assert run(tmp_path, text) == 0
+    assert not (tmp_path / "out" / "ardupilot.param").exists()  # no signal named roll
+
+
+@pytest.mark.parametrize(
+    ("change", "place"),
+    [
+        (("law: lqr", "law: pid"), "loops"),
+        (("law: lqr", "law: lqg"), "sensors"),
+        (("inputs: {lat", "inputs: {stick"), "control.inputs"),
+        (("p: {most", "speed: {most"), "control.signals"),
+        (("most: 1.0", "most: 0.0"), "most"),
+        (("gusts: {lat", "gusts: {wind_x"), "wind"),
+        (("duration: 2", "duration: 0.01"), "duration"),
+        (("rate: 50", "rate: 50\n  fit: nowhere"), "nowhere"),
+    ],
+)
+def test_wrong_configurations_end_in_one_sentence(tmp_path, capsys, change, place):
+    assert run(tmp_path, (CONFIG % ("lqr", 0)).replace(*change)) == 2
+    err = capsys.readouterr().err
+    assert place in err
+    assert len(err.splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+class _Fitted:
+    """Estimates with a correlation, as a fit has them."""
+
+    def __init__(self, estimates, correlation):
+        self.estimates = estimates
+        self.content = {"verdict": {"names": list(estimates), "correlation": correlation}}
+
+
+def estimate(value, sd, low, high):
+    fields = dict.fromkeys(Estimate._fields, None)
+    return Estimate(**{**fields, "value": value, "sd": sd, "lower95": low, "upper95": high})
+
+
+def test_draws_have_the_intervals_and_the_correlation_of_the_fit():
+    z = 1.959963984540054
+    log = estimate(2.0, 0.4, 2.0 * np.exp(-0.2 * z), 2.0 * np.exp(0.2 * z))
+    plain = estimate(-1.0, 0.5, -1.0 - 0.5 * z, -1.0 + 0.5 * z)
+    found = draws(_Fitted({"a": log, "b": plain}, [[1.0, 0.8], [0.8, 1.0]]), 20_000, seed=1)
+    assert (found["a"][0], found["b"][0]) == (2.0, -1.0)
+    both = np.stack([np.log(found["a"] / 2.0), found["b"]])
+    np.testing.assert_allclose(both.std(axis=1), [0.2, 0.5], rtol=0.03)
+    assert np.corrcoef(both)[0, 1] == pytest.approx(0.8, abs=0.01)
+    unknown = estimate(1.0, None, None, None)
+    with pytest.raises(ValueError, match="not identifiable"):
+        draws(_Fitted({"a": unknown}, [[1.0]]), 10)
+
+
+@pytest.fixture(scope="module")
+def tuning():
+    found = linear_model("roll")
+    model, params = found.model, found.vehicle().params
+    rng = np.random.default_rng(2)
+    values = {"Lb": float(params.Lb) * np.exp(np.r_[0.0, 0.3 * rng.standard_normal(5)])}
+    vehicles, flights, lost = vehicles_of(model, params, values)
+    assert lost == 0
+    first = jax.tree.map(lambda v: v[0], flights)
+    most = {"phi": 0.02, "lat": 0.2}
+    law = lqr(model, params, first, most=most, dt=DT, references=("phi",))
+    scenario = Scenario({}, {"phi": 0.1 * np.ones(150)}, 150)
+    return model, vehicles, flights, law, scenario, most
+
+
+def test_the_gradient_of_the_cost_is_a_difference(tuning):
+    model, vehicles, flights, law, scenario, most = tuning
+    of = Tuning(model, vehicles, flights, law, scenario, most)
+    gains = {f"controller_gains_lat_{n}": jnp.asarray(v) for n, v in law.gains["lat"].items()}
+    cost = jax.jit(of.cost)
+    slope = jax.jit(jax.grad(of.cost))(gains)
+    for name, value in gains.items():
+        h = 1e-5 * abs(float(value)) + 1e-9
+        up, down = (float(cost({**gains, name: value + s * h})) for s in (1, -1))
+        assert float(slope[name]) == pytest.approx((up - down) / (2 * h), rel=1e-4, abs=1e-7)
+
+
+def test_tuning_lowers_the_cost_and_keeps_the_distance(tuning):
+    model, vehicles, flights, law, scenario, most = tuning
+    found = tune(model, vehicles, flights, law, scenario, most=most, distance=0.6)
+    assert found.converged
+    assert found.cost[1] < found.cost[0]
+    assert found.distance[1] >= 0.6 - 1e-3
+    assert found.stable[1] == 1.0
+    # The loop's distance by a simulation in NumPy: no vehicle oscillates.
+    flown = Tuning(model, vehicles, flights, found.controller, scenario, most).flown(
+        found.controller
+    )
+    assert np.all(np.abs(flown.deviations["phi"][:, -1]) < 0.01)
+
+
+def test_wrong_names_of_a_tuning_are_refused(tuning):
+    model, vehicles, flights, law, scenario, most = tuning
+    for flown, weights in (
+        (scenario, {"speed": 1.0}),
+        (scenario._replace(inputs={"wind_x": np.zeros(150)}), most),
+        (scenario._replace(set_points={"p": np.zeros(150)}), most),
+    ):
+        with pytest.raises(ValueError, match="no"):
+            tune(model, vehicles, flights, law, flown, most=weights)
+
+
+def test_a_vehicle_that_moves_at_zero_is_refused():
+    found = linear_model("roll")
+    params = naming.replace(found.vehicle().params)
+    vehicles, flights, lost = vehicles_of(found.model, params, {})
+    assert lost == 0
+    assert jax.tree.leaves(vehicles)[0].shape == (1,)
+    assert jax.tree.leaves(flights)[0].shape == (1,)
