@@ -38,6 +38,9 @@ _SHARP = 300.0
 """Sharpness of the smooth maximum: it exceeds the maximum by log(values near it) / 300."""
 _MOST_TIMES = 1e4
 """Repetitions after which more do not help."""
+_GROWTH = 10.0
+"""Length of a flight over the time constant of a growing mode, at most: a deviation grows by
+exp(10)."""
 CRITERIA = ("D", "A", "E")
 
 
@@ -55,7 +58,7 @@ class Limits:
 
     Attributes:
         inputs: inputs that are excited, by name.
-        motion: largest absolute value of outputs and states by name, SI.
+        motion: largest absolute value of outputs, states and acting inputs by name, SI.
     """
 
     inputs: Mapping[str, InputLimit]
@@ -127,7 +130,8 @@ class Design(NamedTuple):
         return float(np.sqrt(np.max(powers @ C @ powers)))
 
     def needed(self, rated: Rated, wanted: Mapping[str, float]) -> float:
-        """Return the duration [s] after which a manoeuvre, repeated, gives the wanted sds.
+        """Return the duration [s] after which a manoeuvre, repeated, gives the wanted sds: that of
+        one run at least.
 
         It is infinite if no duration does, as for a parameter that only its prior determines.
 
@@ -143,7 +147,9 @@ class Design(NamedTuple):
 
         if not enough(_MOST_TIMES):
             return math.inf
-        low, high = -math.log(_MOST_TIMES), math.log(_MOST_TIMES)
+        if enough(1.0):
+            return self.duration
+        low, high = 0.0, math.log(_MOST_TIMES)
         for _ in range(40):
             middle = 0.5 * (low + high)
             low, high = (low, middle) if enough(math.exp(middle)) else (middle, high)
@@ -159,6 +165,7 @@ def design(
     rest: Mapping[str, float] | None = None,
     differences: Sequence[Mapping[str, tuple[float, float]]] | None = None,
     feedback: Feedback | None = None,
+    chirps: Sequence[str] = ("chirp",),
     vehicles: int = 1,
     seed: int = 0,
     max_steps: int = 400,
@@ -179,13 +186,15 @@ def design(
             and highest values.
         feedback: the loop that flies the vehicle, as in `simulate`. It receives the excitation as
             its inputs. The recorded inputs are those that act.
+        chirps: kinds of chirps in the library, such as those that autopilots play.
         vehicles: vehicles drawn from the priors or bounds of the free parameters; the design is for
             all of them. 1: the start values.
         seed: seed of the draw.
         max_steps: limit of the optimiser; 0: only the library is rated.
 
     Raises:
-        ValueError: an unknown name, a limit that is not positive, or a method in frequency.
+        ValueError: an unknown name, a limit that is not positive or that the vehicle exceeds without
+            excitation, a vehicle that diverges, or a method in frequency.
     """
     report = progress or (lambda _: None)
     if problem.noise_model == "spectrum" or problem.window is not None:
@@ -204,8 +213,9 @@ def design(
     points = _points(problem, np.asarray(z), vehicles, seed)
     experiment = planned(problem, layout, data, noise, points, feedback)
     search = _Search(experiment, limits, criterion, chosen, rest or {})
+    search.check()
     report("rating the library of inputs")
-    rated = sorted(search.library(), key=lambda r: r.value)
+    rated = sorted(search.library(chirps), key=lambda r: r.value)
     optimum, converged, steps = rated[0], True, 0
     if max_steps:
         report(f"optimising {search.size} values from {rated[0].words}")
@@ -231,7 +241,7 @@ def _check(
     model = problem.model
     known = {
         "inputs": naming.names(model.Inputs),
-        "motion": (*naming.names(model.Outputs), *naming.names(model.State)),
+        "motion": sum(map(naming.names, (model.Outputs, model.State, model.Inputs)), ()),
     }
     for kind, names in known.items():
         for name in getattr(limits, kind):
@@ -324,7 +334,7 @@ class _Search:
                 least = max(flight.dt, 2.0 * limit.amplitude / limit.rate)
                 spacing = max(least, 0.1, flight.duration * inputs / _NODES)
                 per_node = math.ceil(spacing / flight.dt - 1e-9)
-                count = -(-flight.n_samples // per_node) + (limit.rate < math.inf)
+                count = -(-(flight.n_samples - 1) // per_node)
                 by_input[name] = (slice(at, at + count), per_node)
                 at += count
             self.places.append(by_input)
@@ -333,16 +343,17 @@ class _Search:
         self.augmented = jax.jit(jax.value_and_grad(self._augmented, has_aux=True))
 
     def excitations(self, x: Any) -> tuple[dict[str, Any], ...]:
-        """Return the excitations (N,) by flight and input, SI."""
+        """Return the excitations (N,) by flight and input, SI. They begin at zero, as before the
+        flight."""
         found = []
         for flight, places in zip(self.flights, self.places, strict=True):
             by_input, k = {}, np.arange(flight.n_samples)
             for name, (at, per_node) in places.items():
-                limit, nodes = self.limits.inputs[name], x[at]
-                u = nodes[k // per_node]
+                limit, nodes = self.limits.inputs[name], jnp.concatenate([jnp.zeros(1), x[at]])
+                u = nodes[-(-k // per_node)]
                 if limit.rate < math.inf:
-                    share = (k % per_node) / per_node
-                    u = (1.0 - share) * u + share * nodes[k // per_node + 1]
+                    share = (-k % per_node) / per_node
+                    u = (1.0 - share) * u + share * nodes[k // per_node]
                 by_input[name] = limit.amplitude * u
             found.append(by_input)
         return tuple(found)
@@ -437,20 +448,46 @@ class _Search:
             for flight, own in zip(self.flights, excitations, strict=True):
                 u = own.get(name, np.zeros(1))
                 sizes.append(float(np.max(np.abs(u))))
-                rates.append(float(np.max(np.abs(np.diff(u)), initial=0.0)) / flight.dt)
+                rates.append(float(np.max(np.abs(np.diff(u, prepend=0.0)))) / flight.dt)
             margins[name] = 1.0 - max(sizes) / limit.amplitude
             if limit.rate < math.inf:
                 margins[f"rate of {name}"] = 1.0 - max(rates) / limit.rate
         return margins
 
-    def library(self) -> list[Rated]:
+    def check(self) -> None:
+        """Refuse a vehicle that exceeds a limit or diverges without excitation.
+
+        Raises:
+            ValueError: names the state, its value and the limit, or the time constant.
+        """
+        from scipy.linalg import eigvals
+
+        experiment, duration = self.experiment, max(f.duration for f in self.flights)
+        growing = max(float(np.max(eigvals(A).real)) for A in experiment.state_matrices())
+        if growing * duration > _GROWTH:
+            raise ValueError(
+                f"the vehicle diverges: a mode grows with a time constant of {1.0 / growing:.3g} s "
+                f"in a flight of {duration:.4g} s, expected a feedback or at most "
+                f"{_GROWTH / growing:.3g} s"
+            )
+        none = tuple(dict[str, np.ndarray]() for _ in self.flights)
+        at_rest = self._as_rated("", none, self.known(np.full(self.size, 0.5)))
+        for name, limit in self.limits.motion.items():
+            if not at_rest.margins[name] > 0.0:
+                reached = (1.0 - at_rest.margins[name]) * limit
+                raise ValueError(
+                    f"limits.motion: {name} reaches {reached:.4g} without any excitation, expected "
+                    f"less than its limit of {limit:.4g}"
+                )
+
+    def library(self, chirps: Sequence[str]) -> list[Rated]:
         """Return the manoeuvres of the library within the limits."""
         names, found = list(self.limits.inputs), []
         middle = self.known(np.full(self.size, 0.5))
         least = min(f.duration for f in self.flights)
         dt = max(f.dt for f in self.flights)
         rates = [limit.rate / limit.amplitude for limit in self.limits.inputs.values()]
-        for manoeuvre in manoeuvres(len(names), least, dt):
+        for manoeuvre in manoeuvres(len(names), least, dt, chirps):
             each = [manoeuvre.samples(f.n_samples, f.dt, rates) for f in self.flights]
             by_flight = tuple(
                 {n: self.limits.inputs[n].amplitude * row for n, row in zip(names, u, strict=True)}
@@ -473,7 +510,8 @@ class _Search:
         x = np.full(self.size, 0.5)
         for flight, places, own in zip(self.flights, self.places, start.inputs, strict=True):
             for name, (at, per_node) in places.items():
-                k = np.minimum(np.arange(at.stop - at.start) * per_node, flight.n_samples - 1)
+                k = np.arange(1, at.stop - at.start + 1) * per_node
+                k = np.minimum(k, flight.n_samples - 1)
                 # All values at their bounds may be a corner from which no step leads.
                 x[at] = 0.5 * own[name][k] / self.limits.inputs[name].amplitude
         bounds = [(-1.0, 1.0)] * self.nodes + [(0.0, 1.0)] * len(self.varied)

@@ -86,7 +86,7 @@ def simulated_flight(
         options: of `simulate`, in place of those for least squares.
     """
     # ForwardMode compiles faster than an adjoint for both modes, and least squares uses it alone.
-    usual = {"block": layout.block, "adjoint": dfx.ForwardMode()}
+    usual = {"block": layout.block, "adjoint": None if layout.reverse else dfx.ForwardMode()}
     return simulate(
         layout.model,
         drive.params,
