@@ -3,7 +3,7 @@
 import functools
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -25,8 +25,7 @@ from heli_jax.report.page import filled, picture
 from heli_jax.report.style import label
 from heli_jax.report.tables import Table
 
-if TYPE_CHECKING:
-    from heli_jax.design_workflow import DesignRun
+# `run` is a DesignRun of `heli_jax.design_workflow`, which imports this module.
 
 _FILES = ("design.json", "input.csv")
 _GAIN = 1e-3
@@ -35,7 +34,7 @@ _ROWS = 12
 """Manoeuvres of the library in a table."""
 
 
-def manoeuvres_table(run: "DesignRun", most: int = _ROWS) -> Table:
+def manoeuvres_table(run: Any, most: int = _ROWS) -> Table:
     """Return the optimum, the user's inputs and the best of the library, a row each."""
     design = run.design
     names = list(dict.fromkeys([*products(run), *design.optimum.sd]))
@@ -54,7 +53,7 @@ def manoeuvres_table(run: "DesignRun", most: int = _ROWS) -> Table:
     return Table((*head, "least margin"), rows)
 
 
-def products(run: "DesignRun") -> list[str]:
+def products(run: Any) -> list[str]:
     """Return the criterion and the wanted products, if they are products."""
     asked = [] if run.design.criterion in CRITERIA else [run.design.criterion]
     return [*asked, *run.wanted]
@@ -64,7 +63,7 @@ def _percent(share: float) -> str:
     return f"{number(100.0 * share, 2)} %"
 
 
-def summary(run: "DesignRun") -> str:
+def summary(run: Any) -> str:
     """Return what the design gains, in a sentence."""
     design = run.design
     best, optimum = design.library[0], design.optimum
@@ -77,7 +76,7 @@ def summary(run: "DesignRun") -> str:
     return f"The optimised input lowers {what} by {_percent(gain)} against {best.words}."
 
 
-def known_differences(run: "DesignRun") -> list[str]:
+def known_differences(run: Any) -> list[str]:
     """Return the differences that the design chose, a sentence for each run that has some."""
     return [
         f"Run {i + 1}: {', '.join(f'{n} = {number(v)}' for n, v in own.items())}"
@@ -86,7 +85,7 @@ def known_differences(run: "DesignRun") -> list[str]:
     ]
 
 
-def write_design(folder: Path, run: "DesignRun", config: str) -> None:
+def write_design(folder: Path, run: Any, config: str) -> None:
     """Write design.json, input.csv, report.html and figures/ of a design."""
     columns = input_columns(run)
     write_table(folder / "input.csv", columns)
@@ -114,7 +113,7 @@ def write_design(folder: Path, run: "DesignRun", config: str) -> None:
     (folder / "report.html").write_text(page, encoding="utf-8")
 
 
-def doubts(run: "DesignRun") -> list[str]:
+def doubts(run: Any) -> list[str]:
     """Return what limits the trust in a design."""
     design, found = run.design, []
     if not design.converged:
@@ -132,7 +131,7 @@ def doubts(run: "DesignRun") -> list[str]:
     return found
 
 
-def input_columns(run: "DesignRun") -> dict[str, np.ndarray]:
+def input_columns(run: Any) -> dict[str, np.ndarray]:
     """Return time and excitations in the units of `design.inputs`, one run after another."""
     parts: list[dict[str, Any]] = []
     for i, (flight, own) in enumerate(
@@ -148,7 +147,7 @@ def input_columns(run: "DesignRun") -> dict[str, np.ndarray]:
     return {n: np.concatenate([p[n] for p in parts]) for n in parts[0]}
 
 
-def autopilot_files(run: "DesignRun") -> dict[str, str]:
+def autopilot_files(run: Any) -> dict[str, str]:
     """Return by name the files of the first run for autopilots and transmitters.
 
     Autopilots play the best chirp of the library, a transmitter the optimised input.
@@ -180,7 +179,7 @@ def autopilot_files(run: "DesignRun") -> dict[str, str]:
     return files
 
 
-def _content(run: "DesignRun") -> dict[str, Any]:
+def _content(run: Any) -> dict[str, Any]:
     design = run.design
 
     def of(rated: Rated) -> dict[str, Any]:
@@ -213,7 +212,7 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _draw(run: "DesignRun", i: int) -> Chart:
+def _draw(run: Any, i: int) -> Chart:
     """Draw the excitations and the limited motion of a run."""
     flight, model = run.problem.training[i], run.problem.model
     t, motion = np.arange(flight.n_samples) * flight.dt, run.design.optimum.motion[i]
