@@ -193,8 +193,8 @@ def design(
         max_steps: limit of the optimiser; 0: only the library is rated.
 
     Raises:
-        ValueError: an unknown name, a limit that is not positive or that the vehicle exceeds without
-            excitation, a vehicle that diverges, or a method in frequency.
+        ValueError: an unknown name, a limit that is not positive or that the vehicle exceeds
+            without excitation, a vehicle that diverges, or a method in frequency.
     """
     report = progress or (lambda _: None)
     if problem.noise_model == "spectrum" or problem.window is not None:

@@ -41,7 +41,8 @@ class Flown(NamedTuple):
     data: Data
     """With the outputs, and the inputs as they are recorded: with feedback those that act."""
     motion: tuple[dict[str, Array], ...]
-    """Acting inputs, states and outputs (N,) by flight and name, SI; of two with one name the last."""
+    """Acting inputs, states and outputs (N,) by flight and name, SI; outputs of a state's name take
+    its place."""
 
 
 @jax.custom_vjp
