@@ -187,6 +187,6 @@ def _limit(model: Any, name: str, unit: str, gains: dict[str, dict[str, float]])
     if axis is not None and gains.get(name, {}).get(axis.rate):
         return f"{{amplitude: 0.3, set_point: {axis.rate}, ardupilot: rate-{axis.name}}}  # rad/s"
     # The command of a model without a rotor may be that of an autopilot's loop.
-    rotor = axis is not None and axis.flapping and unit == "1"
+    rotor = axis is not None and axis.tilt and unit == "1"
     place = f", ardupilot: mixer-{axis.name}" if axis is not None and rotor else ""
     return f"{{amplitude: {_AMPLITUDE.get(unit, EDIT)}{place}}}  # {unit}"

@@ -396,8 +396,9 @@ class _Search:
         all flights and vehicles."""
         outcome = self.experiment.outcome(inputs, known)
         value = jnp.mean(jax.vmap(self._of_covariance)(outcome.covariance))
+        parts = (*outcome.motion, *outcome.before)
         ratios = [
-            largest(jnp.concatenate([jnp.abs(m[n]).ravel() for m in outcome.motion]) / limit)
+            largest(jnp.concatenate([jnp.abs(m[n]).ravel() for m in parts if n in m]) / limit)
             for n, limit in self.limits.motion.items()
         ]
         return value, outcome, jnp.array(ratios, value.dtype)
@@ -430,7 +431,7 @@ class _Search:
         self, words: str, excitations: tuple[dict[str, np.ndarray], ...], known: Any
     ) -> Rated:
         """Return excitations with the accuracy they give, and their margins."""
-        value, (C, motion), ratios = jax.device_get(self.rated(self.inputs(excitations), known))
+        value, (C, motion, _), ratios = jax.device_get(self.rated(self.inputs(excitations), known))
         if not np.isfinite(C).all():
             value, C = np.inf, np.full(C.shape, np.inf)
         sd = np.sqrt(np.max(C.diagonal(axis1=1, axis2=2), axis=0))

@@ -43,6 +43,8 @@ class Flown(NamedTuple):
     motion: tuple[dict[str, Array], ...]
     """Acting inputs, states and outputs (N,) by flight and name, SI; outputs of a state's name take
     its place."""
+    before: tuple[dict[str, Array], ...]
+    """Outputs (N - 1,) by flight and name just before the next sample's inputs act, SI."""
 
 
 @jax.custom_vjp
@@ -85,6 +87,8 @@ class Outcome(NamedTuple):
     """Of the parameters, in relative coordinates."""
     motion: tuple[dict[str, Array], ...]
     """As in `Flown`."""
+    before: tuple[dict[str, Array], ...]
+    """As in `Flown`."""
 
 
 class Experiment(NamedTuple):
@@ -116,7 +120,7 @@ class Experiment(NamedTuple):
         def of_one(vehicle: Vehicle) -> Outcome:
             flown = self.flown(vehicle, inputs, known)
             rows = jnp.concatenate([self._rows(vehicle, flown.data), vehicle.rows])
-            return Outcome(covariance(rows)[:p, :p], flown.motion)
+            return Outcome(covariance(rows)[:p, :p], flown.motion, flown.before)
 
         return jax.vmap(of_one)(self.vehicles)
 
@@ -133,20 +137,26 @@ class Experiment(NamedTuple):
         given = tuple(f._replace(inputs=u, known={**f.known, **k}) for f, u, k in flights)
         data = self.data._replace(flights=given)
         u = unpack(layout, data, vehicle.z)
-        flown, motion = [], []
+        flown, motion, before = [], [], []
         for i, names in enumerate(layout.outputs):
             # A shift is zero at the start.
             options = {"feedback": self.feedback}
             if keys is not None or self.feedback is not None:
                 options |= {"block": 1, "key": None if keys is None else keys[i]}
-            run = simulated_flight(layout, i, driven(layout, data, u, i), None, **options)
+            drive = driven(layout, data, u, i)
+            run = simulated_flight(layout, i, drive, None, **options)
             # The record has the inputs as commanded: the rows delay them again.
             inputs = given[i].inputs if self.feedback is None else run.inputs
             outputs = {n: getattr(run.outputs, n) for n in names}
             flown.append(given[i]._replace(inputs=inputs, outputs=outputs))
             parts = (run.inputs, run.states, run.outputs)
             motion.append({n: x for part in parts for n, x in naming.asdict(part).items()})
-        return Flown(data._replace(flights=tuple(flown)), tuple(motion))
+            now = jax.tree.map(lambda v: v[1:], run.states)
+            earlier = jax.tree.map(lambda v: v[:-1], run.inputs)
+            # An output with direct feedthrough jumps at a sample.
+            output = jax.vmap(lambda x, u, p=drive.params: layout.model.output(p, x, u))
+            before.append(naming.asdict(output(now, earlier)))
+        return Flown(data._replace(flights=tuple(flown)), tuple(motion), tuple(before))
 
     def state_matrices(self) -> list[Float[Array, "n n"]]:
         """Return the first vehicle's state matrix, with feedback, at the begin of each flight."""

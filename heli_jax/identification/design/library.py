@@ -108,7 +108,7 @@ def manoeuvres(
         for kind in (*chirps, "multisine"):
             # Two periods of ArduPilot's first frequency take half of the record. Betaflight counts
             # tenths of a hertz.
-            first = 2.0 * max(low, 2.0 * inputs / duration) if kind == "ardupilot-chirp" else low
+            first = max(low, 4.0 * inputs / duration) if kind == "ardupilot-chirp" else low
             first = math.ceil(10.0 * first) / 10.0 if kind == "betaflight-chirp" else first
             fade = (
                 min(_FADE * duration / inputs, _LONGEST_FADE) if kind == "ardupilot-chirp" else 0.0
