@@ -450,7 +450,8 @@ class _Search:
                 u = own.get(name, np.zeros(1))
                 sizes.append(float(np.max(np.abs(u))))
                 rates.append(float(np.max(np.abs(np.diff(u, prepend=0.0)))) / flight.dt)
-            margins[name] = 1.0 - max(sizes) / limit.amplitude
+            key = f"excitation of {name}" if name in self.limits.motion else name
+            margins[key] = 1.0 - max(sizes) / limit.amplitude
             if limit.rate < math.inf:
                 margins[f"rate of {name}"] = 1.0 - max(rates) / limit.rate
         return margins
