@@ -1,9 +1,10 @@
 """Design of a flight: the inputs within limits that determine the parameters best.
 
 The candidates of the library are compared first. From the best of them, SciPy's L-BFGS-B searches
-over values of the inputs at nodes, with gradients in reverse mode. Limits of the inputs are bounds.
-Limits of the motion hold along the whole flight, by an augmented Lagrangian: the largest value over
-time is replaced by a smooth one that is never smaller (Kreisselmeier and Steinhauser, 1979).
+over values of the inputs at nodes, with gradients in reverse mode. Limits of deflections are
+bounds. Limits of rates and of the motion hold along the whole flight, by an augmented Lagrangian:
+the largest value over time is replaced by a smooth one that is never smaller (Kreisselmeier and
+Steinhauser, 1979).
 Sources: Mehra (1974); Goodwin and Payne (1977) for the criteria.
 """
 
@@ -325,14 +326,13 @@ class _Search:
         self.varied = [
             (i, n, low, high) for i, own in enumerate(differences) for n, (low, high) in own.items()
         ]
+        self.rates = {n: u.rate for n, u in limits.inputs.items() if u.rate < math.inf}
         inputs = len(self.flights) * len(limits.inputs)
         self.places, at = [], 0
         for flight in self.flights:
             by_input = {}
-            for name, limit in limits.inputs.items():
-                # With this spacing no ramp between two nodes exceeds the rate.
-                least = max(flight.dt, 2.0 * limit.amplitude / limit.rate)
-                spacing = max(least, 0.1, flight.duration * inputs / _NODES)
+            for name in limits.inputs:
+                spacing = max(flight.dt, 0.1, flight.duration * inputs / _NODES)
                 per_node = math.ceil(spacing / flight.dt - 1e-9)
                 count = -(-(flight.n_samples - 1) // per_node)
                 by_input[name] = (slice(at, at + count), per_node)
@@ -351,7 +351,7 @@ class _Search:
             for name, (at, per_node) in places.items():
                 limit, nodes = self.limits.inputs[name], jnp.concatenate([jnp.zeros(1), x[at]])
                 u = nodes[-(-k // per_node)]
-                if limit.rate < math.inf:
+                if name in self.rates:
                     share = (-k % per_node) / per_node
                     u = (1.0 - share) * u + share * nodes[k // per_node]
                 by_input[name] = limit.amplitude * u
@@ -409,8 +409,14 @@ class _Search:
         def smooth(ratios: Array) -> Array:
             return jax.scipy.special.logsumexp(_SHARP * ratios) / _SHARP
 
-        inputs, known = self.inputs(self.excitations(x)), self.known(x)
-        value, _, ratios = self._rated(inputs, known, smooth)
+        excitations = self.excitations(x)
+        value, _, ratios = self._rated(self.inputs(excitations), self.known(x), smooth)
+        rates = []
+        for name, rate in self.rates.items():
+            each = zip(self.flights, excitations, strict=True)
+            slopes = [jnp.diff(own[name], prepend=0.0) / flight.dt for flight, own in each]
+            rates.append(smooth(jnp.abs(jnp.concatenate(slopes)) / rate))
+        ratios = jnp.concatenate([ratios, jnp.array(rates, ratios.dtype)])
         active = jnp.maximum(multipliers + penalty * (ratios - 1.0), 0.0)
         added = jnp.sum(jnp.square(active) - jnp.square(multipliers)) / (2.0 * penalty)
         return value + added, ratios - 1.0
@@ -419,7 +425,7 @@ class _Search:
         """Return a manoeuvre, made smaller until its motion is within the limits."""
         for _ in range(30):
             rated = self._as_rated(words, excitations, known)
-            worst = 1.0 - min((rated.margins[n] for n in self.limits.motion), default=1.0)
+            worst = 1.0 - float(np.min(list(rated.margins.values())))
             if worst <= 1.0:
                 break
             # A diverged motion has no size.
@@ -452,7 +458,7 @@ class _Search:
                 rates.append(float(np.max(np.abs(np.diff(u, prepend=0.0)))) / flight.dt)
             key = f"excitation of {name}" if name in self.limits.motion else name
             margins[key] = 1.0 - max(sizes) / limit.amplitude
-            if limit.rate < math.inf:
+            if name in self.rates:
                 margins[f"rate of {name}"] = 1.0 - max(rates) / limit.rate
         return margins
 
@@ -517,7 +523,8 @@ class _Search:
                 # All values at their bounds may be a corner from which no step leads.
                 x[at] = 0.5 * own[name][k] / self.limits.inputs[name].amplitude
         bounds = [(-1.0, 1.0)] * self.nodes + [(0.0, 1.0)] * len(self.varied)
-        multipliers, penalty, steps, before = np.zeros(len(self.limits.motion)), 10.0, 0, np.inf
+        multipliers = np.zeros(len(self.limits.motion) + len(self.rates))
+        penalty, steps, before = 10.0, 0, np.inf
 
         def cost(x: np.ndarray, *lagrangian: Any) -> tuple[float, np.ndarray]:
             (value, _), slope = self.augmented(x, *lagrangian)
