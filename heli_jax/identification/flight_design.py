@@ -1,9 +1,9 @@
 """Design of a flight: the inputs within limits that determine the parameters best.
 
-The candidates of the library are compared first. From the best of them, SciPy's L-BFGS-B searches
-over values of the inputs at nodes, with gradients in reverse mode. Limits of deflections are
-bounds. Limits of rates and of the motion hold along the whole flight, by an augmented Lagrangian:
-the largest value over time is replaced by a smooth one that is never smaller (Kreisselmeier and
+The candidates of the library are compared first. From the best two, SciPy's L-BFGS-B searches over
+values of the inputs at nodes, with gradients in reverse mode. Limits of deflections are bounds.
+Limits of rates and of the motion hold along the whole flight, by an augmented Lagrangian: the
+largest value over time is replaced by a smooth one that is never smaller (Kreisselmeier and
 Steinhauser, 1979).
 Sources: Mehra (1974); Goodwin and Payne (1977) for the criteria.
 """
@@ -32,6 +32,8 @@ from heli_jax.identification.unknowns.layout import Solution, layout_of
 
 _NODES = 2000
 """Values of all inputs together that the search moves, at most."""
+_STARTS = 2
+"""Inputs of the library from which the search starts, the best first."""
 _ROUNDS, _TOLERANCE = 12, 1e-3
 """Rounds of the augmented Lagrangian, and change of the criterion (a logarithm) and excess of a
 limit (relative) at which they end."""
@@ -191,7 +193,7 @@ def design(
         vehicles: vehicles drawn from the priors or bounds of the free parameters; the design is for
             all of them. 1: the start values.
         seed: seed of the draw.
-        max_steps: limit of the optimiser; 0: only the library is rated.
+        max_steps: limit of the optimiser from each start; 0: only the library is rated.
 
     Raises:
         ValueError: an unknown name, a limit that is not positive or that the vehicle exceeds
@@ -219,8 +221,11 @@ def design(
     rated = sorted(search.library(chirps), key=lambda r: r.value)
     optimum, converged, steps = rated[0], True, 0
     if max_steps:
-        report(f"optimising {search.size} values from {rated[0].words}")
-        optimum, converged, steps = search.optimise(rated[0], max_steps)
+        found = []
+        for start in rated[:_STARTS]:
+            report(f"optimising {search.size} values from {start.words}")
+            found.append(search.optimise(start, max_steps))
+        optimum, converged, steps = min(found, key=lambda one: one[0].value)
     return Design(
         criterion=criterion,
         duration=sum(f.duration for f in problem.training),
