@@ -150,6 +150,10 @@ def doubts(run: Any) -> list[str]:
             f"The optimised input does not determine {', '.join(lost)}: a prior, another output or "
             "a second run with a known difference is needed."
         )
+    limits, kinds = run.settings.inputs.values(), _played(run)
+    for key, words in (("ardupilot", "ArduPilot"), ("betaflight", "Betaflight")):
+        if any(getattr(limit, key) for limit in limits) and f"{key}-chirp" not in kinds:
+            found.append(f"No chirp of {words} fits in the flight: it must last longer.")
     own = [("Your own inputs exceed", design.own)] if design.own else []
     for words, rated in [("The optimised input exceeds", design.optimum), *own]:
         if over := [n for n, m in rated.margins.items() if m < -1e-9]:

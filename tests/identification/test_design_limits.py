@@ -1,6 +1,8 @@
 """Designs with delays, nonlinear models and limits: against NumPy and SciPy."""
 
 import dataclasses
+import re
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,7 @@ from heli_jax import Flight, Free, Nuisance, Problem, linear_model
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.flight_design import InputLimit, Limits, design
 from heli_jax.naming import asdict
+from heli_jax.report.design import summary
 from tests.identification.test_enough import SWING
 from tests.identification.test_flight_design import DT, LIMITS, TRUTH, problem
 
@@ -165,10 +168,33 @@ def test_an_unstable_vehicle_needs_feedback():
     design(of, LIMITS, feedback=lambda x, u: u._replace(u=u.u - 0.5 * x.p), max_steps=0)
 
 
-def test_gains_are_those_of_the_printed_sds():
+def test_less_than_a_run_is_one_run():
     found = design(problem(), LIMITS, max_steps=0)
     once = found.sd_of(found.library[0], "d")
     assert found.needed(found.library[0], {"d": 2.0 * once}) == found.duration
+
+
+@pytest.mark.parametrize(
+    ("criterion", "size"),
+    [
+        ("D", lambda sd: np.prod(sd) ** (1 / 3)),
+        ("A", lambda sd: np.sqrt(np.mean(sd**2))),
+        ("E", np.max),
+        ("d", lambda sd: sd[1]),
+    ],
+)
+def test_the_headline_compares_printed_sds_with_the_best_row(criterion, size):
+    found = design(problem(), LIMITS, criterion=criterion, max_steps=5)
+    sizes = {r.words: size(np.array(list(r.sd.values()))) for r in found.library}
+    best = min(sizes, key=lambda words: sizes[words])
+    after = size(np.array(list(found.optimum.sd.values())))
+    words = summary(SimpleNamespace(design=found))
+    assert words.rstrip(".").endswith(best)
+    if found_gain := re.search(r"by ([0-9.]+) %", words):
+        gain = 100.0 * (1.0 - after / sizes[best])
+        assert float(found_gain[1]) == pytest.approx(gain, rel=0.06)
+    else:
+        assert after >= sizes[best] * (1 - 1.1e-3)
 
 
 def test_an_output_that_jumps_at_a_sample_is_limited_before_it_too():
