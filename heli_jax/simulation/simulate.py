@@ -227,11 +227,12 @@ def _stepwise(
     dtype = jax.tree.leaves(x0)[0].dtype
     check_countable(n, dtype)
     if isinstance(adjoint, Scan):
-        assert isinstance(method, SolverWrapper)
+        # Every solver of whole samples has `stepped`.
+        solver: Any = method
 
         @jax.checkpoint
         def sample(x: Any, k: Time) -> tuple[Any, Any]:
-            x, _ = method.stepped(term, k, k + 1.0, x, args)
+            x, _ = solver.stepped(term, k, k + 1.0, x, args)
             return x, x
 
         _, later = jax.lax.scan(sample, x0, jnp.arange(n - 1, dtype=dtype))
