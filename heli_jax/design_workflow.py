@@ -15,6 +15,7 @@ from heli_jax.control.pilot import Pilot
 from heli_jax.dynamics.model import require_constants, zeros
 from heli_jax.errors import InputError, located, require_known
 from heli_jax.flights.flight import Flight
+from heli_jax.identification.design.autopilots import ARDUPILOT
 from heli_jax.identification.design.information import Feedback
 from heli_jax.identification.flight_design import Design, InputLimit, Limits, design
 from heli_jax.identification.identifiability.verdict import exponents
@@ -97,6 +98,7 @@ def run_design(
             rest=plan.rest,
             differences=differences,
             feedback=feedback,
+            chirps=_chirps(settings) or ("chirp",),
             vehicles=settings.vehicles,
             seed=settings.seed,
             max_steps=settings.max_steps,
@@ -107,6 +109,16 @@ def run_design(
     if run.directory is not None:
         _write(run, run.directory)
     return run
+
+
+def _chirps(settings: FlightDesignConfig) -> tuple[str, ...]:
+    """Return the kinds of chirps that the files of the design play."""
+    limits = settings.inputs.values()
+    played = {
+        "ardupilot-chirp": any(limit.ardupilot for limit in limits),
+        "betaflight-chirp": any(limit.betaflight for limit in limits),
+    }
+    return tuple(kind for kind, wanted in played.items() if wanted)
 
 
 def _flights(
@@ -168,9 +180,9 @@ def _limits(config: Experiment, settings: FlightDesignConfig, where: str) -> Lim
         factor = _factor(limit.unit, si, place)
         rate = np.inf if limit.rate is None else factor * limit.rate
         inputs[name] = InputLimit(factor * limit.amplitude, rate)
-    known = dict.fromkeys(naming.names(model.State), model.State)
-    known |= dict.fromkeys(naming.names(model.Outputs), model.Outputs)
-    words = f"model {model.name} has no output or state"
+    records = (model.Inputs, model.State, model.Outputs)
+    known = {n: record for record in records for n in naming.names(record)}
+    words = f"model {model.name} has no output, state or input"
     require_known(settings.motion, tuple(known), f"{where}.motion", words)
     motion = {
         n: m.most * _factor(m.unit, naming.unit(known[n], n), f"{where}.motion.{n}")
@@ -181,9 +193,8 @@ def _limits(config: Experiment, settings: FlightDesignConfig, where: str) -> Lim
 
 def _check_autopilot(limit: DesignedInputConfig, si: str, where: str) -> None:
     """Refuse a place of an autopilot that has another unit than the excitation."""
-    kinds = {"input": "rad", "rate": "rad/s", "mixer": "1"}
     for key, needed in (
-        ("ardupilot", limit.ardupilot and kinds[limit.ardupilot.partition("-")[0]]),
+        ("ardupilot", limit.ardupilot and ARDUPILOT[limit.ardupilot][1]),
         ("betaflight", limit.betaflight and "rad/s"),
     ):
         if needed and needed != si:

@@ -28,7 +28,13 @@ def wanted_sds(texts: list[str]) -> dict[str, float]:
 
 def print_design(run: "DesignRun", *, verbose: bool = False) -> None:
     """Print the design: what it gains, the inputs compared, and doubts."""
-    from heli_jax.report.design import doubts, known_differences, manoeuvres_table, summary
+    from heli_jax.report.design import (
+        doubts,
+        known_differences,
+        manoeuvres_table,
+        signals_played,
+        summary,
+    )
 
     print_text(summary(run))
     print_page_table(manoeuvres_table(run, len(run.design.library) if verbose else _ROWS))
@@ -37,5 +43,7 @@ def print_design(run: "DesignRun", *, verbose: bool = False) -> None:
     for words in doubts(run):
         print_text(f"! {words}")
     if run.directory is not None:
+        for words in signals_played(run):
+            print_text(words)
         print_text(f"input: {run.directory / 'input.csv'}")
         print_text(f"report: {run.directory / 'report.html'}")

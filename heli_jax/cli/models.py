@@ -13,6 +13,7 @@ from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import vehicle_constants
 from heli_jax.errors import InputError
 from heli_jax.linear_models.read import linear_model
+from heli_jax.new_config import tables
 from heli_jax.numbers import terse
 from heli_jax.report.tables import Table
 from heli_jax.run_directory import whole_file
@@ -117,6 +118,9 @@ def write_design_config(text: str, out: Path) -> None:
     inputs, outputs = ({n: naming.unit(r, n) or "1" for n in naming.names(r)} for r in (
         model.Inputs, model.Outputs))  # fmt: skip
     gains = _gains(model, params) if _unstable(model, params) else {}
+    # Parameters that one record of the model determines.
+    free = tables.models().get(name["linear"], [n for n in naming.names(model.Params) if n != "g"])
+    known = [n for n in naming.names(model.Params) if n not in free]
     lines = [
         f"# Designs a flight for {name['linear']}. Check the lines marked GUESS, then run",
         f"# heli-jax design {out}",
@@ -124,10 +128,9 @@ def write_design_config(text: str, out: Path) -> None:
         "fit:",
         # The simulation of an unstable vehicle leaves any record, so it needs the filter.
         *(["  method: filter-error"] if gains else []),
-        "  free:  # delete what is known",
+        f"  free:{f'  # known: {", ".join(known)}' if known else ''}",
     ]
-    values = naming.asdict(params)
-    lines += [f"    {n}: {{start: {terse(float(v), 5)}}}" for n, v in values.items() if n != "g"]
+    lines += [f"    {n}: {{start: {terse(float(getattr(params, n)), 5)}}}" for n in free]
     if gains and model.axes:
         axis = model.axes[0].name
         gusts = f"{{axis: {axis}, poles: 1, sigma_w: {_GUSTS}, tau_w: 1.0}}"
@@ -183,5 +186,7 @@ def _limit(model: Any, name: str, unit: str, gains: dict[str, dict[str, float]])
         axis = None
     if axis is not None and gains.get(name, {}).get(axis.rate):
         return f"{{amplitude: 0.3, set_point: {axis.rate}, ardupilot: rate-{axis.name}}}  # rad/s"
-    place = f", ardupilot: mixer-{axis.name}" if axis is not None and unit == "1" else ""
+    # The command of a model without a rotor may be that of an autopilot's loop.
+    rotor = axis is not None and axis.tilt and unit == "1"
+    place = f", ardupilot: mixer-{axis.name}" if axis is not None and rotor else ""
     return f"{{amplitude: {_AMPLITUDE.get(unit, EDIT)}{place}}}  # {unit}"

@@ -22,9 +22,18 @@ class DesignedInputConfig(ExcitedConfig):
     full_stick: Positive | None = None
     """deflection at full stick, in `unit`: writes a script for transmitters with EdgeTX"""
 
+    @model_validator(mode="after")
+    def _within_the_stick(self) -> "DesignedInputConfig":
+        if self.full_stick is not None and self.full_stick < self.amplitude:
+            raise ValueError(
+                f"full_stick: expected at least the amplitude, {self.amplitude:g}, got "
+                f"{self.full_stick:g}"
+            )
+        return self
+
 
 class MotionConfig(Section):
-    """Limit of an output or a state."""
+    """Limit of an output, a state or an input as it acts."""
 
     most: Positive
     """largest absolute value, in `unit`"""
@@ -45,7 +54,8 @@ class FlightDesignConfig(Section):
     inputs: dict[str, DesignedInputConfig]
     """inputs to excite, by name"""
     motion: dict[str, MotionConfig] = {}
-    """limits of outputs and states, by name"""
+    """limits of outputs, states and inputs, by name; of an input as it acts, with the feedback's
+    part"""
     criterion: str = "D"
     """D: determinant of the covariance; A: its trace; E: its largest eigenvalue; or a free
     parameter, or a product such as a/Ixx, whose sd is made small"""

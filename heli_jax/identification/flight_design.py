@@ -1,9 +1,10 @@
 """Design of a flight: the inputs within limits that determine the parameters best.
 
-The candidates of the library are compared first. From the best of them, SciPy's L-BFGS-B searches
-over values of the inputs at nodes, with gradients in reverse mode. Limits of the inputs are bounds.
-Limits of the motion hold along the whole flight, by an augmented Lagrangian: the largest value over
-time is replaced by a smooth one that is never smaller (Kreisselmeier and Steinhauser, 1979).
+The candidates of the library are compared first. From the best two, SciPy's L-BFGS-B searches over
+values of the inputs at nodes, with gradients in reverse mode. Limits of deflections are bounds.
+Limits of rates and of the motion hold along the whole flight, by an augmented Lagrangian: the
+largest value over time is replaced by a smooth one that is never smaller (Kreisselmeier and
+Steinhauser, 1979).
 Sources: Mehra (1974); Goodwin and Payne (1977) for the criteria.
 """
 
@@ -31,6 +32,8 @@ from heli_jax.identification.unknowns.layout import Solution, layout_of
 
 _NODES = 2000
 """Values of all inputs together that the search moves, at most."""
+_STARTS = 2
+"""Inputs of the library from which the search starts, the best first."""
 _ROUNDS, _TOLERANCE = 12, 1e-3
 """Rounds of the augmented Lagrangian, and change of the criterion (a logarithm) and excess of a
 limit (relative) at which they end."""
@@ -38,6 +41,9 @@ _SHARP = 300.0
 """Sharpness of the smooth maximum: it exceeds the maximum by log(values near it) / 300."""
 _MOST_TIMES = 1e4
 """Repetitions after which more do not help."""
+_GROWTH = 10.0
+"""Length of a flight over the time constant of a growing mode, at most: a deviation grows by
+exp(10)."""
 CRITERIA = ("D", "A", "E")
 
 
@@ -55,7 +61,7 @@ class Limits:
 
     Attributes:
         inputs: inputs that are excited, by name.
-        motion: largest absolute value of outputs and states by name, SI.
+        motion: largest absolute value of outputs, states and acting inputs by name, SI.
     """
 
     inputs: Mapping[str, InputLimit]
@@ -127,7 +133,8 @@ class Design(NamedTuple):
         return float(np.sqrt(np.max(powers @ C @ powers)))
 
     def needed(self, rated: Rated, wanted: Mapping[str, float]) -> float:
-        """Return the duration [s] after which a manoeuvre, repeated, gives the wanted sds.
+        """Return the duration [s] after which a manoeuvre, repeated, gives the wanted sds: that of
+        one run at least.
 
         It is infinite if no duration does, as for a parameter that only its prior determines.
 
@@ -143,7 +150,9 @@ class Design(NamedTuple):
 
         if not enough(_MOST_TIMES):
             return math.inf
-        low, high = -math.log(_MOST_TIMES), math.log(_MOST_TIMES)
+        if enough(1.0):
+            return self.duration
+        low, high = 0.0, math.log(_MOST_TIMES)
         for _ in range(40):
             middle = 0.5 * (low + high)
             low, high = (low, middle) if enough(math.exp(middle)) else (middle, high)
@@ -159,6 +168,7 @@ def design(
     rest: Mapping[str, float] | None = None,
     differences: Sequence[Mapping[str, tuple[float, float]]] | None = None,
     feedback: Feedback | None = None,
+    chirps: Sequence[str] = ("chirp",),
     vehicles: int = 1,
     seed: int = 0,
     max_steps: int = 400,
@@ -179,13 +189,15 @@ def design(
             and highest values.
         feedback: the loop that flies the vehicle, as in `simulate`. It receives the excitation as
             its inputs. The recorded inputs are those that act.
+        chirps: kinds of chirps in the library, such as those that autopilots play.
         vehicles: vehicles drawn from the priors or bounds of the free parameters; the design is for
             all of them. 1: the start values.
         seed: seed of the draw.
-        max_steps: limit of the optimiser; 0: only the library is rated.
+        max_steps: limit of the optimiser from each start; 0: only the library is rated.
 
     Raises:
-        ValueError: an unknown name, a limit that is not positive, or a method in frequency.
+        ValueError: an unknown name, a limit that is not positive or that the vehicle exceeds
+            without excitation, a vehicle that diverges, or a method in frequency.
     """
     report = progress or (lambda _: None)
     if problem.noise_model == "spectrum" or problem.window is not None:
@@ -204,12 +216,16 @@ def design(
     points = _points(problem, np.asarray(z), vehicles, seed)
     experiment = planned(problem, layout, data, noise, points, feedback)
     search = _Search(experiment, limits, criterion, chosen, rest or {})
+    search.check()
     report("rating the library of inputs")
-    rated = sorted(search.library(), key=lambda r: r.value)
+    rated = sorted(search.library(chirps), key=lambda r: r.value)
     optimum, converged, steps = rated[0], True, 0
     if max_steps:
-        report(f"optimising {search.size} values from {rated[0].words}")
-        optimum, converged, steps = search.optimise(rated[0], max_steps)
+        found = []
+        for start in rated[:_STARTS]:
+            report(f"optimising {search.size} values from {start.words}")
+            found.append(search.optimise(start, max_steps))
+        optimum, converged, steps = min(found, key=lambda one: one[0].value)
     return Design(
         criterion=criterion,
         duration=sum(f.duration for f in problem.training),
@@ -231,7 +247,7 @@ def _check(
     model = problem.model
     known = {
         "inputs": naming.names(model.Inputs),
-        "motion": (*naming.names(model.Outputs), *naming.names(model.State)),
+        "motion": sum(map(naming.names, (model.Outputs, model.State, model.Inputs)), ()),
     }
     for kind, names in known.items():
         for name in getattr(limits, kind):
@@ -315,16 +331,15 @@ class _Search:
         self.varied = [
             (i, n, low, high) for i, own in enumerate(differences) for n, (low, high) in own.items()
         ]
+        self.rates = {n: u.rate for n, u in limits.inputs.items() if u.rate < math.inf}
         inputs = len(self.flights) * len(limits.inputs)
         self.places, at = [], 0
         for flight in self.flights:
             by_input = {}
-            for name, limit in limits.inputs.items():
-                # With this spacing no ramp between two nodes exceeds the rate.
-                least = max(flight.dt, 2.0 * limit.amplitude / limit.rate)
-                spacing = max(least, 0.1, flight.duration * inputs / _NODES)
+            for name in limits.inputs:
+                spacing = max(flight.dt, 0.1, flight.duration * inputs / _NODES)
                 per_node = math.ceil(spacing / flight.dt - 1e-9)
-                count = -(-flight.n_samples // per_node) + (limit.rate < math.inf)
+                count = -(-(flight.n_samples - 1) // per_node)
                 by_input[name] = (slice(at, at + count), per_node)
                 at += count
             self.places.append(by_input)
@@ -333,16 +348,17 @@ class _Search:
         self.augmented = jax.jit(jax.value_and_grad(self._augmented, has_aux=True))
 
     def excitations(self, x: Any) -> tuple[dict[str, Any], ...]:
-        """Return the excitations (N,) by flight and input, SI."""
+        """Return the excitations (N,) by flight and input, SI. They begin at zero, as before the
+        flight."""
         found = []
         for flight, places in zip(self.flights, self.places, strict=True):
             by_input, k = {}, np.arange(flight.n_samples)
             for name, (at, per_node) in places.items():
-                limit, nodes = self.limits.inputs[name], x[at]
-                u = nodes[k // per_node]
-                if limit.rate < math.inf:
-                    share = (k % per_node) / per_node
-                    u = (1.0 - share) * u + share * nodes[k // per_node + 1]
+                limit, nodes = self.limits.inputs[name], jnp.concatenate([jnp.zeros(1), x[at]])
+                u = nodes[-(-k // per_node)]
+                if name in self.rates:
+                    share = (-k % per_node) / per_node
+                    u = (1.0 - share) * u + share * nodes[k // per_node]
                 by_input[name] = limit.amplitude * u
             found.append(by_input)
         return tuple(found)
@@ -385,8 +401,9 @@ class _Search:
         all flights and vehicles."""
         outcome = self.experiment.outcome(inputs, known)
         value = jnp.mean(jax.vmap(self._of_covariance)(outcome.covariance))
+        parts = (*outcome.motion, *outcome.before)
         ratios = [
-            largest(jnp.concatenate([jnp.abs(m[n]).ravel() for m in outcome.motion]) / limit)
+            largest(jnp.concatenate([jnp.abs(m[n]).ravel() for m in parts if n in m]) / limit)
             for n, limit in self.limits.motion.items()
         ]
         return value, outcome, jnp.array(ratios, value.dtype)
@@ -397,8 +414,14 @@ class _Search:
         def smooth(ratios: Array) -> Array:
             return jax.scipy.special.logsumexp(_SHARP * ratios) / _SHARP
 
-        inputs, known = self.inputs(self.excitations(x)), self.known(x)
-        value, _, ratios = self._rated(inputs, known, smooth)
+        excitations = self.excitations(x)
+        value, _, ratios = self._rated(self.inputs(excitations), self.known(x), smooth)
+        rates = []
+        for name, rate in self.rates.items():
+            each = zip(self.flights, excitations, strict=True)
+            slopes = [jnp.diff(own[name], prepend=0.0) / flight.dt for flight, own in each]
+            rates.append(smooth(jnp.abs(jnp.concatenate(slopes)) / rate))
+        ratios = jnp.concatenate([ratios, jnp.array(rates, ratios.dtype)])
         active = jnp.maximum(multipliers + penalty * (ratios - 1.0), 0.0)
         added = jnp.sum(jnp.square(active) - jnp.square(multipliers)) / (2.0 * penalty)
         return value + added, ratios - 1.0
@@ -407,7 +430,7 @@ class _Search:
         """Return a manoeuvre, made smaller until its motion is within the limits."""
         for _ in range(30):
             rated = self._as_rated(words, excitations, known)
-            worst = 1.0 - min((rated.margins[n] for n in self.limits.motion), default=1.0)
+            worst = 1.0 - float(np.min(list(rated.margins.values())))
             if worst <= 1.0:
                 break
             # A diverged motion has no size.
@@ -419,7 +442,7 @@ class _Search:
         self, words: str, excitations: tuple[dict[str, np.ndarray], ...], known: Any
     ) -> Rated:
         """Return excitations with the accuracy they give, and their margins."""
-        value, (C, motion), ratios = jax.device_get(self.rated(self.inputs(excitations), known))
+        value, (C, motion, _), ratios = jax.device_get(self.rated(self.inputs(excitations), known))
         if not np.isfinite(C).all():
             value, C = np.inf, np.full(C.shape, np.inf)
         sd = np.sqrt(np.max(C.diagonal(axis1=1, axis2=2), axis=0))
@@ -437,20 +460,47 @@ class _Search:
             for flight, own in zip(self.flights, excitations, strict=True):
                 u = own.get(name, np.zeros(1))
                 sizes.append(float(np.max(np.abs(u))))
-                rates.append(float(np.max(np.abs(np.diff(u)), initial=0.0)) / flight.dt)
-            margins[name] = 1.0 - max(sizes) / limit.amplitude
-            if limit.rate < math.inf:
+                rates.append(float(np.max(np.abs(np.diff(u, prepend=0.0)))) / flight.dt)
+            key = f"excitation of {name}" if name in self.limits.motion else name
+            margins[key] = 1.0 - max(sizes) / limit.amplitude
+            if name in self.rates:
                 margins[f"rate of {name}"] = 1.0 - max(rates) / limit.rate
         return margins
 
-    def library(self) -> list[Rated]:
+    def check(self) -> None:
+        """Refuse a vehicle that exceeds a limit or diverges without excitation.
+
+        Raises:
+            ValueError: names the state, its value and the limit, or the time constant.
+        """
+        from scipy.linalg import eigvals
+
+        experiment, duration = self.experiment, max(f.duration for f in self.flights)
+        growing = max(float(np.max(eigvals(A).real)) for A in experiment.state_matrices())
+        if growing * duration > _GROWTH:
+            raise ValueError(
+                f"the vehicle diverges: a mode grows with a time constant of {1.0 / growing:.3g} s "
+                f"in a flight of {duration:.4g} s, expected a feedback or at most "
+                f"{_GROWTH / growing:.3g} s"
+            )
+        none = tuple(dict[str, np.ndarray]() for _ in self.flights)
+        at_rest = self._as_rated("", none, self.known(np.full(self.size, 0.5)))
+        for name, limit in self.limits.motion.items():
+            if not at_rest.margins[name] > 0.0:
+                reached = (1.0 - at_rest.margins[name]) * limit
+                raise ValueError(
+                    f"limits.motion: {name} reaches {reached:.4g} without any excitation, expected "
+                    f"less than its limit of {limit:.4g}"
+                )
+
+    def library(self, chirps: Sequence[str]) -> list[Rated]:
         """Return the manoeuvres of the library within the limits."""
         names, found = list(self.limits.inputs), []
         middle = self.known(np.full(self.size, 0.5))
         least = min(f.duration for f in self.flights)
         dt = max(f.dt for f in self.flights)
         rates = [limit.rate / limit.amplitude for limit in self.limits.inputs.values()]
-        for manoeuvre in manoeuvres(len(names), least, dt):
+        for manoeuvre in manoeuvres(len(names), least, dt, chirps):
             each = [manoeuvre.samples(f.n_samples, f.dt, rates) for f in self.flights]
             by_flight = tuple(
                 {n: self.limits.inputs[n].amplitude * row for n, row in zip(names, u, strict=True)}
@@ -473,11 +523,13 @@ class _Search:
         x = np.full(self.size, 0.5)
         for flight, places, own in zip(self.flights, self.places, start.inputs, strict=True):
             for name, (at, per_node) in places.items():
-                k = np.minimum(np.arange(at.stop - at.start) * per_node, flight.n_samples - 1)
+                k = np.arange(1, at.stop - at.start + 1) * per_node
+                k = np.minimum(k, flight.n_samples - 1)
                 # All values at their bounds may be a corner from which no step leads.
                 x[at] = 0.5 * own[name][k] / self.limits.inputs[name].amplitude
         bounds = [(-1.0, 1.0)] * self.nodes + [(0.0, 1.0)] * len(self.varied)
-        multipliers, penalty, steps, before = np.zeros(len(self.limits.motion)), 10.0, 0, np.inf
+        multipliers = np.zeros(len(self.limits.motion) + len(self.rates))
+        penalty, steps, before = 10.0, 0, np.inf
 
         def cost(x: np.ndarray, *lagrangian: Any) -> tuple[float, np.ndarray]:
             (value, _), slope = self.augmented(x, *lagrangian)

@@ -3,7 +3,7 @@
 import functools
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -38,14 +38,18 @@ def manoeuvres_table(run: Any, most: int = _ROWS) -> Table:
     """Return the optimum, the user's inputs and the best of the library, a row each."""
     design = run.design
     names = list(dict.fromkeys([*products(run), *design.optimum.sd]))
-    rows = []
-    for rated in (design.optimum, *([design.own] if design.own else []), *design.library[:most]):
+    rows, played = [], _played(run).values()
+    library = [
+        r for i, r in enumerate(design.library) if i < most or any(r is chirp for chirp in played)
+    ]
+    for rated in (design.optimum, *([design.own] if design.own else []), *library):
         tight = min(rated.margins, key=lambda n: rated.margins[n])
         sds = [design.sd_of(rated, n) for n in names]
         cells = [_percent(sd) if sd < DETERMINES else "not determined" for sd in sds]
         if run.wanted:
             needed = design.needed(rated, run.wanted)
-            cells.append(f"{needed:.3g} s" if math.isfinite(needed) else "never")
+            words = f"{needed:.3g} s" if needed > design.duration else "one run"
+            cells.append(words if math.isfinite(needed) else "never")
         # Inputs are made smaller to a millionth below a limit.
         margin = rated.margins[tight] if abs(rated.margins[tight]) > 1e-5 else 0.0
         rows.append((rated.words, *cells, f"{_percent(margin)} ({tight})"))
@@ -64,16 +68,35 @@ def _percent(share: float) -> str:
 
 
 def summary(run: Any) -> str:
-    """Return what the design gains, in a sentence."""
+    """Return what the design gains on the sds of the table, in a sentence."""
     design = run.design
-    best, optimum = design.library[0], design.optimum
-    gain = 1.0 - math.exp(optimum.value - best.value)
-    words = {"D": "the mean sd (criterion D)", "A": "the rms sd (criterion A)"}
-    words |= {"E": "the largest sd (criterion E)"}
-    what = words.get(design.criterion, f"the sd of {design.criterion}")
-    if gain < _GAIN:
-        return f"No input was found that is better than {best.words}."
-    return f"The optimised input lowers {what} by {_percent(gain)} against {best.words}."
+
+    def size(rated: Rated) -> tuple[str, float]:
+        """Return what is compared, and its value."""
+        sds = np.array(list(rated.sd.values()))
+        if design.criterion == "D":
+            return "geometric mean of the sds", float(np.exp(np.mean(np.log(sds))))
+        if design.criterion == "A":
+            return "rms of the sds", float(np.sqrt(np.mean(sds**2)))
+        if design.criterion == "E":
+            return "largest sd", float(np.max(sds))
+        return f"sd of {design.criterion}", design.sd_of(rated, design.criterion)
+
+    best = min(design.library, key=lambda rated: size(rated)[1])
+    (what, after), (_, before) = size(design.optimum), size(best)
+    gain = 1.0 - after / before
+    if not gain >= _GAIN:
+        return f"No input was found with a lower {what} than {best.words}."
+    return f"The optimised input lowers the {what} by {_percent(gain)} against {best.words}."
+
+
+def _played(run: Any) -> dict[str, Rated]:
+    """Return the best chirp of each kind that an autopilot plays."""
+    found = {}
+    for rated in run.design.library:
+        if (kind := rated.manoeuvre.kind).endswith("-chirp"):
+            found.setdefault(kind, rated)
+    return found
 
 
 def known_differences(run: Any) -> list[str]:
@@ -91,8 +114,8 @@ def write_design(folder: Path, run: Any, config: str) -> None:
     write_table(folder / "input.csv", columns)
     (folder / "design.json").write_text(as_json(_content(run)) + "\n", encoding="utf-8")
     played = autopilot_files(run)
-    for name, text in played.items():
-        (folder / name).write_text(text, encoding="utf-8")
+    for name, file in played.items():
+        (folder / name).write_text(file.text, encoding="utf-8")
     (folder / "figures").mkdir()
     numbers, pictures = Numbers(), []
     for i in range(len(run.problem.training)):
@@ -106,6 +129,7 @@ def write_design(folder: Path, run: Any, config: str) -> None:
         doubts=doubts(run),
         table_of=manoeuvres_table(run),
         known=known_differences(run),
+        played=signals_played(run),
         pictures=[p for p in pictures if p is not None],
         numbers=numbers.content(),
         origin=origin(config, (*_FILES, *played)),
@@ -126,8 +150,20 @@ def doubts(run: Any) -> list[str]:
             f"The optimised input does not determine {', '.join(lost)}: a prior, another output or "
             "a second run with a known difference is needed."
         )
-    if design.own and (over := [n for n, m in design.own.margins.items() if m < -1e-9]):
-        found.append(f"Your own inputs exceed the limits of {', '.join(over)}.")
+    limits, kinds = run.settings.inputs.values(), _played(run)
+    for key, words in (("ardupilot", "ArduPilot"), ("betaflight", "Betaflight")):
+        if any(getattr(limit, key) for limit in limits) and f"{key}-chirp" not in kinds:
+            found.append(f"No chirp of {words} fits in the flight: it must last longer.")
+    own = [("Your own inputs exceed", design.own)] if design.own else []
+    for words, rated in [("The optimised input exceeds", design.optimum), *own]:
+        if over := [n for n, m in rated.margins.items() if m < -1e-9]:
+            found.append(f"{words} the limits of {', '.join(over)}.")
+    drawn = [f for f in run.problem.free.values() if f.prior or None not in (f.lower, f.upper)]
+    if run.settings.vehicles > 1 and not drawn:
+        found.append(
+            f"The {run.settings.vehicles} vehicles are all equal: no free parameter has a prior or "
+            "two bounds."
+        )
     return found
 
 
@@ -137,46 +173,71 @@ def input_columns(run: Any) -> dict[str, np.ndarray]:
     for i, (flight, own) in enumerate(
         zip(run.problem.training, run.design.optimum.inputs, strict=True)
     ):
-        part = {"time": np.arange(flight.n_samples) * flight.dt}
+        part = {"time [s]": np.arange(flight.n_samples) * flight.dt}
         if len(run.problem.training) > 1:
             part = {"run": np.full(flight.n_samples, i + 1)} | part
         for name, limit in run.limits.inputs.items():
             scale = run.settings.inputs[name].amplitude / limit.amplitude
-            part[name] = scale * own[name]
+            settings, model = run.settings.inputs[name], run.problem.model
+            unit = settings.unit or _unit(model, name, settings.set_point)
+            part[f"{name} [{unit}]"] = scale * own[name]
         parts.append(part)
     return {n: np.concatenate([p[n] for p in parts]) for n in parts[0]}
 
 
-def autopilot_files(run: Any) -> dict[str, str]:
+def _unit(model: Any, name: str, set_point: str | None) -> str:
+    """Return the SI unit of the excitation of an input, or of a state's set point."""
+    of = (model.Inputs, name) if set_point is None else (model.State, set_point)
+    return naming.unit(*of) or "1"
+
+
+class Played(NamedTuple):
+    """A file for an autopilot or a transmitter."""
+
+    text: str
+    signal: str
+    """Manoeuvre that it plays."""
+
+
+def autopilot_files(run: Any) -> dict[str, Played]:
     """Return by name the files of the first run for autopilots and transmitters.
 
-    Autopilots play the best chirp of the library, a transmitter the optimised input.
+    Autopilots play the best of their own chirps, a transmitter the optimised input.
     """
     settings, flight = run.settings, run.problem.training[0]
-    files: dict[str, str] = {}
-    rated = [(r.inputs[0], r.manoeuvre) for r in run.design.library if r.manoeuvre]
-    chirp = next((one for one in rated if one[1].kind == "chirp"), None)
-    duration = flight.n_samples * flight.dt / len(settings.inputs)
-    shares = []
-    for name, limit in settings.inputs.items():
+    files: dict[str, Played] = {}
+    chirps, shares = _played(run), []
+    for i, (name, limit) in enumerate(settings.inputs.items()):
         scale = limit.amplitude / run.limits.inputs[name].amplitude
         if limit.full_stick is not None:
             own = run.design.optimum.inputs[0][name]
             shares.append((name, scale * own / limit.full_stick))
-        if chirp is None:
-            continue
-        size, band = float(np.max(np.abs(chirp[0][name]))), chirp[1].settings["band"]
-        if limit.ardupilot is not None:
-            # Mixer axes take shares of full output, the others degrees.
-            size_there = size if limit.ardupilot.startswith("mixer") else math.degrees(size)
-            text = ardupilot_parameters(band, limit.ardupilot, size_there, duration)
-            files[f"ardupilot-{name}.param"] = text
-        if limit.betaflight is not None:
-            text = betaflight_commands(band, limit.betaflight, math.degrees(size), duration)
-            files[f"betaflight-{name}.txt"] = text
+        for kind, chirp in chirps.items():
+            of = chirp.manoeuvre
+            assert of is not None
+            duration = of.length(flight.n_samples, len(settings.inputs)) * flight.dt
+            band, fade = of.settings["band"], of.settings["fade"]
+            # Sampled sines may not reach their amplitude.
+            whole = of.samples(flight.n_samples, flight.dt, [np.inf] * len(settings.inputs))[i]
+            size = float(np.max(np.abs(chirp.inputs[0][name])) / np.max(np.abs(whole)))
+            if kind == "ardupilot-chirp" and limit.ardupilot is not None:
+                text = ardupilot_parameters(band, limit.ardupilot, size, duration, fade)
+                files[f"ardupilot-{name}.param"] = Played(text, chirp.words)
+            if kind == "betaflight-chirp" and limit.betaflight is not None:
+                text = betaflight_commands(band, limit.betaflight, size, duration)
+                files[f"betaflight-{name}.txt"] = Played(text, chirp.words)
     if shares:
-        files["input.lua"] = transmitter_script(flight.dt, shares)
+        text = transmitter_script(flight.dt, shares)
+        files["input.lua"] = Played(text, run.design.optimum.words)
     return files
+
+
+def signals_played(run: Any) -> list[str]:
+    """Return which signal each file of a design plays, a sentence for each signal."""
+    by_signal = {run.design.optimum.words: ["input.csv"]}
+    for name, file in autopilot_files(run).items():
+        by_signal.setdefault(file.signal, []).append(name)
+    return [f"{' and '.join(names)}: {signal}" for signal, names in by_signal.items()]
 
 
 def _content(run: Any) -> dict[str, Any]:
@@ -219,7 +280,7 @@ def _draw(run: Any, i: int) -> Chart:
     panels = []
     for name, limit in run.limits.inputs.items():
         own, point = run.design.optimum.inputs[i][name], run.settings.inputs[name].set_point
-        unit = naming.unit(model.Inputs, name) if point is None else naming.unit(model.State, point)
+        unit = _unit(model, name, point)
         panels.append(
             panel(
                 label(name, unit),
@@ -228,7 +289,7 @@ def _draw(run: Any, i: int) -> Chart:
                 levels=(-limit.amplitude, limit.amplitude),
             )
         )
-    records = {n: r for r in (model.State, model.Outputs) for n in naming.names(r)}
+    records = {n: r for r in (model.Inputs, model.State, model.Outputs) for n in naming.names(r)}
     for name, most in run.limits.motion.items():
         series = [samples("", t, motion[name], style.BLUE, 0.9)]
         ends = (-1.1 * most, 1.1 * most)

@@ -5,6 +5,7 @@ and Morelli (2006) for orthogonal multisines; Tischler and Remple (2012) for fre
 fades; Plaetschke and Schulz (1979) for multistep inputs; Golomb (1967) for shift registers.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -84,6 +85,45 @@ def chirp(n: int, dt: float, low: float, high: float, fade: float = 0.0) -> Samp
     growth = np.log(high / low) / max(t[-1], dt)
     u = np.sin(2.0 * np.pi * low * np.expm1(growth * t) / growth)
     return u * np.clip(np.minimum(t, t[-1] - t) / fade, 0.0, 1.0) if fade else u
+
+
+def ardupilot_chirp(n: int, dt: float, band: tuple[float, float], fade: float) -> Samples:
+    """Return the chirp of ArduPilot's mode SYSTEMID (`chirp.cpp`, `mode_systemid.cpp`): two periods
+    of the first frequency, then an exponential sweep.
+
+    Args:
+        dt: sample time [s].
+        band: first and last frequency [Hz].
+        fade: times of the cosine-shaped begin and end, SID_T_FADE_IN and SID_T_FADE_OUT [s].
+
+    Raises:
+        ValueError: two periods take the whole record.
+    """
+    t, record, (low, high) = np.arange(n) * dt, n * dt, band
+    dwell = 2.0 / low
+    if not dwell < record:
+        raise ValueError(
+            f"band: two periods of {low:g} Hz take {dwell:g} s, expected less than {record:g} s"
+        )
+    growth = np.log(high / low) / (record - dwell)
+    periods = np.where(t < dwell, t - dwell, np.expm1(growth * np.maximum(t - dwell, 0)) / growth)
+    share = np.clip(np.minimum(t, record - t) / fade, 0.0, 1.0) if fade else (t > 0).astype(float)
+    return np.sin(2.0 * np.pi * low * periods) * (0.5 - 0.5 * np.cos(np.pi * share))
+
+
+def betaflight_chirp(n: int, dt: float, band: tuple[float, float]) -> Samples:
+    """Return the chirp of Betaflight's mode CHIRP without its filter (`chirp.c`): an exponential
+    sweep of cosines in whole seconds, smaller below 1 Hz.
+
+    Args:
+        dt: sample time [s].
+        band: first and last frequency [Hz].
+    """
+    t, record, (low, high) = np.arange(n) * dt, math.floor(n * dt + 1e-9), band
+    growth = np.log(high / low) / max(record, dt)
+    frequency = low * np.exp(growth * t)
+    u = np.minimum(frequency, 1.0) * np.cos(2.0 * np.pi * (frequency - low) / growth)
+    return np.where(t < record, u, 0.0)
 
 
 def prbs(n: int, dt: float, rng: np.random.Generator, step: float) -> Samples:
@@ -199,6 +239,18 @@ KINDS = (
         smooth=True,
     ),
     Kind(
+        "ardupilot-chirp",
+        lambda n, dt, _, **of: ardupilot_chirp(n, dt, **of),
+        ("band", "fade"),
+        smooth=True,
+    ),
+    Kind(
+        "betaflight-chirp",
+        lambda n, dt, _, band: betaflight_chirp(n, dt, band),
+        ("band",),
+        smooth=True,
+    ),
+    Kind(
         "multisine", lambda n, dt, _, **of: multisine(n, dt, **of), ("band", "place"), smooth=True
     ),
     Kind("neutral", lambda n, dt, _: np.zeros(n)),
@@ -235,10 +287,10 @@ def excitation(
     fastest = float(np.max(np.abs(np.diff(u)), initial=0.0)) / dt
     if fastest <= rate:
         return u
-    return u * (rate / fastest) if found.smooth else _slewed(u, rate * dt)
+    return u * (rate / fastest) if found.smooth else slewed(u, rate * dt)
 
 
-def _slewed(u: Samples, most: float) -> Samples:
+def slewed(u: Samples, most: float) -> Samples:
     """Return steps (N,) as ramps of at most `most` in a sample."""
     at, out = float(u[0]), np.empty(u.size)
     for k, x in enumerate(u.tolist()):

@@ -12,6 +12,11 @@ from heli_jax.simulation.events import Event
 from heli_jax.simulation.hold import Hold
 
 
+class Scan(dfx.DirectAdjoint):
+    """Forward and reverse mode through a scan over the samples, each computed again in reverse. It
+    compiles in a fraction of the time; a failed step does not end the run."""
+
+
 class SimulationOptions(NamedTuple):
     """Options of `simulate` and `accumulate`; each field is also a keyword of both."""
 
@@ -34,7 +39,7 @@ class SimulationOptions(NamedTuple):
     """
     adjoint: dfx.AbstractAdjoint | None = None
     """Default: `diffrax.DirectAdjoint()`, for forward and reverse mode. `ForwardMode()` compiles
-    faster, `RecursiveCheckpointAdjoint()` saves memory in reverse mode.
+    faster, `RecursiveCheckpointAdjoint()` saves memory in reverse mode, `Scan()` both.
     """
     max_steps: int = 4096
     """Limit of adaptive steps per sample; `result` shows if it was reached."""

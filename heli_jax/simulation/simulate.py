@@ -25,7 +25,7 @@ from heli_jax.simulation.blocks import blockwise
 from heli_jax.simulation.discretize import Discrete, process_noise, square_root
 from heli_jax.simulation.events import NO_END, Event, any_over, stopped
 from heli_jax.simulation.hold import Delays, FlightOrInputs, at, at_end, between_samples, delayed
-from heli_jax.simulation.options import DEFAULT, SimulationOptions
+from heli_jax.simulation.options import DEFAULT, Scan, SimulationOptions
 from heli_jax.simulation.solvers import (
     Exact,
     SolverWrapper,
@@ -225,6 +225,18 @@ def _stepwise(
     n = jax.tree.leaves(args.inputs)[0].shape[0]
     dtype = jax.tree.leaves(x0)[0].dtype
     check_countable(n, dtype)
+    if isinstance(adjoint, Scan):
+        # Every solver of whole samples has `stepped`.
+        solver: Any = method
+
+        @jax.checkpoint
+        def sample(x: Any, k: Time) -> tuple[Any, Any]:
+            x, _ = solver.stepped(term, k, k + 1.0, x, args)
+            return x, x
+
+        _, later = jax.lax.scan(sample, x0, jnp.arange(n - 1, dtype=dtype))
+        joined = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), x0, later)
+        return joined, dfx.RESULTS.successful
     sol = dfx.diffeqsolve(
         term,
         method,

@@ -11,7 +11,12 @@ import scipy.linalg
 from heli_jax import Flight, Free, Nuisance, Prior, Problem
 from heli_jax.cli.commands import main
 from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.identification.design.autopilots import ardupilot_parameters, transmitter_script
+from heli_jax.identification.design.autopilots import (
+    ARDUPILOT,
+    ardupilot_parameters,
+    betaflight_commands,
+    transmitter_script,
+)
 from heli_jax.identification.flight_design import InputLimit, Limits, _Search, design
 from heli_jax.identification.identifiability.verdict import exponents
 from heli_jax.naming import asdict
@@ -215,12 +220,18 @@ def test_refused(changes):
 def test_files_for_autopilots_and_transmitters():
     lines = dict(
         line.split(",")
-        for line in ardupilot_parameters((0.1, 5.0), "rate-roll", 20, 60).splitlines()
+        for line in ardupilot_parameters(
+            (0.1, 5.0), "rate-roll", np.radians(20), 60, 3
+        ).splitlines()
     )
     assert float(lines["SID_AXIS"]) == 7
     assert float(lines["SID_MAGNITUDE"]) == 20
     assert float(lines["SID_T_REC"]) == 60
     assert (float(lines["SID_F_START_HZ"]), float(lines["SID_F_STOP_HZ"])) == (0.1, 5.0)
+    assert ARDUPILOT["input-yaw"] == (3, "rad/s")
+    commands = betaflight_commands((0.25, 5.0), "yaw", np.radians(20.5), 20.9).splitlines()
+    assert "set chirp_amplitude_yaw = 20" in commands
+    assert "set chirp_time_seconds = 20" in commands
     script = transmitter_script(0.01, [("lat", np.array([0.0, 0.5, 1.0, -1.0, 2.0]))])
     assert "{0,1024,1024}" in script
 
@@ -252,17 +263,25 @@ def test_command(tmp_path, capsys):
     assert content["optimum"]["seconds_needed"] > 0
     assert min(content["optimum"]["margins"].values()) > -1e-9
     table = np.genfromtxt(out / "input.csv", delimiter=",", names=True)
-    assert np.max(np.abs(table["lat"])) <= 0.1 * (1 + 1e-9)
+    assert table.dtype.names == ("time_s", "lat_rads")
+    assert np.max(np.abs(table["lat_rads"])) <= 0.1 * (1 + 1e-9)
+    # The file plays a chirp that is rated, and which ArduPilot accepts.
+    words = [r["input"] for r in content["library"] if r["input"].startswith("ArduPilot's")]
+    assert f"ardupilot-lat.param: {words[0]}" in (printed := capsys.readouterr().out)
+    lines = (out / "ardupilot-lat.param").read_text().splitlines()
+    played = dict(line.split(",") for line in lines)
+    assert float(played["SID_T_REC"]) > 2.0 / float(played["SID_F_START_HZ"])
     assert {"report.html", "config.yaml", "ardupilot-lat.param", "input.lua"} <= {
         p.name for p in out.iterdir()
     }
-    assert "tau_f" in capsys.readouterr().out
+    assert "tau_f" in printed
 
 
 @pytest.mark.parametrize(
     "change",
     ["simulate=null", "design=null", "design.inputs.lat.set_point=b", "simulate.noise={}",
-     "design.motion.x.most=1", "design.inputs.lat.ardupilot=mixer-roll", "design.criterion=a/b"],
+     "design.motion.x.most=1", "design.inputs.lat.ardupilot=mixer-roll", "design.criterion=a/b",
+     "design.inputs.lat.full_stick=0.05"],
 )  # fmt: skip
 def test_wrong_configurations(tmp_path, capsys, change):
     config = tmp_path / "design.yaml"

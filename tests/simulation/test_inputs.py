@@ -1,11 +1,15 @@
 """Stick inputs: amplitudes, holds and frequencies."""
 
+import math
+
 import numpy as np
 import pytest
 
 from heli_jax.config import StickConfig
 from heli_jax.simulation.inputs import (
     KINDS,
+    ardupilot_chirp,
+    betaflight_chirp,
     chirp,
     excitation,
     multisine,
@@ -90,10 +94,44 @@ def test_multisines_of_several_inputs_are_orthogonal():
 def test_every_kind_keeps_its_limits(kind):
     assert StickConfig(kind=kind, amplitude=1.0).kind == kind
     rng = np.random.default_rng(0)
-    settings = {**dict(StickConfig(amplitude=1.0, band=(0.1, 2.0))), "place": (0, 1)}
+    settings = {**dict(StickConfig(amplitude=1.0, band=(0.2, 2.0))), "place": (0, 1)}
     u = excitation(kind, 2000, 0.01, rng, settings, amplitude=0.3, rate=1.5)
     assert u.shape == (2000,)
     assert np.max(np.abs(u)) <= 0.3 + 1e-12
     assert np.max(np.abs(np.diff(u))) <= 1.5 * 0.01 + 1e-12
-    if kind not in ("neutral", "chirp", "multisine"):
+    if kind != "neutral" and "chirp" not in kind and kind != "multisine":
         assert np.max(np.abs(u)) > 0.25
+
+
+def test_ardupilots_chirp():
+    # `Chirp::update`, sample by sample.
+    n, dt, low, high, fade = 1000, 0.01, 0.5, 5.0, 0.4
+    u, record, dwell = ardupilot_chirp(n, dt, (low, high), fade), n * dt, 2.0 / low
+    first, B = 2 * math.pi * low, math.log(high / low)
+    for k in range(1, n):
+        t = k * dt
+        window = 1.0
+        if t <= fade:
+            window = 0.5 - 0.5 * math.cos(math.pi * t / fade)
+        elif t > record - fade:
+            window = 0.5 - 0.5 * math.cos(math.pi * (t - (record - fade)) / fade + math.pi)
+        if t <= dwell:
+            expected = math.sin(first * t - first * dwell)
+        else:
+            rise = math.exp(B * (t - dwell) / (record - dwell)) - 1
+            expected = math.sin(first * (record - dwell) / B * rise)
+        assert u[k] == pytest.approx(window * expected, abs=1e-9)
+    assert u[0] == 0.0
+    with pytest.raises(ValueError, match="two periods"):
+        ardupilot_chirp(300, 0.01, (0.5, 5.0), 0.0)
+
+
+def test_betaflights_chirp():
+    # `chirpUpdate`, sample by sample; the last part of a second is not played.
+    n, dt, low, high = 550, 0.01, 0.5, 5.0
+    u, beta = betaflight_chirp(n, dt, (low, high)), (high / low) ** (1 / 5.0)
+    for k in range(n):
+        frequency = low * beta ** (k * dt)
+        k0 = 2 * math.pi / math.log(beta)
+        expected = math.cos(k0 * frequency - k0 * low) * min(frequency, 1.0)
+        assert u[k] == pytest.approx(expected if k < 500 else 0.0, abs=1e-9)

@@ -5,17 +5,18 @@ CHIRP. Neither plays another signal, and PX4 and Rotorflight play none. A transm
 plays any signal by a script in its mixer.
 """
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
-_PLACES = {"input": 1, "rate": 7, "mixer": 10}
+_PLACES = {"input": (1, "rad"), "rate": (7, "rad/s"), "mixer": (10, "1")}
 ARDUPILOT = {
-    f"{place}-{axis}": first + i
-    for place, first in _PLACES.items()
+    f"{place}-{axis}": (first + i, unit)
+    for place, (first, unit) in _PLACES.items()
     for i, axis in enumerate(("roll", "pitch", "yaw"))
-} | {"mixer-thrust": 13}
-"""SID_AXIS by the place where the chirp is added."""
+} | {"input-yaw": (3, "rad/s"), "mixer-thrust": (13, "1")}
+"""SID_AXIS, and the unit of the chirp, by the place where it is added."""
 _LEAST_DEADTIME = 0.02
 """Time between two steps of a mixer script [s]."""
 _FULL = 1024
@@ -23,21 +24,23 @@ _FULL = 1024
 
 
 def ardupilot_parameters(
-    band: tuple[float, float], axis: str, magnitude: float, duration: float
+    band: tuple[float, float], axis: str, magnitude: float, duration: float, fade: float
 ) -> str:
-    """Return a parameter file for a chirp of ArduPilot's mode SYSTEMID.
+    """Return a parameter file for `ardupilot_chirp` in ArduPilot's mode SYSTEMID.
 
     Args:
-        band: lowest and highest frequency [Hz].
+        band: first and last frequency [Hz].
         axis: key of `ARDUPILOT`.
-        magnitude: deflection: degrees for input, degrees a second for rate, 0 to 1 for mixer axes.
+        magnitude: deflection, SI.
         duration: duration of the chirp [s].
+        fade: duration of its begin and its end [s].
     """
     low, high = band
-    fade = 0.05 * duration
+    number, unit = ARDUPILOT[axis]
     lines = {
-        "SID_AXIS": ARDUPILOT[axis],
-        "SID_MAGNITUDE": f"{magnitude:.4g}",
+        "SID_AXIS": number,
+        # Mixer axes take shares of full output, the others degrees.
+        "SID_MAGNITUDE": f"{magnitude if unit == '1' else math.degrees(magnitude):.4g}",
         "SID_F_START_HZ": f"{low:.4g}",
         "SID_F_STOP_HZ": f"{high:.4g}",
         "SID_T_FADE_IN": f"{fade:.4g}",
@@ -50,20 +53,24 @@ def ardupilot_parameters(
 def betaflight_commands(
     band: tuple[float, float], axis: str, amplitude: float, duration: float
 ) -> str:
-    """Return commands of Betaflight's command line for its mode CHIRP.
+    """Return commands of Betaflight's command line for `betaflight_chirp` in its mode CHIRP.
 
     Args:
-        band: lowest and highest frequency [Hz].
+        band: first and last frequency [Hz].
         axis: roll, pitch or yaw.
-        amplitude: largest set point [deg/s].
+        amplitude: largest set point [rad/s].
         duration: duration of the chirp [s].
     """
     low, high = band
     lines = {
-        f"chirp_amplitude_{axis}": f"{amplitude:.0f}",
-        "chirp_frequency_start_deci_hz": f"{max(1.0, 10.0 * low):.0f}",
+        # The filter passes the chirp unchanged if its pole and its zero are equal.
+        "chirp_lag_freq_hz": "30",
+        "chirp_lead_freq_hz": "30",
+        # Whole degrees a second, within the limit.
+        f"chirp_amplitude_{axis}": f"{max(1, math.floor(math.degrees(amplitude) + 1e-6))}",
+        "chirp_frequency_start_deci_hz": f"{10.0 * low:.0f}",
         "chirp_frequency_end_deci_hz": f"{10.0 * high:.0f}",
-        "chirp_time_seconds": f"{duration:.0f}",
+        "chirp_time_seconds": f"{math.floor(duration + 1e-9)}",
     }
     return "".join(f"set {name} = {value}\n" for name, value in lines.items()) + "save\n"
 

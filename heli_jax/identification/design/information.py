@@ -7,6 +7,7 @@ linear model. It is averaged once over random records and added.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -17,10 +18,11 @@ from jaxtyping import Array, Float
 from heli_jax import naming
 from heli_jax.identification.estimation.evaluation import named
 from heli_jax.identification.estimation.residual import weak_rows
-from heli_jax.identification.estimation.simulated_flights import driven, simulated_flight
+from heli_jax.identification.estimation.simulated_flights import Drive, driven, simulated_flight
 from heli_jax.identification.identifiability.analysis import relative_slopes, unknowns_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
+from heli_jax.simulation.hold import at
 
 # Inputs, Params and State are Any, because they are a model's own classes.
 
@@ -37,9 +39,12 @@ class Flown(NamedTuple):
     """The experiment as the model flies it."""
 
     data: Data
-    """With the acting inputs and the outputs."""
+    """With the outputs, and the inputs as they are recorded: with feedback those that act."""
     motion: tuple[dict[str, Array], ...]
-    """Outputs and states (N,) by flight and name, SI."""
+    """Acting inputs, states and outputs (N,) by flight and name, SI; outputs of a state's name take
+    its place."""
+    before: tuple[dict[str, Array], ...]
+    """Outputs (N - 1,) by flight and name just before the next sample's inputs act, SI."""
 
 
 @jax.custom_vjp
@@ -82,6 +87,8 @@ class Outcome(NamedTuple):
     """Of the parameters, in relative coordinates."""
     motion: tuple[dict[str, Array], ...]
     """As in `Flown`."""
+    before: tuple[dict[str, Array], ...]
+    """As in `Flown`."""
 
 
 class Experiment(NamedTuple):
@@ -113,7 +120,7 @@ class Experiment(NamedTuple):
         def of_one(vehicle: Vehicle) -> Outcome:
             flown = self.flown(vehicle, inputs, known)
             rows = jnp.concatenate([self._rows(vehicle, flown.data), vehicle.rows])
-            return Outcome(covariance(rows)[:p, :p], flown.motion)
+            return Outcome(covariance(rows)[:p, :p], flown.motion, flown.before)
 
         return jax.vmap(of_one)(self.vehicles)
 
@@ -130,18 +137,43 @@ class Experiment(NamedTuple):
         given = tuple(f._replace(inputs=u, known={**f.known, **k}) for f, u, k in flights)
         data = self.data._replace(flights=given)
         u = unpack(layout, data, vehicle.z)
-        each = []
+        flown, motion, before = [], [], []
         for i, names in enumerate(layout.outputs):
-            # The motion is differentiated in reverse mode too. A shift is zero at the start.
-            options = {"adjoint": None, "feedback": self.feedback}
+            # A shift is zero at the start.
+            options = {"feedback": self.feedback}
             if keys is not None or self.feedback is not None:
                 options |= {"block": 1, "key": None if keys is None else keys[i]}
-            run = simulated_flight(layout, i, driven(layout, data, u, i), None, **options)
-            each.append((run.inputs, {n: getattr(run.outputs, n) for n in names}, run))
-        flights = zip(given, each, strict=True)
-        flown = tuple(f._replace(inputs=v, outputs=y) for f, (v, y, _) in flights)
-        motion = [naming.asdict(r.states) | naming.asdict(r.outputs) for _, _, r in each]
-        return Flown(data._replace(flights=flown), tuple(motion))
+            drive = driven(layout, data, u, i)
+            run = simulated_flight(layout, i, drive, None, **options)
+            # The record has the inputs as commanded: the rows delay them again.
+            inputs = given[i].inputs if self.feedback is None else run.inputs
+            outputs = {n: getattr(run.outputs, n) for n in names}
+            flown.append(given[i]._replace(inputs=inputs, outputs=outputs))
+            parts = (run.inputs, run.states, run.outputs)
+            motion.append({n: x for part in parts for n, x in naming.asdict(part).items()})
+            now = jax.tree.map(lambda v: v[1:], run.states)
+            earlier = jax.tree.map(lambda v: v[:-1], run.inputs)
+            # An output with direct feedthrough jumps at a sample.
+            output = jax.vmap(lambda x, u, p=drive.params: layout.model.output(p, x, u))
+            before.append(naming.asdict(output(now, earlier)))
+        return Flown(data._replace(flights=tuple(flown)), tuple(motion), tuple(before))
+
+    def state_matrices(self) -> list[Float[Array, "n n"]]:
+        """Return the first vehicle's state matrix, with feedback, at the begin of each flight."""
+        layout, data = self.layout, self.data
+        u = unpack(layout, data, self.vehicles.z[0])
+        found, model = [], layout.model
+        for i in range(len(data.flights)):
+            drive = driven(layout, data, u, i)
+            begin = model.initial_state(drive.params) if drive.state is None else drive.state
+
+            def rates(x: Array, drive: Drive = drive) -> Array:
+                state, inputs = naming.unravel(model.State, x), at(drive.inputs, 0)
+                inputs = inputs if self.feedback is None else self.feedback(state, inputs)
+                return naming.ravel(model.vector_field(drive.params, state, inputs))
+
+            found.append(jax.jacfwd(rates)(naming.ravel(begin)))
+        return found
 
     def _rows(self, vehicle: Vehicle, data: Data) -> Float[Array, "n q"]:
         """Return the rows of the measurements and of the weak priors of nuisances."""
@@ -172,6 +204,7 @@ def planned(
         flown: rows of the information of earlier flights on the shared unknowns; without them
             that of gusts is computed.
     """
+    layout = replace(layout, reverse=True)
     scales = np.ones(points.shape)
     rows = np.tile(_WEAK * np.eye(layout.size), (len(points), 1, 1))
     for z, own, prior in zip(points, scales, rows, strict=True):

@@ -21,7 +21,7 @@ from heli_jax.identification.estimation.evaluation import Evaluation
 from heli_jax.identification.identifiability.analysis import sensitivity_at, verdict_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Solution, flight_places, layout_of
-from heli_jax.simulation.inputs import excitation
+from heli_jax.simulation.inputs import excitation, slewed
 
 _STEPS = (0.1, 0.2, 0.5, 1.0)
 """Shortest steps of a candidate [s]."""
@@ -33,7 +33,14 @@ _STEPPED = {
     "prbs": ("a binary sequence of {:g} s", 5),
 }
 """Words, and the number of shortest steps that a manoeuvre takes with its pause."""
-_SWEPT = {"chirp": "a chirp", "multisine": "a multisine"}
+_SWEPT = {
+    "chirp": "a chirp",
+    "ardupilot-chirp": "ArduPilot's chirp",
+    "betaflight-chirp": "Betaflight's chirp",
+    "multisine": "a multisine",
+}
+_FADE, _LONGEST_FADE = 0.05, 5.0
+"""Fades of ArduPilot's chirp: share of the record, and at most [s]."""
 
 
 class Manoeuvre(NamedTuple):
@@ -50,31 +57,44 @@ class Manoeuvre(NamedTuple):
     ) -> Float[np.ndarray, "i n"]:
         """Return the samples of several inputs, with deflections of at most 1.
 
-        Inputs move together if their motions are independent, else one after another.
+        Inputs move together if their motions are independent, else one after another. The first
+        sample is zero, as the inputs before the flight.
 
         Args:
             rates: largest rate of each input [deflection/s].
         """
-        number = len(rates)
-        at_once = self.kind in ("multisine", "prbs", "random-steps")
-        length, u = (n if at_once else n // number), np.zeros((number, n))
+        number, length = len(rates), self.length(n, len(rates))
+        u = np.zeros((number, n))
         for i, rate in enumerate(rates):
             # One generator per input: two binary sequences of one seed would be equal.
             rng = np.random.default_rng(i)
             settings = {**self.settings, "place": (i, number)}
-            begin = 0 if at_once else i * length
+            begin = 1 if self._at_once else 1 + i * length
             u[i, begin : begin + length] = excitation(
                 self.kind, length, dt, rng, settings, rate=rate
             )
+            # The begin and the end of an excitation are steps.
+            u[i] = slewed(u[i], rate * dt)
         return u
 
+    @property
+    def _at_once(self) -> bool:
+        return self.kind in ("multisine", "prbs", "random-steps")
 
-def manoeuvres(inputs: int, duration: float, dt: float) -> list[Manoeuvre]:
+    def length(self, n: int, inputs: int) -> int:
+        """Return the samples of one input's excitation in a flight of n samples."""
+        return n - 1 if self._at_once else (n - 1) // inputs
+
+
+def manoeuvres(
+    inputs: int, duration: float, dt: float, chirps: Sequence[str] = ("chirp",)
+) -> list[Manoeuvre]:
     """Return the manoeuvres that a flight has time for.
 
     Args:
         inputs: number of inputs.
         duration: duration of the flight [s].
+        chirps: kinds of chirps.
     """
     found = [
         Manoeuvre(words.format(step), kind, {"step": step, "pause": step})
@@ -85,10 +105,17 @@ def manoeuvres(inputs: int, duration: float, dt: float) -> list[Manoeuvre]:
     for low, high in _BANDS:
         # The lowest line has a period in the record, and each input a line of its own.
         low = max(low, inputs / duration)
-        if 2.0 * low < high <= 0.2 / dt:
-            for kind, words in _SWEPT.items():
-                words = f"{words} from {low:.2g} to {high:.2g} Hz"
-                found.append(Manoeuvre(words, kind, {"band": (low, high), "fade": 0.0}))
+        for kind in (*chirps, "multisine"):
+            # Two periods of ArduPilot's first frequency take half of the record. Betaflight counts
+            # tenths of a hertz.
+            first = max(low, 4.0 * inputs / duration) if kind == "ardupilot-chirp" else low
+            first = math.ceil(10.0 * first) / 10.0 if kind == "betaflight-chirp" else first
+            fade = (
+                min(_FADE * duration / inputs, _LONGEST_FADE) if kind == "ardupilot-chirp" else 0.0
+            )
+            if 2.0 * first < high <= 0.2 / dt:
+                words = f"{_SWEPT[kind]} from {first:.2g} to {high:.2g} Hz"
+                found.append(Manoeuvre(words, kind, {"band": (first, high), "fade": fade}))
     found.append(Manoeuvre("random steps of 0.3 to 2 s", "random-steps", {"hold": (0.3, 2.0)}))
     return found
 

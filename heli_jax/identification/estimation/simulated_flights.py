@@ -13,6 +13,7 @@ from heli_jax.dynamics.disturbance import sensor_noise
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns, unpack
 from heli_jax.numerics.jitted import jitted
 from heli_jax.simulation.hold import Delays, at, delays_of
+from heli_jax.simulation.options import Scan
 from heli_jax.simulation.simulate import Trajectory, simulate
 
 # Params, State and Inputs are Any, because they are a model's own classes.
@@ -86,7 +87,7 @@ def simulated_flight(
         options: of `simulate`, in place of those for least squares.
     """
     # ForwardMode compiles faster than an adjoint for both modes, and least squares uses it alone.
-    usual = {"block": layout.block, "adjoint": dfx.ForwardMode()}
+    usual = {"block": layout.block, "adjoint": Scan() if layout.reverse else dfx.ForwardMode()}
     return simulate(
         layout.model,
         drive.params,

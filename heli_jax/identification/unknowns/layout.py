@@ -108,6 +108,8 @@ class Layout(eqx.Module):
     """Filter error: groups of flights that share covariances."""
     flight_facts: tuple[Any, ...] = eqx.field(static=True, default=())
     """`Objective.flight_facts` by flight."""
+    reverse: bool = eqx.field(static=True, default=False)
+    """True if the rows are differentiated in reverse mode too."""
 
     @property
     def noise_model(self) -> str:
