@@ -1,5 +1,6 @@
 """Gains tuned by gradients through the nonlinear closed loop, for many vehicles at once."""
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -36,6 +37,7 @@ from heli_jax.control.loops import (
     sampled_loop,
 )
 from heli_jax.dynamics.model import Model
+from heli_jax.numerics.constrained import lagrangian, minimise
 from heli_jax.simulation.options import REVERSE_MODE
 from heli_jax.simulation.simulate import simulate, substeps_for
 
@@ -111,13 +113,11 @@ def tune(
         controller: gains to begin with.
         most: largest acceptable deviation of signals and commands, SI.
         distance: least distance of L from -1.
-        max_steps: most steps of SLSQP.
+        max_steps: most steps of L-BFGS-B.
 
     Raises:
         ValueError: an unknown name, or a controller without gains.
     """
-    import scipy.optimize  # simulations with a pilot need not wait for it
-
     problem = Tuning(model, vehicles, trimmed, controller, scenario, dict(most))
     names = list(gains_of(controller))
     start = np.asarray([float(v) for v in gains_of(controller).values()])
@@ -129,32 +129,28 @@ def tune(
         k = jnp.asarray(start).at[moved].set(start[moved] * jnp.exp(z))
         return dict(zip(names, k, strict=True))
 
-    cost = jax.jit(jax.value_and_grad(lambda z: problem.cost(gains(z))))
-    apart = jax.jit(lambda z: problem.distances(gains(z)))
-    slope = jax.jit(jax.jacrev(lambda z: problem.distances(gains(z))))
+    limits = np.append(np.full(len(commanded(model, controller)), distance), 0.0)
 
-    def value(z: np.ndarray) -> tuple[float, np.ndarray]:
-        f, g = cost(jnp.asarray(z))
-        progress(f"cost {float(f):.4g}")
-        return float(f), np.asarray(g)
+    @jax.jit
+    @functools.partial(jax.value_and_grad, has_aux=True)
+    def augmented(z: Array, multipliers: Array, penalty: Array) -> tuple[Array, Array]:
+        excess = limits - problem.distances(gains(z))
+        return lagrangian(problem.cost(gains(z)), excess, multipliers, penalty), excess
 
-    zero = np.zeros(moved.size)
-    wanted = np.append(np.full(len(commanded(model, controller)), distance), 0.0)
-    with np.errstate(over="ignore"):
-        found = scipy.optimize.minimize(
-            value, zero, jac=True, method="SLSQP",
-            bounds=[(-_WIDEST, _WIDEST)] * moved.size,
-            constraints={
-                "type": "ineq",
-                "fun": lambda z: np.asarray(apart(jnp.asarray(z))) - wanted,
-                "jac": lambda z: np.asarray(slope(jnp.asarray(z))),
-            },
-            options={"maxiter": max_steps, "ftol": 1e-5},
-        )  # fmt: skip
+    def told(*arguments: Any) -> Any:
+        found = augmented(*arguments)
+        progress(f"cost with limits {float(found[0][0]):.4g}")
+        return found
+
+    bounds = [(-_WIDEST, _WIDEST)] * moved.size
+    found = minimise(told, np.zeros(moved.size), limits.size, bounds, max_steps)
     made = with_gains(controller, gains(jnp.asarray(found.x)))
     before, after = problem.judged(controller), problem.judged(made)
-    reached = bool(found.success) and after[1] == 1.0 and after[0] >= distance - 1e-3
-    costs = value(zero)[0], value(found.x)[0]
+    if after[1] < before[1]:
+        # Gains that lose vehicles are no improvement.
+        made, after = controller, before
+    reached = found.converged and after[1] == 1.0 and after[0] >= distance - 0.02
+    costs = problem.cost_of(controller), problem.cost_of(made)
     return Tuned(made, reached, costs, (before[0], after[0]), (before[1], after[1]))
 
 
@@ -224,18 +220,21 @@ class Tuning:
 
         def of_one(vehicle: Any) -> Array:
             flown = self.run(vehicle, gains, adjoint=REVERSE_MODE)
-            both = {**flown.deviations, **flown.commands}
-            total = sum((both[n] / size) ** 2 for n, size in self.most.items())
-            # A vehicle that left the range of floats has no gradient; it counts as a large cost.
-            total = jnp.where(jnp.isfinite(total), total, _DIVERGED)
-            return jnp.log1p(jnp.mean(jnp.minimum(total, _DIVERGED)))
+            return self._cost({**flown.deviations, **flown.commands})
 
         return jnp.mean(jax.vmap(of_one)(self.vehicles))
 
+    def _cost(self, flown: Mapping[str, Any]) -> Any:
+        """Return the costs of flights with signals (..., N)."""
+        total = sum((jnp.asarray(flown[n]) / size) ** 2 for n, size in self.most.items())
+        # A vehicle that left the range of floats has no gradient; it counts as a large cost.
+        total = jnp.where(jnp.isfinite(total), total, _DIVERGED)
+        return jnp.log1p(jnp.mean(jnp.minimum(total, _DIVERGED), axis=-1))
+
     def cost_of(self, controller: Controller) -> float:
         """Return the mean cost of the vehicles with a controller."""
-        gains = {n: jnp.asarray(v, float) for n, v in gains_of(controller).items()}
-        return float(jax.jit(self.cost)(gains))
+        flown = self.flown(controller)
+        return float(self._cost({**flown.deviations, **flown.commands}).mean())
 
     def flown(self, controller: Controller) -> "Flown":
         """Return the flights of all vehicles, NumPy arrays (k, N)."""

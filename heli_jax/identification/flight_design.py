@@ -29,14 +29,12 @@ from heli_jax.identification.identifiability.verdict import exponents
 from heli_jax.identification.problem import Free, Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Solution, layout_of
+from heli_jax.numerics.constrained import lagrangian, minimise
 
 _NODES = 2000
 """Values of all inputs together that the search moves, at most."""
 _STARTS = 2
 """Inputs of the library from which the search starts, the best first."""
-_ROUNDS, _TOLERANCE = 12, 1e-3
-"""Rounds of the augmented Lagrangian, and change of the criterion (a logarithm) and excess of a
-limit (relative) at which they end."""
 _SHARP = 300.0
 """Sharpness of the smooth maximum: it exceeds the maximum by log(values near it) / 300."""
 _MOST_TIMES = 1e4
@@ -422,9 +420,7 @@ class _Search:
             slopes = [jnp.diff(own[name], prepend=0.0) / flight.dt for flight, own in each]
             rates.append(smooth(jnp.abs(jnp.concatenate(slopes)) / rate))
         ratios = jnp.concatenate([ratios, jnp.array(rates, ratios.dtype)])
-        active = jnp.maximum(multipliers + penalty * (ratios - 1.0), 0.0)
-        added = jnp.sum(jnp.square(active) - jnp.square(multipliers)) / (2.0 * penalty)
-        return value + added, ratios - 1.0
+        return lagrangian(value, ratios - 1.0, multipliers, penalty), ratios - 1.0
 
     def rate(self, words: str, excitations: tuple[dict[str, np.ndarray], ...], known: Any) -> Rated:
         """Return a manoeuvre, made smaller until its motion is within the limits."""
@@ -518,8 +514,6 @@ class _Search:
 
     def optimise(self, start: Rated, max_steps: int) -> tuple[Rated, bool, int]:
         """Return the optimum, whether the search converged, and its steps."""
-        from scipy.optimize import minimize
-
         x = np.full(self.size, 0.5)
         for flight, places, own in zip(self.flights, self.places, start.inputs, strict=True):
             for name, (at, per_node) in places.items():
@@ -528,36 +522,8 @@ class _Search:
                 # All values at their bounds may be a corner from which no step leads.
                 x[at] = 0.5 * own[name][k] / self.limits.inputs[name].amplitude
         bounds = [(-1.0, 1.0)] * self.nodes + [(0.0, 1.0)] * len(self.varied)
-        multipliers = np.zeros(len(self.limits.motion) + len(self.rates))
-        penalty, steps, before = 10.0, 0, np.inf
-
-        def cost(x: np.ndarray, *lagrangian: Any) -> tuple[float, np.ndarray]:
-            (value, _), slope = self.augmented(x, *lagrangian)
-            return float(value), np.asarray(slope, float)
-
-        for _ in range(_ROUNDS):
-            found = minimize(
-                cost,
-                x,
-                args=(multipliers, penalty),
-                jac=True,
-                method="L-BFGS-B",
-                bounds=bounds,
-                options={"maxiter": max_steps - steps, "ftol": 1e-7, "gtol": 1e-6},
-            )
-            x, steps = found.x, steps + int(found.nit)
-            if not multipliers.size:
-                break
-            excess = np.asarray(self.augmented(x, multipliers, penalty)[0][1])
-            value = float(found.fun)
-            if steps >= max_steps or (
-                np.all(excess < _TOLERANCE) and abs(before - value) < _TOLERANCE
-            ):
-                break
-            multipliers = np.maximum(multipliers + penalty * excess, 0.0)
-            penalty, before = 2.0 * penalty, value
-        converged = steps < max_steps
-        best = np.clip(x, *np.array(bounds).T)
+        limits = len(self.limits.motion) + len(self.rates)
+        best, converged, steps = minimise(self.augmented, x, limits, bounds, max_steps)
         inputs = tuple({n: np.asarray(u) for n, u in own.items()} for own in self.excitations(best))
         rated = self.rate("optimised input", inputs, self.known(best))
         # The library's best may be sharper than the nodes allow.
