@@ -21,7 +21,7 @@ from heli_jax.cli.terminal import print_table, print_text
 from heli_jax.cli.wanted import Wanted
 from heli_jax.config import Experiment
 from heli_jax.config.logs import clock_signal, first_signals, require_flights, with_log
-from heli_jax.errors import InputError, located
+from heli_jax.errors import InputError, located, require_known
 from heli_jax.flights.flight import Flight, Signal
 from heli_jax.flights.grid import Grid as EvenClock
 from heli_jax.flights.grid import rounding_of, uniform_grid
@@ -177,13 +177,15 @@ class Follower:
                 f"{experiment.path}: model {experiment.model.name} is not linear, expected a "
                 "linear one on line"
             )
+        # Names and units are checked before the first row.
         with experiment.located("flights[0].signals"):
-            # Units are checked before the first row.
             units.factor(clock.unit, "s")
             for logged, kind in (
                 (signals.inputs, experiment.model.Inputs),
                 (signals.outputs, experiment.model.Outputs),
             ):
+                known = naming.names(kind)
+                require_known(logged, known, f"{experiment.path}: flights[0]", "unknown signal")
                 for name, signal in logged.items():
                     if signal.unit is not None:
                         units.factor(signal.unit, naming.unit(kind, name))
@@ -238,10 +240,8 @@ class Follower:
         if not self._stamps or (elapsed < self._due and not last):
             return False
         self._due = elapsed + self.block
-        try:
-            flights = self._read(last)
-        except InputError as e:
-            raise InputError(str(e).replace(str(self.log), self.sorter.path)) from e
+        # An error names the kept log, to which its line belongs.
+        flights = self._read(last)
         if self.problem is None or self.state is None:
             return False
         self._samples(flights)
