@@ -21,10 +21,11 @@ from heli_jax.cli.terminal import print_table, print_text
 from heli_jax.cli.wanted import Wanted
 from heli_jax.config import Experiment
 from heli_jax.config.logs import clock_signal, first_signals, require_flights, with_log
-from heli_jax.errors import InputError, located
+from heli_jax.errors import InputError, located, require_known
 from heli_jax.flights.flight import Flight, Signal
 from heli_jax.flights.grid import Grid as EvenClock
 from heli_jax.flights.grid import rounding_of, uniform_grid
+from heli_jax.flights.resample import lost_samples
 from heli_jax.identification.identifiability.verdict import exponents
 from heli_jax.identification.problem import Problem
 from heli_jax.numbers import terse
@@ -35,6 +36,8 @@ from heli_jax.stream.steps import BLOCK
 
 _PIECE, _TOGETHER = 1 << 18, 64
 """Bytes that are read at once, and samples that one program takes."""
+_NETWORKS = ("udp", "udpin", "udpout", "udpbcast", "tcp", "tcpin", "mcast", "ws", "wsserver")
+"""Connections of pymavlink that are no file."""
 _GAP = 3.5
 """Step from which on a log is split at its gaps [usual steps]."""
 _PAUSE, _EVERY = 0.1, 0.5
@@ -116,6 +119,11 @@ def _messages(
             "mavlink: pymavlink is not installed, expected the extra logs: pip install "
             "'heli_jax[logs]'"
         ) from e
+    if device.partition(":")[0] not in _NETWORKS and not Path(device).exists():
+        raise InputError(
+            f"mavlink:{device}: no such device or file, expected such as udpin:0.0.0.0:14550, "
+            "/dev/ttyUSB0 or a .tlog"
+        )
     try:
         link: Any = mavutil.mavlink_connection(device)
     except Exception as e:  # of serial ports, sockets and files
@@ -164,14 +172,45 @@ class Follower:
         self.names = list(dict.fromkeys(s.signal for s in each if s.signal))
         self._has_inputs = any(s.signal for s in signals.inputs.values())
         self.experiment, self.time, self.log, self.block = experiment, clock, log, block
+        if not experiment.model.linear:
+            raise InputError(
+                f"{experiment.path}: model {experiment.model.name} is not linear, expected a "
+                "linear one on line"
+            )
+        # Names and units are checked before the first row.
+        with experiment.located("flights[0].signals"):
+            units.factor(clock.unit, "s")
+            for logged, kind in (
+                (signals.inputs, experiment.model.Inputs),
+                (signals.outputs, experiment.model.Outputs),
+            ):
+                known = naming.names(kind)
+                require_known(logged, known, f"{experiment.path}: flights[0]", "unknown signal")
+                for name, signal in logged.items():
+                    if signal.unit is not None:
+                        units.factor(signal.unit, naming.unit(kind, name))
         self.sorter = Sorter(place, clock, self.names)
         self.problem: Problem | None = None
         self.state: State | None = None
         self.known: Known | None = None
         self._stamps: list[float] = []
+        self.heard = time.monotonic()
+        """Time of the last row, on the clock of `time.monotonic` [s]."""
         self._due, self._taken = block, np.nan
         # States are large, so each step writes over the one before.
         self._follow = jax.jit(follow, donate_argnums=0)
+
+    @property
+    def rows(self) -> int:
+        """Rows that were kept."""
+        return len(self._stamps)
+
+    @property
+    def lost(self) -> float:
+        """Share of rows that are missing between those kept [%]."""
+        seconds = np.unique(self._stamps)
+        lost = int(lost_samples(seconds).sum()) if seconds.size > 1 else 0
+        return 100.0 * lost / max(lost + seconds.size, 1)
 
     def take(self, data: bytes) -> None:
         """Take further bytes."""
@@ -179,7 +218,6 @@ class Follower:
 
     def finish(self) -> None:
         """Take what was held back for later rows."""
-        self._keep(self.sorter.take(b""))
         self._keep(self.sorter.finish())
 
     def _keep(self, rows: list[Row]) -> None:
@@ -190,6 +228,7 @@ class Follower:
             file.write(b"" if self._stamps else self.sorter.head)
             file.writelines(line + b"\n" for _, line in rows)
         self._stamps += [seconds for seconds, _ in rows]
+        self.heard = time.monotonic()
 
     def update(self, *, last: bool = False) -> bool:
         """Estimate anew if a block was completed since; return if so.
@@ -201,10 +240,8 @@ class Follower:
         if not self._stamps or (elapsed < self._due and not last):
             return False
         self._due = elapsed + self.block
-        try:
-            flights = self._read(last)
-        except InputError as e:
-            raise InputError(str(e).replace(str(self.log), self.sorter.path)) from e
+        # An error names the kept log, to which its line belongs.
+        flights = self._read(last)
         if self.problem is None or self.state is None:
             return False
         self._samples(flights)
@@ -310,7 +347,7 @@ def rows_of(follower: Follower, wanted: Mapping[str, Wanted]) -> list[tuple[str,
                 name,
                 terse(one.value, 4),
                 f"{terse(one.lower95, 4)} to {terse(one.upper95, 4)}",
-                f"{terse(100.0 * one.sd / abs(one.value), 2)} %" if one.value else terse(one.sd, 2),
+                f"{terse(100.0 * one.sd / abs(one.value), 3)} %" if one.value else terse(one.sd, 2),
                 unit or "",
                 stated + (" %" if want is not None and want.relative else ""),
                 enough,
@@ -325,17 +362,21 @@ HEAD = ("parameter", "estimate", "95 % interval", "sd", "unit", "wanted", "flown
 def lines_of(follower: Follower) -> list[str]:
     """Return sentences on what was received, and on coherence."""
     state, known, sorter = follower.state, follower.known, follower.sorter
+    silent = f"last row {time.monotonic() - follower.heard:.0f} s ago"
     if state is None:
-        return ["waiting for the first seconds in which all signals move"]
+        return [f"waiting for the first seconds in which all signals move; {silent}"]
     samples = int(state.samples)
     lines = [
         f"{samples} samples, {samples * state.dt:.1f} s; {int(state.missing)} gaps, "
-        f"{sorter.late} too late, {sorter.repeated} repeated; {int(state.blocks)} blocks of "
-        f"{state.length * state.dt:.3g} s"
+        f"{sorter.late} too late, {sorter.repeated} repeated, {follower.lost:.2g} % missing; "
+        f"{silent}",
+        f"{int(state.blocks)} blocks of {state.length * state.dt:.3g} s"
+        + ("" if known else "; estimates follow the first one"),
     ]
     if known is not None:
         each = (f"{y} from {u} {terse(c, 2)}" for (u, y), c in known.coherence.items())
         lines.append(f"coherence: {', '.join(each)}")
+        lines.append("flown enough: the sd alone; the report at the end tests the model")
     return lines
 
 
@@ -378,7 +419,15 @@ def run_stream(
     shown = 0.0
     arrives = received(place, until_end, stopped, follower.time, follower.names)
     for data in arrives:
-        follower.take(data)
+        try:
+            follower.take(data)
+        except InputError as e:
+            follower.finish()
+            if not log.exists():
+                raise
+            fit = f"heli-jax fit {experiment.path} --set flights.0.log={log.absolute()}"
+            kept = f"{log} has the {follower.rows} rows before it: {fit}"
+            raise InputError(f"{str(e).rstrip('.')}; {kept}") from e
         due = sys.stdout.isatty() and time.monotonic() - shown > _EVERY
         if follower.update() or due:
             _show(follower, wanted)

@@ -45,6 +45,7 @@ from heli_jax.flights.resample import (
     rate_notes,
     resampled,
     usual_step,
+    with_lost,
 )
 
 MOST_UPSAMPLING = 100
@@ -430,6 +431,11 @@ def at_times(
         times: times of the grid (M,) [s].
     """
     samples, notes, rate = {}, [], 1.0 / float(times[1] - times[0])
+    # Linear inputs have their lines by interpolation.
+    signals = {
+        (n, kind): Timed(*with_lost(*s)) if kind == "input" and holds[n].hold != "linear" else s
+        for (n, kind), s in signals.items()
+    }
     alike = _alike(request, signals, holds, times)
     # Input and output need the same filter. If only the output is filtered, its ringing after jumps
     # would be attributed to the vehicle.

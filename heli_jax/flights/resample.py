@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from heli_jax.finding import Finding, note
+from heli_jax.flights.grid import JITTER_ALLOWED
 from heli_jax.numerics.jumps import split
 
 # A gap is bridged if it is a few lost samples, or so short that a small helicopter's attitude is
@@ -36,6 +37,10 @@ def rate_notes(seconds: np.ndarray, rate: float) -> list[Finding]:
     usual = float(np.median(np.diff(seconds)))
     words = f"resampled to {rate:.6g} Hz from about {1 / usual:.6g} Hz"
     notes = [note("resampling.rate", words, value=1 / usual)]
+    if lost := int(lost_samples(seconds).sum()):
+        share = 100.0 * lost / (lost + seconds.size)
+        words = f"{lost} samples are missing ({share:.2g} %), straight lines replace them"
+        notes.append(note("resampling.lost", words, value=share))
     if rate * usual < _GOES_DOWN:
         passed = PASSED * rate
         words = (
@@ -116,6 +121,31 @@ def held_low_passed(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) 
     means = held_mean(seconds, values, seconds[0] + cell * np.arange(count))
     # A mean belongs to the middle of its cell.
     return low_pass(means, cell, times - seconds[0] - 0.5 * cell, step)
+
+
+def with_lost(seconds: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a stepwise signal with the samples that a regular clock lost, on straight lines.
+
+    The line is the expected value: a step between two samples was equally likely at each lost one.
+    The last value would make each such step late. Stamps of an irregular clock, such as those of a
+    log of changes, are returned unchanged.
+    """
+    lost = lost_samples(seconds)
+    if not lost.any():
+        return seconds, values
+    at = np.r_[0, np.cumsum(1 + lost)]
+    each = np.arange(at[-1] + 1)
+    return np.interp(each, at, seconds), np.interp(each, at, values)
+
+
+def lost_samples(seconds: np.ndarray) -> np.ndarray:
+    """Return the samples lost in each step (N - 1,) of a regular clock that a fit bridges."""
+    steps = np.diff(seconds)
+    usual = np.median(steps)
+    # Half of the steps at least must show the clock.
+    regular = np.median(np.abs(steps / usual - 1.0)) <= JITTER_ALLOWED
+    bridged = regular & (steps <= longest_gap(seconds) * (1 + 1e-9))
+    return np.where(bridged, np.rint(steps / usual) - 1, 0).clip(0).astype(np.int64)
 
 
 def goes_down(seconds: np.ndarray, times: np.ndarray) -> bool:

@@ -117,3 +117,24 @@ def test_an_input_acts_in_a_short_gap_too(tmp_path):
     assert np.isfinite(f.inputs["u"]).all()
     assert np.max(np.abs(f.inputs["u"] - np.sin(3.0 * f.times))) < 0.05
     assert np.isnan(f.outputs["p"]).any()
+
+
+def test_a_step_in_lost_samples_is_late_by_nothing_on_average():
+    from heli_jax.flights.resample import with_lost
+
+    rng = np.random.default_rng(4)
+    u = np.repeat(rng.uniform(-1.0, 1.0, 500), 10)
+    kept = rng.uniform(size=u.size) > 0.2
+    kept[[0, -1]] = True
+    stamps = 0.02 * np.arange(u.size)
+    seconds, restored = with_lost(stamps[kept], u[kept])
+    assert seconds == pytest.approx(stamps, abs=1e-9)
+    assert restored[kept] == pytest.approx(u[kept])
+    # Regression on the input's own steps: its delay in samples.
+    steps = -np.gradient(u)
+    assert abs((restored - u) @ steps / (steps @ steps)) < 0.03
+    late = u[np.maximum.accumulate(np.where(kept, np.arange(u.size), 0))]
+    assert (late - u) @ steps / (steps @ steps) > 0.1
+    # A log of changes has no regular clock.
+    changes = np.cumsum(rng.exponential(0.3, 400))
+    assert with_lost(changes, u[:400])[0] is changes

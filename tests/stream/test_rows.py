@@ -81,3 +81,15 @@ def test_wrong_lines_end_in_one_sentence(damage):
         taken([damage(text_of(table()))])
     assert str(e.value).startswith("log.csv")
     assert "\n" not in str(e.value)
+
+
+def test_a_damaged_line_has_its_number_and_the_rows_before_it():
+    lines = text_of(table()).split(b"\n")
+    lines[200] = b"3.980,x,1"
+    sorter, text = Sorter("log.csv", TIME, NAMES), b"\n".join(lines)
+    given = sorter.take(text[:1000])
+    with pytest.raises(InputError) as e:
+        sorter.take(text[1000:])
+    assert "line 201," in str(e.value)
+    # Rows of the call that failed are held.
+    assert len(given) + len(sorter.finish()) == 199
