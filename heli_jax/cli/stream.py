@@ -119,7 +119,8 @@ def _messages(
             "mavlink: pymavlink is not installed, expected the extra logs: pip install "
             "'heli_jax[logs]'"
         ) from e
-    if device.partition(":")[0] not in _NETWORKS and not Path(device).exists():
+    port = device.upper().startswith("COM")  # a serial port of Windows
+    if device.partition(":")[0] not in _NETWORKS and not port and not Path(device).exists():
         raise InputError(
             f"mavlink:{device}: no such device or file, expected such as udpin:0.0.0.0:14550, "
             "/dev/ttyUSB0 or a .tlog"
