@@ -10,7 +10,14 @@ from heli_jax import naming
 from heli_jax.analysis.trim import Condition, is_full_nonlinear
 from heli_jax.control.pilot import Pilot
 from heli_jax.dynamics.check_model import check_model
-from heli_jax.dynamics.model import Model, plain, reads, require_constants, require_linear
+from heli_jax.dynamics.model import (
+    Model,
+    plain,
+    reads,
+    require_constants,
+    require_continuous,
+    require_linear,
+)
 from heli_jax.errors import nearest, require_kind
 from heli_jax.flights.flight import Flight
 from heli_jax.simulation.options import SimulationOptions
@@ -321,6 +328,8 @@ def _check_results(
         raise ValueError("reduce: no result is kept, expected a result or trajectories")
     for name, reducer in reduce.items():
         reducers.check(name, reducer, outputs, inputs)
+        if reducer.how in reducers.LINEAR:
+            require_continuous(model, f"reduce.{name}")
         # Reserved names of the store; names that its format cannot have are refused where it is
         # created.
         if name in design.names or name in ("status", "element"):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model, naming
+from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model, naming, sweep
 from heli_jax.analysis.linear import linearize, modes
 from heli_jax.control.controller import (
     Controller,
@@ -27,6 +27,7 @@ from heli_jax.control.posterior import SteadyFlights
 from heli_jax.control.regulators import lqg, lqr, pid
 from heli_jax.dynamics.model import zeros
 from heli_jax.simulation.simulate import simulate
+from heli_jax.sweeps import Reduce, grid
 
 DT = 0.02
 
@@ -340,6 +341,38 @@ def test_derivatives_by_gains_are_differences(roll):
     h = 1e-5
     wanted = (cost(0.05 + h) - cost(0.05 - h)) / (2 * h)
     assert float(jax.grad(cost)(0.05)) == pytest.approx(float(wanted), rel=1e-5)
+
+
+@pytest.mark.parametrize("backend", ["xla", "fused"])
+def test_gains_are_axes_of_sweeps(roll, backend):
+    if backend == "fused":
+        pytest.importorskip("llvmlite")
+    model, params = roll
+    law = Cascade(
+        loops={"lat": (Loop(2.0, signal="phi"), Loop(0.02, signal="p"))}, dt=DT,
+        references=("phi",),
+    )  # fmt: skip
+    closed = with_controller(model, law)
+    p = closed.Params(**naming.asdict(params))
+    state, inputs = begin(closed, p, at_rest(model), 100)
+    inputs = naming.replace(inputs, set_phi=jnp.full(100, 0.2))
+    given = {n: np.asarray(v) for n, v in naming.asdict(inputs).items()}
+    flight = Flight(DT, given, {"phi": np.zeros(100)}, sd={"phi": 0.01})
+    axis, gains = "controller_loops_lat_phi_p", np.array([0.5, 1.0, 3.0])
+    swept = sweep(
+        closed, p, flight, grid({axis: gains}), {"end": Reduce("final", "phi")}, backend=backend
+    )
+    wanted = [
+        float(
+            simulate(
+                closed, naming.replace(p, **{axis: k}), inputs, dt=DT, initial_state=state
+            ).outputs.phi[-1]
+        )
+        for k in gains
+    ]
+    np.testing.assert_allclose(swept["end"].values, wanted, rtol=1e-9)
+    with pytest.raises(ValueError, match="controller"):
+        sweep(closed, p, flight, grid({axis: gains}), {"modes": Reduce("modes")})
 
 
 class Bad(Controller):
