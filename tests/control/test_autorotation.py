@@ -55,6 +55,7 @@ def test_the_programme_has_the_derivatives_of_finite_differences(model, params, 
         np.testing.assert_allclose((a - b) / 2e-3, J @ direction, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_optimum_lands_in_scipy_too(model, params, entry, flight):
     landing = ar.land(model, params, entry, start=flight, grid=GRID)
     assert landing.converged

@@ -178,8 +178,8 @@ def test_less_than_a_run_is_one_run():
     ("criterion", "size"),
     [
         ("D", lambda sd: np.prod(sd) ** (1 / 3)),
-        ("A", lambda sd: np.sqrt(np.mean(sd**2))),
-        ("E", np.max),
+        pytest.param("A", lambda sd: np.sqrt(np.mean(sd**2)), marks=pytest.mark.slow),
+        pytest.param("E", np.max, marks=pytest.mark.slow),
         ("d", lambda sd: sd[1]),
     ],
 )
