@@ -43,8 +43,9 @@ from heli_jax.simulation.simulate import simulate, substeps_for
 
 _SHARP = 100.0
 """Sharpness of the smooth minimum of |1 + L| over frequencies and vehicles."""
-_GROWTH = 0.1
-"""Largest growth of a closed loop that is tuned [1/s]; the smooth minimum takes part of it."""
+_CONTROLLED, _DRIFTING = -0.02, 0.05
+"""Largest growth of a closed loop that is tuned [1/s]: of one whose modes all decay, and of one
+with positions or headings that drift."""
 _DIVERGED = 1e12
 """Square of a deviation over its largest acceptable value that counts as diverged."""
 _WIDEST = 3.0
@@ -134,7 +135,7 @@ def tune(
     @jax.jit
     @functools.partial(jax.value_and_grad, has_aux=True)
     def augmented(z: Array, multipliers: Array, penalty: Array) -> tuple[Array, Array]:
-        excess = limits - problem.distances(gains(z))
+        excess = jnp.asarray(limits) - problem.distances(gains(z))
         return lagrangian(problem.cost(gains(z)), excess, multipliers, penalty), excess
 
     def told(*arguments: Any) -> Any:
@@ -193,6 +194,9 @@ class Tuning:
             inputs, **{n: getattr(inputs, n) + jnp.asarray(v) for n, v in changed.items()}
         )
         self.omega = frequencies(self.dt)
+        first = jax.tree.map(lambda v: v[0], self.plants)
+        slowest = growth(sampled_loop(model, first, controller), self.dt)
+        self.most_growth = _CONTROLLED if slowest < _CONTROLLED else _DRIFTING
 
     def params(self, vehicle: Any, gains: Mapping[str, Any]) -> Any:
         return self.closed.Params(**{**naming.asdict(vehicle), **gains})
@@ -252,7 +256,7 @@ class Tuning:
         def of_one(plant: Plant) -> tuple[Array, Array]:
             loop = sampled_loop(self.model, plant, controller)
             apart = jnp.abs(1.0 + loop_responses(loop, self.dt, self.omega))
-            return apart, _GROWTH - growth(loop, self.dt)
+            return apart, self.most_growth - growth(loop, self.dt)
 
         apart, stable = jax.vmap(of_one)(self.plants)
         apart = jnp.moveaxis(apart, 1, 0).reshape(apart.shape[1], -1)
