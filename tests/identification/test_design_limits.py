@@ -180,7 +180,7 @@ def test_less_than_a_run_is_one_run():
         ("D", lambda sd: np.prod(sd) ** (1 / 3)),
         pytest.param("A", lambda sd: np.sqrt(np.mean(sd**2)), marks=pytest.mark.slow),
         pytest.param("E", np.max, marks=pytest.mark.slow),
-        ("d", lambda sd: sd[1]),
+        pytest.param("d", lambda sd: sd[1], marks=pytest.mark.slow),
     ],
 )
 def test_the_headline_compares_printed_sds_with_the_best_row(criterion, size):

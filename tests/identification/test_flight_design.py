@@ -123,7 +123,7 @@ def _searching(of, limits, criterion="D"):
     return _Search(experiment, limits, criterion, [{}], {})
 
 
-@pytest.mark.parametrize("criterion", ["D", "E", "b/k"])
+@pytest.mark.parametrize("criterion", ["D", pytest.param("E", marks=pytest.mark.slow), "b/k"])
 def test_the_optimum_is_better_and_holds_its_limits(criterion):
     limits = Limits({"u": InputLimit(0.2, rate=4.0)}, {"phi": 0.1, "p": 0.8})
     found = design(problem(), limits, criterion=criterion, max_steps=60)
@@ -161,6 +161,7 @@ def test_a_known_difference_is_chosen():
     assert halved.library[0].sd["k"] > 2.0 * found.optimum.sd["k"]
 
 
+@pytest.mark.slow
 def test_several_vehicles():
     free = {"k": Free(36.0, lower=18.0, upper=72.0), "d": Free(2.0), "b": Free(20.0)}
     of = dataclasses.replace(problem(), free=free)
@@ -293,7 +294,11 @@ def test_wrong_configurations(tmp_path, capsys, change):
 
 
 @pytest.mark.parametrize(
-    ("model", "files"), [("quad-roll", {"ardupilot-lat.param"}), ("yaw", set())]
+    ("model", "files"),
+    [
+        pytest.param("quad-roll", {"ardupilot-lat.param"}, marks=pytest.mark.slow),
+        ("yaw", set()),
+    ],
 )
 def test_from_a_shipped_model_to_files(tmp_path, model, files):
     config, out = tmp_path / "start.yaml", tmp_path / "run"
