@@ -26,7 +26,7 @@ from heli_jax.analysis.trim import trim
 from heli_jax.control.controller import begin, commands, with_controller
 from heli_jax.control.posterior import SteadyFlights, draws, vehicles_of
 from heli_jax.control.regulators import lqg, lqr
-from heli_jax.control.tune import Scenario, Tuning, tune
+from heli_jax.control.tune import Scenario, Tuning, gusts, tune
 from heli_jax.dynamics.helicopter import helicopter
 from heli_jax.dynamics.onboard.servos import with_servos
 from heli_jax.simulation.simulate import simulate, substeps_for
@@ -100,15 +100,6 @@ def identified(vehicle, seconds, seed):
     return params, heli_jax.fit(problem)
 
 
-def gusts(rng, n, sd, tau):
-    kept = np.exp(-DT / tau)
-    w = np.empty(n)
-    w[0] = sd * rng.standard_normal()
-    for k in range(1, n):
-        w[k] = kept * w[k - 1] + sd * np.sqrt(1.0 - kept**2) * rng.standard_normal()
-    return w
-
-
 def main():
     jax.config.update("jax_enable_x64", True)
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else "runs/hover")
@@ -138,8 +129,8 @@ def main():
     first = SteadyFlights(*jax.tree.map(lambda v: v[0], (flights.state, flights.inputs)))
     mean = jax.tree.map(lambda v: v[0], vehicles)
     law = lqg(model, mean, first, most=MOST, sd=SENSORS, noise=NOISE, dt=DT, references=("x",))
-    wind = {"wind_x": gusts(rng, n, 1.0, 1.0), "wind_y": gusts(rng, n, 1.0, 1.0),
-            "wind_z": gusts(rng, n, 0.5, 0.5)}  # fmt: skip
+    wind = {"wind_x": gusts(1.0, 1.0, n, DT, rng), "wind_y": gusts(1.0, 1.0, n, DT, rng),
+            "wind_z": gusts(0.5, 0.5, n, DT, rng)}  # fmt: skip
     scenario = Scenario(wind, {"x": np.where(np.arange(n) > 100, 0.1, 0.0)}, n)
     robust = tuned(24, 0.4)
     print(f"tuning converged: {robust.converged}; cost {robust.cost}, distance {robust.distance}")

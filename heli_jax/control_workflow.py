@@ -16,7 +16,7 @@ from heli_jax.config.control_section import AcceptableConfig, ControlConfig
 from heli_jax.control.controller import Controller, commanded, in_loop
 from heli_jax.control.posterior import SteadyFlights, draws, vehicles_of
 from heli_jax.control.regulators import lqg, lqr, pid
-from heli_jax.control.tune import Flown, Scenario, Tuned, Tuning, tune
+from heli_jax.control.tune import Flown, Scenario, Tuned, Tuning, gusts, tune
 from heli_jax.dynamics.model import Model, require_constants
 from heli_jax.errors import InputError, located, require_known
 from heli_jax.report.saved_fit import SavedFit, load_fit
@@ -212,23 +212,13 @@ def _scenario(
     for name in naming.names(model.Inputs):
         if name in settings.gusts:
             gust = settings.gusts[name]
-            inputs[name] = _gusts(gust.sd, gust.tau, n, dt, rng)
+            inputs[name] = gusts(gust.sd, gust.tau, n, dt, rng)
     set_points = {}
     for i, (name, step) in enumerate(steps.items()):
         # Each step lasts an equal share of the flight, and begins after the first tenth.
         begin = round((0.1 + 0.9 * i / len(steps)) * n)
         set_points[name] = np.where(np.arange(n) >= begin, step, 0.0)
     return Scenario(inputs, set_points, n)
-
-
-def _gusts(sd: float, tau: float, n: int, dt: float, rng: np.random.Generator) -> np.ndarray:
-    """Return a stationary first-order Gauss-Markov process (n,)."""
-    kept = np.exp(-dt / tau)
-    w, drawn = np.empty(n), rng.standard_normal(n)
-    w[0] = sd * drawn[0]
-    for k in range(1, n):
-        w[k] = kept * w[k - 1] + sd * np.sqrt(1.0 - kept**2) * drawn[k]
-    return w
 
 
 def _write(run: ControlRun, out: Path) -> None:

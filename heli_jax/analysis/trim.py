@@ -31,7 +31,8 @@ _TRIES = 12
 """Number of starts: the first from momentum theory, the others around it."""
 _ROUNDING = 1e-9
 _TRIMMED = 1e-6
-
+"""Largest residual [SI] of a steady flight in a batch, which has one start and may end slightly
+above `_TOLERANCE`."""
 _LOWEST = -0.3
 """Lowest collective stick of an upright vehicle."""
 _UPRIGHT = 1.5

@@ -6,7 +6,7 @@ servos and delays of the model are within the loop.
 """
 
 import abc
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -20,7 +20,7 @@ from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.model import Model, Sampled, require_continuous
 from heli_jax.dynamics.onboard.delays import with_delay_line
 from heli_jax.dynamics.onboard.device import Device, Parts, Quantity
-from heli_jax.errors import nearest
+from heli_jax.errors import nearest, require_known
 from heli_jax.naming import Record
 
 type Signals = Mapping[str, Any]
@@ -79,7 +79,9 @@ def with_controller(model: Model, controller: Controller) -> Model:
     if not isinstance(controller, Controller):
         raise TypeError(f"expected a Controller, got {type(controller).__name__}")
     require_continuous(model, "with_controller")
-    require_signals(controller.references, signals_of(model), f"model {model.name} has no signal")
+    require_known(
+        controller.references, signals_of(model), "references", f"model {model.name} has no signal"
+    )
     driven = commanded(model, controller)
     return _Controlled(in_loop(model, driven), controller).closed()
 
@@ -96,17 +98,6 @@ def in_loop(model: Model, commands: Iterable[str]) -> Model:
     return model
 
 
-def require_signals(names: Iterable[str], known: Sequence[str], words: str) -> None:
-    """Raise if a name is unknown.
-
-    Raises:
-        ValueError: with the words, the name and the nearest known one.
-    """
-    for name in names:
-        if name not in known:
-            raise ValueError(f"{words} {name!r}{nearest(name, known)}")
-
-
 def signals_of(model: Model) -> tuple[str, ...]:
     """Return the names of the signals that a controller may read."""
     names = (*naming.names(model.State), *naming.names(model.Outputs))
@@ -115,7 +106,8 @@ def signals_of(model: Model) -> tuple[str, ...]:
 
 def gains_of(controller: Controller) -> dict[str, Any]:
     """Return the gains of a controller by the names of their parameters."""
-    return {_name(controller, path): leaf for path, leaf in _scalars(controller)}
+    leaves = jax.tree_util.tree_leaves_with_path(controller)
+    return {_name(controller, path): leaf for path, leaf in leaves if np.shape(leaf) == ()}
 
 
 def with_gains(controller: Controller, values: Signals) -> Any:
@@ -251,14 +243,8 @@ def commanded(model: Model, controller: Controller) -> tuple[str, ...]:
             raise ValueError(f"step: expected scalars by name, got {name!r} of shape {shape}")
     if not command:
         raise ValueError("step: expected the command of at least one input, got none")
-    require_signals(command, naming.names(model.Inputs), f"model {model.name} has no input")
+    require_known(command, naming.names(model.Inputs), "step", f"model {model.name} has no input")
     return tuple(n for n in naming.names(model.Inputs) if n in command)
-
-
-def _scalars(controller: Controller) -> list[tuple[Any, Any]]:
-    """Return paths and values of the scalar fields."""
-    leaves = jax.tree_util.tree_leaves_with_path(controller)
-    return [(path, leaf) for path, leaf in leaves if np.shape(leaf) == ()]
 
 
 def _name(controller: Controller, path: tuple[Any, ...]) -> str:

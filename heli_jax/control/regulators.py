@@ -9,10 +9,11 @@ import scipy.linalg
 
 from heli_jax import naming
 from heli_jax.analysis.linear import linearize
-from heli_jax.control.controller import commanded, in_loop, measured, require_signals, signals_of
+from heli_jax.control.controller import commanded, in_loop, measured, signals_of
 from heli_jax.control.laws import Cascade, Loop, Observer, StateFeedback
 from heli_jax.control.loops import Plant, plant_of, response, sampled_loop
 from heli_jax.dynamics.model import Model
+from heli_jax.errors import require_known
 
 
 class _Plant(NamedTuple):
@@ -26,6 +27,8 @@ class _Plant(NamedTuple):
     """Rows of states and outputs by name, as functions of the states."""
     at: dict[str, float]
     """Values of the signals in steady flight."""
+    drives: dict[str, np.ndarray]
+    """Effects (n,) on the states' rates of every input, and of a noise on each state's rate."""
 
 
 def lqr(
@@ -98,13 +101,13 @@ def lqg(
     """
     driven = _driven(model, most)
     outputs = naming.names(model.Outputs)
-    require_signals(sd, outputs, f"model {model.name} has no output")
+    require_known(sd, outputs, "sd", f"model {model.name} has no output")
     plant = _plant(model, params, trimmed, driven, (*most, *sd))
     K = _regulator(plant, most, {})
     n = len(plant.states)
     A, B = _discrete(plant.A, plant.B, dt)
     C = np.stack([plant.signals[name] for name in sd])
-    G = _noise_columns(model, params, trimmed, plant, noise)
+    G = _noise_columns(plant, noise, model.name)
     R = np.diag(np.square(list(sd.values())))
     # Van Loan's integral of the noise over a sample.
     both = scipy.linalg.expm(dt * np.block([[-plant.A, G @ G.T], [np.zeros((n, n)), plant.A.T]]))
@@ -157,10 +160,9 @@ def pid(
     """
     limits = dict(limits or {})
     signals = [s for by in loops.values() for s in by]
-    require_signals(
-        (*signals, *integral, *limits), signals_of(model), f"model {model.name} has no signal"
-    )
-    require_signals(loops, naming.names(model.Inputs), f"model {model.name} has no input")
+    words = f"model {model.name} has no"
+    require_known((*signals, *integral, *limits), signals_of(model), "loops", f"{words} signal")
+    require_known(loops, naming.names(model.Inputs), "loops", f"{words} input")
     model, state = _in_flight(model, params, trimmed, loops)
     plant = plant_of(model, params, state, trimmed.inputs, dt)
     at = dict(zip(signals_of(model), np.asarray(plant.at), strict=True))
@@ -225,8 +227,8 @@ def _driven(model: Model, most: Mapping[str, float]) -> tuple[str, ...]:
         ValueError: an unknown name, a weight that is not above zero, or no input.
     """
     inputs = naming.names(model.Inputs)
-    words = f"most: model {model.name} has no signal or input"
-    require_signals(most, (*signals_of(model), *inputs), words)
+    words = f"model {model.name} has no signal or input"
+    require_known(most, (*signals_of(model), *inputs), "most", words)
     for name, value in most.items():
         if not (np.isfinite(value) and value > 0.0):
             raise ValueError(f"most.{name}: expected a number above zero, got {value:g}")
@@ -263,6 +265,8 @@ def _plant(
         tuple(n for n, k in zip(linear.states, kept, strict=True) if k),
         {n: row[kept] for n, row in rows.items()},
         {n: float(v) for n, v in signals.items()},
+        {n: row[kept] for n, row in zip(linear.states, np.eye(len(A)), strict=True)}
+        | {n: column[kept] for n, column in zip(linear.inputs, B.T, strict=True)},
     )
 
 
@@ -310,23 +314,11 @@ def _discrete(A: np.ndarray, B: np.ndarray, dt: float) -> tuple[np.ndarray, np.n
     return Phi[:n, :n], Phi[:n, n:]
 
 
-def _noise_columns(
-    model: Model, params: Any, trimmed: Any, plant: _Plant, noise: Mapping[str, float]
-) -> np.ndarray:
-    """Return the effect of the white noises on the states, (n, noises)."""
-    linear = linearize(model, params, trimmed.state, trimmed.inputs)
-    B = np.asarray(linear.matrices.B, np.float64)
-    known = (*linear.inputs, *linear.states)
-    require_signals(noise, known, f"noise: model {model.name} has no input or state")
-    columns = []
-    for name, size in noise.items():
-        full: dict[str, Any] = dict.fromkeys(linear.states, 0.0)
-        if name in linear.inputs:
-            full |= dict(zip(linear.states, B[:, linear.inputs.index(name)], strict=True))
-        else:
-            full[name] = 1.0
-        columns.append([size * full.get(s, 0.0) for s in plant.states])
-    return np.array(columns).reshape(len(columns), -1).T
+def _noise_columns(plant: _Plant, noise: Mapping[str, float], name: str) -> np.ndarray:
+    """Return the effect of the white noises on the states, (n, noises), for the model `name`."""
+    require_known(noise, plant.drives, "noise", f"model {name} has no input or state")
+    columns = [size * plant.drives[n] for n, size in noise.items()]
+    return np.reshape(columns, (len(columns), len(plant.states))).T
 
 
 def _state_of(plant: _Plant, name: str) -> str:

@@ -21,7 +21,6 @@ from heli_jax.control.controller import (
     gains_of,
     in_loop,
     measured,
-    require_signals,
     signals_of,
     with_controller,
     with_gains,
@@ -36,9 +35,11 @@ from heli_jax.control.loops import (
     plant_of,
     sampled_loop,
 )
+from heli_jax.control.posterior import SteadyFlights
 from heli_jax.dynamics.model import Model
+from heli_jax.errors import require_known
 from heli_jax.numerics.constrained import lagrangian, minimise
-from heli_jax.simulation.options import REVERSE_MODE
+from heli_jax.simulation.options import Scan
 from heli_jax.simulation.simulate import simulate, substeps_for
 
 _SHARP = 100.0
@@ -60,6 +61,16 @@ class Scenario(NamedTuple):
     set_points: Mapping[str, Any]
     """Changes of set points (N,) by signal, SI."""
     samples: int
+
+
+def gusts(sd: float, tau: float, n: int, dt: float, rng: np.random.Generator) -> np.ndarray:
+    """Return a stationary first-order Gauss-Markov process (n,)."""
+    kept = np.exp(-dt / tau)
+    w, drawn = np.empty(n), rng.standard_normal(n)
+    w[0] = sd * drawn[0]
+    for k in range(1, n):
+        w[k] = kept * w[k - 1] + sd * np.sqrt(1.0 - kept**2) * drawn[k]
+    return w
 
 
 class Flown(NamedTuple):
@@ -110,7 +121,7 @@ def tune(
     Args:
         vehicles: the model's Params with arrays (k,), such as draws of a posterior. All start in
             the steady flight of the first, and have its sticks.
-        trimmed: steady flights with arrays (k,), see `trims_of`.
+        trimmed: steady flights with arrays (k,), see `vehicles_of`.
         controller: gains to begin with.
         most: largest acceptable deviation of signals and commands, SI.
         distance: least distance of L from -1.
@@ -168,16 +179,15 @@ class Tuning:
         most: dict[str, float],
     ) -> None:
         model = in_loop(model, commanded(model, controller))
-        known = (*signals_of(model), *naming.names(model.Inputs))
-        require_signals(most, known, f"most: model {model.name} has no signal or input")
-        require_signals(
-            scenario.inputs,
-            naming.names(model.Inputs),
-            f"scenario: model {model.name} has no input",
+        known, words = (
+            (*signals_of(model), *naming.names(model.Inputs)),
+            f"model {model.name} has no",
         )
-        require_signals(
-            scenario.set_points, controller.references, "scenario: the controller has no set point"
-        )
+        require_known(most, known, "most", f"{words} signal or input")
+        inputs = naming.names(model.Inputs)
+        require_known(scenario.inputs, inputs, "scenario", f"{words} input")
+        without = "the controller has no set point"
+        require_known(scenario.set_points, controller.references, "scenario", without)
         self.model, self.controller, self.dt = model, controller, controller.dt
         self.closed = with_controller(model, controller)
         self.vehicles, self.most, self.scenario = vehicles, most, scenario
@@ -186,7 +196,7 @@ class Tuning:
         )
         first = jax.tree.map(lambda v: v[0], (vehicles, trimmed.state, trimmed.inputs))
         state, inputs = begin(
-            self.closed, self.params(first[0], {}), _Flight(*first[1:]), scenario.samples
+            self.closed, self.params(first[0], {}), SteadyFlights(*first[1:]), scenario.samples
         )
         changed = {**scenario.inputs, **{SET + n: v for n, v in scenario.set_points.items()}}
         self.begun = state
@@ -223,7 +233,7 @@ class Tuning:
         """Return the mean cost of the vehicles."""
 
         def of_one(vehicle: Any) -> Array:
-            flown = self.run(vehicle, gains, adjoint=REVERSE_MODE)
+            flown = self.run(vehicle, gains, adjoint=Scan())
             return self._cost({**flown.deviations, **flown.commands})
 
         return jnp.mean(jax.vmap(of_one)(self.vehicles))
@@ -287,8 +297,3 @@ class Tuning:
         """Return the least distance and the share of stable vehicles."""
         stable = np.all([m.stable for m in self.margins(controller)], axis=0)
         return float(np.min(np.abs(1.0 + self.responses(controller)))), float(np.mean(stable))
-
-
-class _Flight(NamedTuple):
-    state: Any
-    inputs: Any

@@ -83,6 +83,4 @@ class SimulationOptions(NamedTuple):
         return self._replace(**keywords)
 
 
-REVERSE_MODE = dfx.RecursiveCheckpointAdjoint()
-"""`adjoint` for gradients by many numbers in reverse mode, with less memory."""
 DEFAULT = SimulationOptions()

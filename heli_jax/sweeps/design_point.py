@@ -24,9 +24,6 @@ from heli_jax.sweeps.spec import Job, Plan
 Scalars = dict[str, jax.Array]
 """Numbers () by name."""
 
-# Accelerations [SI] below which a flight is steady. `trim` requires 1e-10 and tries several starts;
-# an element of a batch has one try and may end slightly above.
-
 
 class FlightNumbers(NamedTuple):
     """Numbers of a flight and of the vehicle, in the sweep's precision."""
