@@ -78,6 +78,7 @@ def run_control(
     with config.located(""):
         require_constants(model, config.vehicle.params)
     most, integral, limits, steps = _numbers(model, settings, where)
+    sd = _sensors(model, settings, where)
     progress("steady flights of the vehicles")
     with located(where):
         values = {} if saved is None else draws(saved, settings.samples, settings.seed)
@@ -85,18 +86,21 @@ def run_control(
         vehicles, flights, lost = vehicles_of(model, config.vehicle.params, values, condition)
         first = SteadyFlights(*jax.tree.map(lambda v: v[0], (flights.state, flights.inputs)))
         mode = jax.tree.map(lambda v: v[0], vehicles)
-        controller = _law(model, mode, first, settings, most, integral, limits, tuple(steps), where)
-        scenario = _scenario(model, settings, steps, where)
+        controller = _law(
+            model, mode, first, settings, most, integral, limits, sd, tuple(steps), where
+        )
+        scenario = _scenario(model, settings, steps, sd, where)
+        bandwidth = {n: s.bandwidth for n, s in settings.signals.items() if s.bandwidth}
         tuned = None
         if settings.max_steps:
             some, steady = jax.tree.map(lambda v: v[: settings.vehicles], (vehicles, flights))
             tuned = tune(
                 model, some, steady, controller, scenario, most=most, distance=settings.distance,
-                max_steps=settings.max_steps, progress=progress,
+                bandwidth=bandwidth, max_steps=settings.max_steps, progress=progress,
             )  # fmt: skip
             controller = tuned.controller
         progress("flights of the samples")
-        tuning = Tuning(model, vehicles, flights, controller, scenario, most)
+        tuning = Tuning(model, vehicles, flights, controller, scenario, most, bandwidth)
     margins = tuning.margins(controller)
     kept = np.all([m.stable for m in margins], axis=0)
     run = ControlRun(
@@ -132,8 +136,7 @@ def _numbers(
 ) -> tuple[dict[str, float], dict[str, float], dict[str, float], dict[str, float]]:
     """Return largest deviations, largest integrals, limits and steps, by name, SI."""
     known = dict.fromkeys(naming.names(model.Inputs), model.Inputs)
-    signals = dict.fromkeys(naming.names(model.Outputs), model.Outputs)
-    signals |= dict.fromkeys(naming.names(model.State), model.State)
+    signals = _signals(model)
     words = f"model {model.name} has no"
     require_known(settings.inputs, tuple(known), f"{where}.inputs", f"{words} input")
     require_known(settings.signals, tuple(signals), f"{where}.signals", f"{words} signal")
@@ -169,6 +172,7 @@ def _law(
     most: dict[str, float],
     integral: dict[str, float],
     limits: dict[str, float],
+    sd: dict[str, float],
     references: tuple[str, ...],
     where: str,
 ) -> Controller:
@@ -189,21 +193,39 @@ def _law(
     shared: dict[str, Any] = {"most": most, "dt": dt, "references": references, "limits": commands}
     if settings.law == "lqr":
         return lqr(model, params, trimmed, integral=integral, **shared)
-    outputs = naming.names(model.Outputs)
-    words = f"model {model.name} has no output"
-    require_known(settings.sensors, outputs, f"{where}.sensors", words)
-    sd = {}
-    for name, sensor in settings.sensors.items():
-        si = naming.unit(model.Outputs, name) or "1"
-        with located(f"{where}.sensors.{name}.unit"):
-            sd[name] = sensor.sd * units.factor(sensor.unit or si, si)
     return lqg(model, params, trimmed, sd=sd, noise=settings.noise, **shared)
 
 
+def _signals(model: Model) -> dict[str, type]:
+    """Return the record of each signal by name."""
+    signals = dict.fromkeys(naming.names(model.State), model.State)
+    return signals | dict.fromkeys(naming.names(model.Outputs), model.Outputs)
+
+
+def _sensors(model: Model, settings: ControlConfig, where: str) -> dict[str, float]:
+    """Return the sd of the noise of the measured signals, SI."""
+    signals, sd = _signals(model), {}
+    words = f"model {model.name} has no"
+    if settings.law == "lqg":
+        require_known(
+            settings.sensors, naming.names(model.Outputs), f"{where}.sensors", f"{words} output"
+        )
+    require_known(settings.sensors, tuple(signals), f"{where}.sensors", f"{words} signal")
+    for name, sensor in settings.sensors.items():
+        si = naming.unit(signals[name], name) or "1"
+        with located(f"{where}.sensors.{name}.unit"):
+            sd[name] = sensor.sd * units.factor(sensor.unit or si, si)
+    return sd
+
+
 def _scenario(
-    model: Model, settings: ControlConfig, steps: dict[str, float], where: str
+    model: Model,
+    settings: ControlConfig,
+    steps: dict[str, float],
+    sd: dict[str, float],
+    where: str,
 ) -> Scenario:
-    """Return gusts, and steps of the set points one after another."""
+    """Return gusts, steps of the set points one after another, and the noise of sensors."""
     dt, rng = 1.0 / settings.rate, np.random.default_rng(settings.seed)
     n = round(settings.duration * settings.rate)
     if n < 2:
@@ -218,7 +240,8 @@ def _scenario(
         # Each step lasts an equal share of the flight, and begins after the first tenth.
         begin = round((0.1 + 0.9 * i / len(steps)) * n)
         set_points[name] = np.where(np.arange(n) >= begin, step, 0.0)
-    return Scenario(inputs, set_points, n)
+    noise = {name: size * rng.standard_normal(n) for name, size in sd.items()}
+    return Scenario(inputs, set_points, n, noise)
 
 
 def _write(run: ControlRun, out: Path) -> None:

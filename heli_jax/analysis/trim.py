@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.check_model import check_model
-from heli_jax.dynamics.model import Model, SteadyFlight, require_constants
+from heli_jax.dynamics.model import Model, Sampled, SteadyFlight, require_constants
 from heli_jax.vehicle import of_helicopter
 
 STICKS = {"x_throttle": (0.0, 1.0), "x_yaw": (-1.0, 1.0), "x_collective": (-1.0, 1.0)}
@@ -91,6 +91,11 @@ def trim(
             the model's range.
     """
     steady = _require(model, power_off)
+    if model.sampled is not None:
+        at = trim(
+            model.sampled.plant, params, condition, wind=wind, sticks=sticks, power_off=power_off
+        )
+        return _held(model.sampled, params, at)
     if sticks is None:
         sticks = {n: ends for n, ends in STICKS.items() if n in naming.names(model.Inputs)}
     require_constants(model, params)
@@ -140,8 +145,17 @@ def equilibrium(
 
     Check `residual`: if it is not small (such as 1e-10), there is no trim.
     """
-    offset = jnp.zeros(len(_require(model).unknowns))
+    steady = _require(model)
+    if model.sampled is not None:
+        at = equilibrium(model.sampled.plant, params, condition, wind)
+        return _held(model.sampled, params, at)
+    offset = jnp.zeros(len(steady.unknowns))
     return _equilibrium(model, params, condition, wind, offset, power_off=False)
+
+
+def _held(sampled: Sampled, params: Any, at: Trim) -> Trim:
+    """Return a closed loop in the steady flight of its plant: its controller acts on deviations."""
+    return Trim(*sampled.hold(params, at.state, at.inputs), at.residual)
 
 
 @eqx.filter_jit

@@ -24,6 +24,9 @@ class AcceptableConfig(Section):
     """
     step: Finite | None = None
     """step of the set point, in `unit`, that is flown; a number gives the signal a set point"""
+    bandwidth: Positive | None = None
+    """least bandwidth [rad/s] of the response to the set point, kept by the tuning: up to it the
+    phase stays above -135 deg (ADS-33, attitude command)"""
 
 
 class GustConfig(Section):
@@ -53,7 +56,8 @@ class ControlConfig(Section):
     integral: tuple[str, ...] = ()
     """pid: signals with an integral"""
     sensors: dict[str, NoiseConfig] = {}
-    """lqg: measured outputs with the sd of their white noise"""
+    """signals with the sd of the white noise in what the controller reads; lqg: the measured
+    outputs"""
     noise: dict[str, Positive] = {}
     """lqg: square root of the spectral density of white noise [SI times sqrt(s)] at inputs, or of
     the rates of states"""
@@ -84,8 +88,11 @@ class ControlConfig(Section):
             raise ValueError("inputs: expected a commanded input, got none")
         if (self.law == "pid") != bool(self.loops):
             raise ValueError(f"loops: expected with law: pid alone, got law: {self.law}")
-        if (self.law == "lqg") != bool(self.sensors):
-            raise ValueError(f"sensors: expected with law: lqg alone, got law: {self.law}")
+        if self.law == "lqg" and not self.sensors:
+            raise ValueError("sensors: expected the measured outputs of law: lqg, got none")
+        for name, one in self.signals.items():
+            if one.bandwidth is not None and one.step is None:
+                raise ValueError(f"signals.{name}.step: expected with bandwidth, got none")
         for name in set(self.loops) ^ set(self.inputs) if self.loops else ():
             raise ValueError(f"loops: expected the same names as inputs, got {name!r} in one")
         return self

@@ -11,11 +11,13 @@ import pydantic
 from pydantic_core import ErrorDetails
 
 from heli_jax import models, naming
+from heli_jax.config.controller_file import read_controller
 from heli_jax.config.keys import json_schema
 from heli_jax.config.kinematics import completed
 from heli_jax.config.measurement import OpenedLogs, with_measurement
 from heli_jax.config.onboard import with_onboard
 from heli_jax.config.schema import Config, LinearConfig
+from heli_jax.control.controller import with_controller
 from heli_jax.dynamics.check_model import starting_at
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, VehicleError, located, nearest, require_kind, require_known
@@ -144,6 +146,9 @@ def _started(config: Config, path: Path, model: Model, logs: OpenedLogs) -> Mode
     model = with_onboard(model, config.onboard, path)
     # Outermost, because it models the autopilot's processing of its sensors.
     model = with_measurement(model, config.flights, path, logs)
+    if config.controller is not None:
+        with located(f"{path}: controller"):
+            model = with_controller(model, read_controller(path.parent / config.controller))
     if not config.initial_state:
         return model
     return starting_at(model, _initial_state(config, model, path))
@@ -390,6 +395,8 @@ def resolved(experiment: Experiment) -> dict[str, Any]:
     # Except the one key whose absence has another meaning.
     if config.rls is None:
         content["rls"] = None
+    if config.controller is not None:
+        content["controller"] = str((path.parent / config.controller).resolve())
     # A shipped model keeps its name, which is valid on any computer.
     if isinstance(config.model, LinearConfig) and not is_shipped(config.model.linear):
         content["model"] = {"linear": str((path.parent / config.model.linear).resolve())}

@@ -295,6 +295,9 @@ class Config(Section):
     (`heli_jax.dynamics.helicopter.Corrections`); full helicopter only"""
     onboard: OnboardConfig | None = None
     """servos, rate loops, gyro, sensors and delays around the model (docs/onboard.md)"""
+    controller: str | None = None
+    """run directory of `heli-jax control`, or its control.json: the model is flown by this
+    controller, and its gains are parameters `controller_...` (docs/control.md)"""
     # Any: a number in SI or {value, unit}, as in a vehicle file. It is checked where the model's
     # units are known.
     initial_state: dict[str, Any] = {}

@@ -16,6 +16,7 @@ import numpy as np
 from jax.tree_util import DictKey, SequenceKey
 
 from heli_jax import naming
+from heli_jax.analysis.trim import steady_flight
 from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.model import Model, Sampled, require_continuous
 from heli_jax.dynamics.onboard.delays import with_delay_line
@@ -55,21 +56,25 @@ class Controller(eqx.Module):
         """
 
 
-COMMAND, SET, STATE, GAIN = "command_", "set_", "controller_", "controller_"
-"""Prefixes of names in a closed loop: held commands, set points, the controller's states, gains."""
+COMMAND, SET, NOISE = "command_", "set_", "noise_"
+STATE = GAIN = "controller_"
+"""Prefixes of names in a closed loop: held commands, set points, sensor noise; the controller's
+states and gains."""
 
 
-def with_controller(model: Model, controller: Controller) -> Model:
+def with_controller(model: Model, controller: Controller, noise: Iterable[str] = ()) -> Model:
     """Return the closed loop of a model and a controller.
 
     The controller acts at each sample of a simulation, and its command is held until the next. The
     command is added to the model's own inputs, which are the trim or an excitation. New inputs
-    `set_SIGNAL` are set points. New parameters `controller_...` are the gains, with their values as
-    defaults; the names follow the controller's fields. New states are `command_INPUT`, the held
-    commands, and `controller_...`, the controller's own.
+    `set_SIGNAL` are set points, and `noise_SIGNAL` is added to what the controller reads. New
+    parameters `controller_...` are the gains, with their values as defaults; the names follow the
+    controller's fields. New states are `command_INPUT`, the held commands, and `controller_...`,
+    the controller's own.
 
     Args:
         model: with its servos, sensors and delays; input delays become delay lines in the loop.
+        noise: signals that the controller reads with noise.
 
     Raises:
         ValueError: a signal or an input that the model does not have, a state that is no scalar, or
@@ -79,11 +84,11 @@ def with_controller(model: Model, controller: Controller) -> Model:
     if not isinstance(controller, Controller):
         raise TypeError(f"expected a Controller, got {type(controller).__name__}")
     require_continuous(model, "with_controller")
-    require_known(
-        controller.references, signals_of(model), "references", f"model {model.name} has no signal"
-    )
+    words = f"model {model.name} has no signal"
+    require_known(controller.references, signals_of(model), "references", words)
+    require_known(noise := tuple(noise), signals_of(model), "noise", words)
     driven = commanded(model, controller)
-    return _Controlled(in_loop(model, driven), controller).closed()
+    return _Controlled(in_loop(model, driven), controller, noise).closed()
 
 
 def in_loop(model: Model, commands: Iterable[str]) -> Model:
@@ -146,20 +151,15 @@ def begin(closed: Model, params: Record, trimmed: Any, samples: int) -> tuple[Re
         params: the closed loop's Params.
         trimmed: a `Trim` of the model without controller, or a record with `state` and `inputs`.
     """
-    own = naming.asdict(closed.initial_state(params)) | naming.asdict(trimmed.state)
-    state = closed.State(**own)
-    values = naming.asdict(trimmed.inputs)
-    names = naming.names(closed.Inputs)
-    sticks = closed.Inputs(**{n: values.get(n, 0.0) for n in names})
-    signals = measured(closed, params, state, sticks)
-    values |= {n: signals[n.removeprefix(SET)] for n in names if n.startswith(SET)}
-    return state, closed.Inputs(**{n: jnp.full(samples, values[n]) for n in names})
+    assert closed.sampled is not None
+    state, inputs = closed.sampled.hold(params, trimmed.state, trimmed.inputs)
+    return state, jax.tree.map(lambda v: jnp.full(samples, v), inputs)
 
 
 class _Controlled(Device):
     """A model with the held commands and the states of a controller."""
 
-    def __init__(self, model: Model, controller: Controller) -> None:
+    def __init__(self, model: Model, controller: Controller, noise: tuple[str, ...]) -> None:
         self.driven = commanded(model, controller)
         units = {n: naming.unit(model.Inputs, n) for n in self.driven}
         states = {COMMAND + n: Quantity(units[n], f"command of {n}, held") for n in self.driven} | {
@@ -170,22 +170,31 @@ class _Controlled(Device):
             for n, v in gains_of(controller).items()
         }
         super().__init__(model, Parts(gains, states, linear=False))
-        self.controller = controller
+        self.controller, self.noise = controller, noise
+        known = {**naming.fields(model.State), **naming.fields(model.Outputs)}
+        fields = {SET + n: (known[n], None) for n in controller.references}
+        fields |= {NOISE + n: (known[n], None) for n in noise}
+        given = model.Inputs
+        self.Inputs = naming.extended(given, f"{given.__name__}Set", fields) if fields else given
 
     def closed(self) -> Model:
-        known = {**naming.fields(self.model.State), **naming.fields(self.model.Outputs)}
-        fields = {SET + n: (known[n], None) for n in self.controller.references}
-        inputs = self.model.Inputs
-        more = naming.extended(inputs, f"{inputs.__name__}Set", fields) if fields else inputs
         return self.made(
             "controller",
-            lambda bare: with_controller(bare, self.controller),
-            Inputs=more,
-            sampled=Sampled(self.controller.dt, self.update),
+            lambda bare: with_controller(bare, self.controller, self.noise),
+            Inputs=self.Inputs,
+            sampled=Sampled(self.controller.dt, self.update, self.model, self.hold),
             # Steady flight is that of the model: the controller acts on deviations from it.
-            steady_flight=None,
+            steady_flight=steady_flight(self.model),
             within=None,
         )
+
+    def hold(self, p: Record, s: Record, u: Record) -> tuple[Record, Record]:
+        """Return State and Inputs that hold a steady flight of the model."""
+        state = self.State(**(naming.asdict(self.start(p)) | naming.asdict(s)))
+        signals = measured(self.model, p, s, u)
+        values = {SET + n: signals[n] for n in self.controller.references}
+        values |= {NOISE + n: jnp.zeros_like(signals[n]) for n in self.noise}
+        return state, self.Inputs(**{**values, **naming.asdict(u)})
 
     def inputs(self, p: Record, s: Record, u: Record) -> Record:
         """Return the model's inputs: the given ones, with the held commands added."""
@@ -206,6 +215,7 @@ class _Controlled(Device):
         """Return the State after the controller's step at a sample."""
         # Sensors show what the command of the previous sample did.
         signals = measured(self.model, p, self.inner(s), self.inputs(p, s, u))
+        signals |= {n: signals[n] + getattr(u, NOISE + n) for n in self.noise}
         controller = with_gains(self.controller, naming.asdict(p))
         own = {n: getattr(s, STATE + n) for n in controller.init()}
         references = {n: getattr(u, SET + n) for n in controller.references}

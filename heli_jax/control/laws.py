@@ -9,6 +9,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax.control.controller import Controller, Signals
@@ -204,3 +205,25 @@ def _pid(
     if loop.i is not None:
         changed[f"{loop.signal}_i"] = state[f"{loop.signal}_i"] + dt * within * error
     return value, changed
+
+
+def content_of(controller: Controller) -> dict[str, Any]:
+    """Return a law as content of a JSON file."""
+    return {"law": type(controller).__name__, **_fields(controller)}
+
+
+def _fields(record: Any) -> dict[str, Any]:
+    return {
+        n: _plain(dict(v) if n in ("about", "limits", "place") else v)
+        for n, v in vars(record).items()
+    }
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Loop):
+        return _fields(value)
+    if isinstance(value, dict):
+        return {n: _plain(v) for n, v in value.items()}
+    if isinstance(value, tuple):
+        return [_plain(v) for v in value]
+    return np.asarray(value).tolist()

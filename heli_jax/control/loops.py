@@ -159,18 +159,13 @@ def frequencies(dt: float, count: int = 60, lowest: float = 0.1) -> np.ndarray:
 
 def loop_responses(loop: SampledLoop, dt: float, omega: np.ndarray) -> Complex[Array, "m k"]:
     """Return L of one loop at frequencies (k,) [rad/s], opened at each of the m commands."""
-    z = jnp.asarray(np.exp(1j * dt * np.asarray(omega)))[:, None, None]
-    eye = jnp.eye(loop.A.shape[-1], dtype=z.dtype)[None]
-    rows = []
-    for A, b, c in (opened(loop, i) for i in range(loop.B.shape[-1])):
-        x = jnp.linalg.solve(z * eye - A.astype(z.dtype)[None], b.astype(z.dtype)[None, :, None])
-        rows.append(x[:, :, 0] @ c.astype(z.dtype))
-    return jnp.stack(rows)
+    loops = (opened(loop, i) for i in range(loop.B.shape[-1]))
+    return jnp.stack([_at(A, b, c, dt, omega) for A, b, c in loops])
 
 
 def response(
     loop: SampledLoop, dt: float, omega: np.ndarray, *, of: int, to: int, set_point: bool
-) -> np.ndarray:
+) -> Complex[Array, " k"]:
     """Return the closed loop's response (k,) of a signal at frequencies (k,) [rad/s], complex.
 
     Args:
@@ -178,11 +173,17 @@ def response(
         to: number of the command that an excitation is added to, or of the set point.
         set_point: True for a set point.
     """
-    A, B, C, E, F, G = (np.asarray(M) for M in loop)
+    A, B, C, E, F, G = loop
     b = E[:, to] + B @ F[:, to] if set_point else B[:, to]
-    z = np.exp(1j * np.asarray(omega) * dt)[:, None, None]
-    x = np.linalg.solve(z * np.eye(len(A)) - A - B @ C, b[:, None].astype(complex))
-    return x[:, :, 0] @ G[of]
+    return _at(A + B @ C, b, G[of], dt, omega)
+
+
+def _at(A: Array, b: Array, c: Array, dt: float, omega: np.ndarray) -> Complex[Array, " k"]:
+    """Return c (z - A)^-1 b at frequencies (k,) [rad/s]."""
+    z = jnp.asarray(np.exp(1j * dt * np.asarray(omega)))[:, None, None]
+    eye = jnp.eye(A.shape[-1], dtype=z.dtype)[None]
+    x = jnp.linalg.solve(z * eye - A.astype(z.dtype)[None], b.astype(z.dtype)[None, :, None])
+    return x[:, :, 0] @ c.astype(z.dtype)
 
 
 _SQUARINGS = 11

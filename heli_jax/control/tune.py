@@ -13,6 +13,7 @@ from heli_jax import naming
 from heli_jax.analysis.margins import Margins
 from heli_jax.control.controller import (
     COMMAND,
+    NOISE,
     SET,
     STATE,
     Controller,
@@ -33,6 +34,7 @@ from heli_jax.control.loops import (
     loop_margins,
     loop_responses,
     plant_of,
+    response,
     sampled_loop,
 )
 from heli_jax.control.posterior import SteadyFlights
@@ -49,6 +51,8 @@ _CONTROLLED, _DRIFTING = -0.02, 0.05
 with positions or headings that drift."""
 _DIVERGED = 1e12
 """Square of a deviation over its largest acceptable value that counts as diverged."""
+_LATE = 0.75 * np.pi
+"""Lag of a response at its bandwidth [rad]."""
 _WIDEST = 3.0
 """Largest change of a gain's logarithm."""
 
@@ -61,6 +65,8 @@ class Scenario(NamedTuple):
     set_points: Mapping[str, Any]
     """Changes of set points (N,) by signal, SI."""
     samples: int
+    noise: Mapping[str, Any] = {}
+    """Noise (N,) of the signals that the controller reads, SI."""
 
 
 def gusts(sd: float, tau: float, n: int, dt: float, rng: np.random.Generator) -> np.ndarray:
@@ -108,6 +114,7 @@ def tune(
     *,
     most: Mapping[str, float],
     distance: float = 0.5,
+    bandwidth: Mapping[str, float] | None = None,
     max_steps: int = 50,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Tuned:
@@ -125,12 +132,14 @@ def tune(
         controller: gains to begin with.
         most: largest acceptable deviation of signals and commands, SI.
         distance: least distance of L from -1.
+        bandwidth: least bandwidth [rad/s] of the response to each set point, as ADS-33 defines it
+            for attitude command: up to it the phase stays above -135 deg.
         max_steps: most steps of L-BFGS-B.
 
     Raises:
         ValueError: an unknown name, or a controller without gains.
     """
-    problem = Tuning(model, vehicles, trimmed, controller, scenario, dict(most))
+    problem = Tuning(model, vehicles, trimmed, controller, scenario, dict(most), bandwidth)
     names = list(gains_of(controller))
     start = np.asarray([float(v) for v in gains_of(controller).values()])
     moved = np.flatnonzero(start)
@@ -141,7 +150,9 @@ def tune(
         k = jnp.asarray(start).at[moved].set(start[moved] * jnp.exp(z))
         return dict(zip(names, k, strict=True))
 
-    limits = np.append(np.full(len(commanded(model, controller)), distance), 0.0)
+    limits = np.append(
+        np.full(len(commanded(model, controller)), distance), np.zeros(1 + len(bandwidth or {}))
+    )
 
     @jax.jit
     @functools.partial(jax.value_and_grad, has_aux=True)
@@ -166,6 +177,11 @@ def tune(
     return Tuned(made, reached, costs, (before[0], after[0]), (before[1], after[1]))
 
 
+def _up_to(bandwidth: float) -> np.ndarray:
+    """Return the frequencies at which a phase is held [rad/s]."""
+    return np.geomspace(0.05 * bandwidth, bandwidth, 30)
+
+
 class Tuning:
     """Cost and distances of a set of vehicles, as functions of the gains."""
 
@@ -177,6 +193,7 @@ class Tuning:
         controller: Controller,
         scenario: Scenario,
         most: dict[str, float],
+        bandwidth: Mapping[str, float] | None = None,
     ) -> None:
         model = in_loop(model, commanded(model, controller))
         known, words = (
@@ -188,8 +205,10 @@ class Tuning:
         require_known(scenario.inputs, inputs, "scenario", f"{words} input")
         without = "the controller has no set point"
         require_known(scenario.set_points, controller.references, "scenario", without)
+        self.bandwidth = dict(bandwidth or {})
+        require_known(self.bandwidth, controller.references, "bandwidth", without)
         self.model, self.controller, self.dt = model, controller, controller.dt
-        self.closed = with_controller(model, controller)
+        self.closed = with_controller(model, controller, scenario.noise)
         self.vehicles, self.most, self.scenario = vehicles, most, scenario
         self.plants: Plant = jax.vmap(lambda p, t: plant_of(model, p, t[0], t[1], self.dt))(
             vehicles, (trimmed.state, trimmed.inputs)
@@ -199,6 +218,7 @@ class Tuning:
             self.closed, self.params(first[0], {}), SteadyFlights(*first[1:]), scenario.samples
         )
         changed = {**scenario.inputs, **{SET + n: v for n, v in scenario.set_points.items()}}
+        changed |= {NOISE + n: v for n, v in scenario.noise.items()}
         self.begun = state
         self.inputs = naming.replace(
             inputs, **{n: getattr(inputs, n) + jnp.asarray(v) for n, v in changed.items()}
@@ -255,26 +275,40 @@ class Tuning:
         gains = {n: jnp.asarray(v, float) for n, v in gains_of(controller).items()}
         return jax.device_get(jax.jit(jax.vmap(lambda p: self.run(p, gains)))(self.vehicles))
 
-    def distances(self, gains: Mapping[str, Array]) -> Float[Array, " m+1"]:
-        """Return smooth minima over the vehicles: of |1 + L| by command, then of stability.
+    def distances(self, gains: Mapping[str, Array]) -> Float[Array, " m"]:
+        """Return smooth minima over the vehicles: of |1 + L| by command, of stability, of phases.
 
         Stability is the limit of growth less the growth of the closed loop [1/s]. The distance
-        alone does not see it, since an unstable loop may be far from -1.
+        alone does not see it, since an unstable loop may be far from -1. Phases are those of the
+        responses to set points up to the wanted bandwidth, above -135 deg [rad].
         """
         controller = with_gains(self.controller, gains)
 
-        def of_one(plant: Plant) -> tuple[Array, Array]:
+        def of_one(plant: Plant) -> tuple[Array, ...]:
             loop = sampled_loop(self.model, plant, controller)
             apart = jnp.abs(1.0 + loop_responses(loop, self.dt, self.omega))
-            return apart, self.most_growth - growth(loop, self.dt)
-
-        apart, stable = jax.vmap(of_one)(self.plants)
-        apart = jnp.moveaxis(apart, 1, 0).reshape(apart.shape[1], -1)
+            stable = self.most_growth - growth(loop, self.dt)
+            ahead = [
+                jnp.unwrap(jnp.angle(self.following(loop, n, _up_to(w)))) + _LATE
+                for n, w in self.bandwidth.items()
+            ]
+            return *apart, stable, *ahead
 
         def least(values: Array) -> Array:
-            return -jax.nn.logsumexp(-_SHARP * values, axis=-1) / _SHARP
+            return -jax.nn.logsumexp(-_SHARP * values) / _SHARP
 
-        return jnp.append(least(apart), least(stable))
+        return jnp.stack([least(v) for v in jax.vmap(of_one)(self.plants)])
+
+    def following(self, loop: SampledLoop, name: str, omega: np.ndarray) -> Complex[Array, " k"]:
+        """Return a signal's response to its set point at frequencies (k,) [rad/s]."""
+        row = signals_of(self.model).index(name)
+        to = self.controller.references.index(name)
+        return response(loop, self.dt, omega, of=row, to=to, set_point=True)
+
+    def followed(self, controller: Controller, name: str) -> Complex[np.ndarray, "k f"]:
+        """Return all vehicles' responses of a signal to its set point, at every frequency."""
+        respond = jax.vmap(lambda loop: self.following(loop, name, self.omega))
+        return np.asarray(respond(self._loops(controller)))
 
     def responses(self, controller: Controller) -> Complex[np.ndarray, "k m f"]:
         """Return L of all vehicles at every command and frequency."""

@@ -87,6 +87,11 @@ class Sampled(NamedTuple):
     """Sample time [s]."""
     update: Callable[[Any, Any, Any], Any]
     """update(params, state, inputs): the State after a controller's step."""
+    plant: "Model"
+    """The model without controller."""
+    hold: Callable[[Any, Any, Any], tuple[Any, Any]]
+    """hold(params, state, inputs): State and Inputs of the closed loop that hold a steady flight of
+    the plant, with a command of zero."""
 
 
 class Model(eqx.Module):

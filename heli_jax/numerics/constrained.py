@@ -49,7 +49,9 @@ def minimise(
 
     def cost(x: np.ndarray, *of_round: Any) -> tuple[float, np.ndarray]:
         (value, _), slope = augmented(x, *of_round)
-        return float(value), np.asarray(slope, float)
+        slope = np.asarray(slope, float)
+        # The line search goes back from a point that is too far, but not with NaN.
+        return float(value), slope if np.all(np.isfinite(slope)) else np.zeros_like(slope)
 
     for _ in range(_ROUNDS):
         found = minimize(
@@ -59,7 +61,7 @@ def minimise(
             jac=True,
             method="L-BFGS-B",
             bounds=bounds,
-            options={"maxiter": max_steps - steps, "ftol": 1e-7, "gtol": 1e-6},
+            options={"maxiter": max_steps - steps, "ftol": 1e-5, "gtol": 1e-4},
         )
         x, steps = found.x, steps + int(found.nit)
         if not limits:

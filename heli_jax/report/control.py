@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 
 from heli_jax import naming
+from heli_jax.analysis.handling_qualities import handling_qualities
+from heli_jax.analysis.response_curves import Curve, Point
 from heli_jax.control.controller import gains_of
-from heli_jax.control.laws import Cascade, StateFeedback
+from heli_jax.control.laws import Cascade, StateFeedback, content_of
 from heli_jax.numbers import number, percent
 from heli_jax.report import style
 from heli_jax.report.charts import Chart, Numbers, Panel, Series, band, panel, time_limits
@@ -113,12 +115,12 @@ def margins_table(run: Any) -> Table:
     return Table(("loop opened at", "stable", "gain margin", "phase margin"), rows)
 
 
-def _pair(values: np.ndarray, unit: str) -> str:
-    """Return the 5 % quantile and the median of the stable vehicles."""
-    low, middle = _quantile(values, _EDGES[0]), _quantile(values, 0.5)
+def _pair(values: np.ndarray, unit: str, edge: float = _EDGES[0]) -> str:
+    """Return a quantile (default 5 %) and the median of the stable vehicles."""
+    worst, middle = _quantile(values, edge), _quantile(values, 0.5)
     if not len(values) > 1:
         return f"{number(middle, 3)} {unit}"
-    return f"{number(low, 3)} {unit} (median {number(middle, 3)})"
+    return f"{number(worst, 3)} {unit} (median {number(middle, 3)})"
 
 
 def _quantile(values: np.ndarray, share: float) -> float:
@@ -142,6 +144,31 @@ def flight_table(run: Any) -> Table:
             (name, kind, f"{low} {unit}", f"{high} {unit}", f"{stated[name].most:g} {unit}")
         )
     return Table(("signal", "", "rms, median", "rms, 95 %", "acceptable"), rows)
+
+
+def handling_table(run: Any) -> Table:
+    """Return bandwidth and phase delay of the responses of angles to their set points."""
+    omega, rows = run.tuning.omega, []
+    for name in run.controller.references:
+        if naming_unit(run, name) != "rad":
+            continue
+        found = []
+        for H in run.tuning.followed(run.controller, name):
+            curve = Curve(functools.partial(_interpolated, omega, H), (omega[0], omega[-1]))
+            numbers = handling_qualities(curve, "attitude-command").numbers
+            found.append(
+                [numbers[n].value if n in numbers else np.nan for n in ("bandwidth", "phase_delay")]
+            )
+        bandwidth, delay = np.array(found).T
+        rows.append((name, _pair(bandwidth, "rad/s"), _pair(delay, "s", _EDGES[1])))
+    return Table(("set point", "bandwidth", "phase delay"), rows)
+
+
+def _interpolated(omega: np.ndarray, H: np.ndarray, at: np.ndarray) -> Point:
+    x, known = np.log(at), np.log(omega)
+    exact = np.zeros((len(at), 0))
+    gain, lag = (np.interp(x, known, v) for v in (np.log(np.abs(H)), np.unwrap(np.angle(H))))
+    return Point(gain, lag, exact, exact)
 
 
 def naming_unit(run: Any, name: str) -> str | None:
@@ -179,6 +206,7 @@ def write_control(folder: Path, run: Any, config: str) -> None:
         summary=summary(run),
         doubts=doubts(run),
         margins=margins_table(run),
+        handling=handling_table(run),
         flight=flight_table(run),
         gains=Table(
             ("gain", "value"), [(n, number(float(v))) for n, v in gains_of(run.controller).items()]
@@ -221,6 +249,7 @@ def _content(run: Any) -> dict[str, Any]:
             "distance": list(tuned.distance),
             "stable": list(tuned.stable),
         },
+        "controller": content_of(run.controller),
         "gains": {n: float(v) for n, v in gains_of(run.controller).items()},
         "doubts": doubts(run),
     }

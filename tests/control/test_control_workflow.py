@@ -8,11 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from heli_jax import linear_model, naming
+from heli_jax import linear_model, naming, run_fit
 from heli_jax.cli.commands import main
+from heli_jax.config.controller_file import read_controller
+from heli_jax.control.controller import signals_of
+from heli_jax.control.laws import content_of
+from heli_jax.control.loops import sampled_loop
 from heli_jax.control.posterior import draws, vehicles_of
 from heli_jax.control.regulators import lqr
 from heli_jax.control.tune import Scenario, Tuning, tune
+from heli_jax.errors import InputError
 from heli_jax.identification.result import Estimate
 
 DT = 0.02
@@ -47,6 +52,51 @@ def test_a_regulator_of_a_linear_model_in_one_command(tmp_path, capsys):
     assert {n: float(v) for n, v in rows[1:]} == content["gains"]
     assert (tmp_path / "out" / "report.html").stat().st_size > 10_000
     assert "stable" in capsys.readouterr().out
+
+
+LOOP = """
+model: {linear: roll-flybarless}
+controller: out
+vehicle: {Lb: 100.0, Blat: 1.0}
+simulate:
+  duration: 12
+  rate: 50
+  inputs: {set_phi: {kind: doublet, amplitude: 0.3}}
+  noise: {p: {sd: 0.005}, phi: {sd: 0.002}}
+"""
+
+
+def test_a_plant_is_identified_through_the_controller_of_a_run(tmp_path):
+    """The sticks that the controller moves are not in the log."""
+    assert run(tmp_path, (CONFIG % ("lqr", 0)).replace("gusts: {lat: {sd: 0.005}}", "")) == 0
+    made = json.loads((tmp_path / "out" / "control.json").read_text())["controller"]
+    law = read_controller(tmp_path / "out")
+    assert content_of(law) == made
+    config, log = tmp_path / "loop.yaml", tmp_path / "log.csv"
+    config.write_text(LOOP)
+    assert main(["simulate", str(config), "--out", str(log), "--quiet"]) == 0
+    fitted = (
+        LOOP
+        + """
+flights:
+- log: log.csv
+  signals:
+    time: {signal: time, unit: s}
+    inputs: {lat: {signal: lat}, set_phi: {signal: set_phi}}
+    outputs: {p: {signal: p}, phi: {signal: phi}}
+fit:
+  method: output-error
+  free: {Lb: {start: 60.0}}
+"""
+    )
+    config.write_text(fitted)
+    found = run_fit(config)
+    e = found.fit.estimates["Lb"]
+    assert found.fit.status == "converged"
+    assert abs(e.value - 100.0) < 4.0 * e.sd < 10.0
+    (tmp_path / "out" / "control.json").write_text('{"controller": {"law": "Cascade"}}')
+    with pytest.raises(InputError, match=r"control\.json"):
+        run_fit(config)
 
 
 def test_gains_of_rate_and_angle_loops_for_autopilots(tmp_path):
@@ -152,6 +202,40 @@ def test_tuning_lowers_the_cost_and_keeps_the_distance(tuning):
         found.controller
     )
     assert np.all(np.abs(flown.deviations["phi"][:, -1]) < 0.01)
+
+
+def test_tuning_keeps_the_bandwidth(tuning):
+    model, vehicles, flights, _, scenario, most = tuning
+    first = jax.tree.map(lambda v: v[0], flights)
+    slow = lqr(
+        model, jax.tree.map(lambda v: v[0], vehicles), first, most={"phi": 0.3, "lat": 0.05},
+        dt=DT, references=("phi",),
+    )  # fmt: skip
+    wanted = 8.0
+
+    def phases(controller):
+        """Phases [deg] at the bandwidth, by closed-loop matrices in NumPy."""
+        of = Tuning(model, vehicles, flights, controller, scenario, most)
+        found = []
+        for loop in range(6):
+            A, B, C, E, F, G = (
+                np.asarray(M[loop])
+                for M in jax.vmap(lambda p: sampled_loop(model, p, controller))(of.plants)
+            )
+            z = np.exp(1j * wanted * DT)
+            x = np.linalg.solve(z * np.eye(len(A)) - A - B @ C, E + B @ F)
+            found.append(np.angle((G @ x)[signals_of(model).index("phi"), 0], deg=True))
+        return np.array(found)
+
+    found = tune(
+        model, vehicles, flights, slow, scenario, most={**most, "lat": 0.01}, distance=0.4,
+        bandwidth={"phi": wanted},
+    )  # fmt: skip
+    assert np.min(phases(slow)) < -135.0
+    assert found.converged
+    assert np.min(phases(found.controller)) > -135.5
+    with pytest.raises(ValueError, match="set point"):
+        tune(model, vehicles, flights, slow, scenario, most=most, bandwidth={"p": 1.0})
 
 
 def test_wrong_names_of_a_tuning_are_refused(tuning):

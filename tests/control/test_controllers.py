@@ -10,8 +10,19 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model, naming, sweep
+from heli_jax import (
+    Flight,
+    Free,
+    Nuisance,
+    Problem,
+    fit,
+    linear_model,
+    load_vehicle,
+    naming,
+    sweep,
+)
 from heli_jax.analysis.linear import linearize, modes
+from heli_jax.analysis.trim import Condition, trim
 from heli_jax.control.controller import (
     Controller,
     begin,
@@ -25,6 +36,7 @@ from heli_jax.control.laws import Cascade, Loop, StateFeedback
 from heli_jax.control.loops import growth, loop_margins, plant_of, response, sampled_loop
 from heli_jax.control.posterior import SteadyFlights
 from heli_jax.control.regulators import lqg, lqr, pid
+from heli_jax.dynamics.helicopter import helicopter
 from heli_jax.dynamics.model import zeros
 from heli_jax.simulation.simulate import simulate
 from heli_jax.sweeps import Reduce, grid
@@ -43,6 +55,18 @@ def r50():
     found = linear_model("r50-hover")
     model = in_loop(found.model, naming.names(found.model.Inputs))
     return model, found.vehicle().params
+
+
+@pytest.fixture(scope="module")
+def helicopter_with_hold():
+    model = helicopter()
+    hold = StateFeedback(
+        gains={"x_pitch": {"dx": -1e-4, "theta": -1e-3}}, integral={}, dt=DT,
+        references=("dx", "theta"),
+    )  # fmt: skip
+    closed = with_controller(model, hold)
+    vehicle = load_vehicle("configs/vehicles/x-cell-60.yaml")
+    return closed, closed.Params(**naming.asdict(vehicle))
 
 
 def at_rest(model):
@@ -321,6 +345,33 @@ def test_gains_are_parameters_that_a_fit_estimates(roll):
     slow = Flight(2 * DT, flight.inputs, flight.outputs, sd=flight.sd)
     with pytest.raises(ValueError, match="controller"):
         Problem(closed, p, [slow], free)
+
+
+def test_noise_of_a_sensor_acts_as_the_opposite_set_point(roll):
+    model, params = roll
+    law = Cascade(loops={"lat": (Loop(0.05, 0.1, signal="p"),)}, dt=DT, references=("p",))
+    closed = with_controller(model, law, noise=("p",))
+    p = closed.Params(**naming.asdict(params))
+    state, inputs = begin(closed, p, at_rest(model), 100)
+    drawn = jnp.asarray(np.random.default_rng(1).standard_normal(100))
+
+    def rates(**changes):
+        run = simulate(closed, p, naming.replace(inputs, **changes), dt=DT, initial_state=state)
+        return np.asarray(run.outputs.p)
+
+    np.testing.assert_allclose(rates(noise_p=drawn), rates(set_p=-drawn), atol=1e-12)
+    with pytest.raises(ValueError, match="nothing"):
+        with_controller(model, law, noise=("nothing",))
+
+
+def test_a_closed_loop_is_steady_in_the_trim_of_its_helicopter(helicopter_with_hold):
+    closed, params = helicopter_with_hold
+    at = trim(closed, params, Condition(forward_speed=3.0))
+    state, inputs = begin(closed, params, at, 50)
+    assert float(inputs.set_dx[0]) == pytest.approx(3.0)
+    run = simulate(closed, params, inputs, dt=DT, initial_state=state, substeps=4)
+    assert np.ptp(np.asarray(run.states.dx)) < 1e-8
+    assert np.max(np.abs(np.asarray(run.states.command_x_pitch))) < 1e-10
 
 
 def test_derivatives_by_gains_are_differences(roll):
