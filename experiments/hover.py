@@ -11,9 +11,12 @@ prints the share of stable vehicles, margins and deviations, and writes figures 
 runs/hover).
 """
 
+import os
 import sys
 import time
 from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads wait for each other in small matrices
 
 import jax
 import jax.numpy as jnp
@@ -132,7 +135,7 @@ def main():
     wind = {"wind_x": gusts(1.0, 1.0, n, DT, rng), "wind_y": gusts(1.0, 1.0, n, DT, rng),
             "wind_z": gusts(0.5, 0.5, n, DT, rng)}  # fmt: skip
     scenario = Scenario(wind, {"x": np.where(np.arange(n) > 100, 0.1, 0.0)}, n)
-    robust = tuned(16, 0.3)
+    robust = tuned(24, 0.3)
     print(f"tuning converged: {robust.converged}; cost {robust.cost}, distance {robust.distance}")
     tested, mean_alone = tuning(24, None, law), tuning(0, 1, law)
     fig, axes = plt.subplots(2, 2, figsize=(10, 6), sharex=True, sharey="row")

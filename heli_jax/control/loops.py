@@ -38,19 +38,29 @@ class Plant(NamedTuple):
 
 
 class SampledLoop(NamedTuple):
-    """x' = A x + B v, w = C x + F r, y = G x: v the commands that act, w the computed ones.
+    """x' = A x + B v, w = C x: v the commands that act, w the computed ones, and v = w closed.
 
-    States are those of the plant, the controller's and the held commands. The loop is closed by v =
-    w; r are set points, which also act by x' = ... + E r; y are the plant's signals. vmap adds
-    batch dimensions.
+    States are those of the plant, the controller's and the held commands. vmap adds batch
+    dimensions.
     """
 
     A: Float[Array, "n n"]
     B: Float[Array, "n m"]
     C: Float[Array, "m n"]
-    E: Float[Array, "n r"]
+
+
+class LinearStep(NamedTuple):
+    """A controller's step: x' = A x + B y + E r, w = C x + D y + F r.
+
+    x are its states, y the plant's signals, r set points, w commands; deviations.
+    """
+
+    A: Float[Array, "c c"]
+    B: Float[Array, "c p"]
+    E: Float[Array, "c r"]
+    C: Float[Array, "m c"]
+    D: Float[Array, "m p"]
     F: Float[Array, "m r"]
-    G: Float[Array, "p n"]
 
 
 @jitted
@@ -75,17 +85,15 @@ def plant_of(model: Model, params: Record, state: Record, inputs: Record, dt: An
     return Plant(Phi[:n, :n], Phi[:n, n:], C, D, both(x0, u0)[1])
 
 
-@eqx.filter_jit
-def sampled_loop(model: Model, plant: Plant, controller: Controller) -> SampledLoop:
-    """Return the loop of a plant and a controller.
+def linear_step(model: Model, plant: Plant, controller: Controller) -> LinearStep:
+    """Return the step of a controller, linearised at the plant's steady flight.
 
     Args:
         model: the plant's.
     """
-    signals, inputs = signals_of(model), naming.names(model.Inputs)
+    signals, sets = signals_of(model), controller.references
     at = dict(zip(signals, plant.at, strict=True))
     first, driven = controller.init(), commanded(model, controller)
-    sets = controller.references
 
     def step(own: Array, y: Array, r: Array) -> tuple[Array, Array]:
         state, command = controller.step(
@@ -95,13 +103,22 @@ def sampled_loop(model: Model, plant: Plant, controller: Controller) -> SampledL
         )
         return _vector(state, first), _vector(command, driven)
 
-    zero = jnp.zeros_like(plant.at)
-    r = _vector(at, sets)
-    own = _vector(first, first)
-    (Ac, Bc, Ec), (Cc, Dc, Fc) = jax.jacfwd(step, argnums=(0, 1, 2))(own, zero, r)
-    columns = jnp.asarray([inputs.index(n) for n in driven])
+    start = _vector(first, first), jnp.zeros_like(plant.at), _vector(at, sets)
+    (A, B, E), (C, D, F) = jax.jacfwd(step, argnums=(0, 1, 2))(*start)
+    return LinearStep(A, B, E, C, D, F)
+
+
+@eqx.filter_jit
+def sampled_loop(model: Model, plant: Plant, controller: Controller) -> SampledLoop:
+    """Return the loop of a plant and a controller.
+
+    Args:
+        model: the plant's.
+    """
+    Ac, Bc, _, Cc, Dc, _ = linear_step(model, plant, controller)
+    columns = _columns(model, controller)
     B, D = plant.B[:, columns], plant.D[:, columns]
-    (n, m), c = B.shape, len(first)
+    (n, m), c = B.shape, len(Ac)
     A = jnp.block(
         [
             [plant.A, jnp.zeros((n, c + m))],
@@ -113,10 +130,13 @@ def sampled_loop(model: Model, plant: Plant, controller: Controller) -> SampledL
         A,
         jnp.concatenate([B, jnp.zeros((c, m)), jnp.eye(m)]),
         jnp.concatenate([Dc @ plant.C, Cc, Dc @ D], axis=1),
-        jnp.concatenate([jnp.zeros((n, len(sets))), Ec, jnp.zeros((m, len(sets)))]),
-        Fc,
-        jnp.concatenate([plant.C, jnp.zeros((plant.C.shape[0], c)), D], axis=1),
     )
+
+
+def _columns(model: Model, controller: Controller) -> Array:
+    """Return the places of the commanded inputs among the model's."""
+    inputs = naming.names(model.Inputs)
+    return jnp.asarray([inputs.index(n) for n in commanded(model, controller)])
 
 
 def _vector(values: Mapping[str, Any], names: Iterable[str]) -> Array:
@@ -152,38 +172,54 @@ def _tustin(A: np.ndarray, b: np.ndarray, c: np.ndarray, dt: float) -> tuple[np.
     return (2.0 / dt) * (A - np.eye(n)) @ back, gain * x, gain * y, -np.einsum("ki,ki->k", c, x)
 
 
-def frequencies(dt: float, count: int = 60, lowest: float = 0.1) -> np.ndarray:
+def frequencies(dt: float, count: int = 240, lowest: float = 0.1) -> np.ndarray:
     """Return a grid of frequencies up to half the sample rate [rad/s]."""
     return np.geomspace(lowest, 0.98 * np.pi / dt, count)
 
 
-def loop_responses(loop: SampledLoop, dt: float, omega: np.ndarray) -> Complex[Array, "m k"]:
-    """Return L of one loop at frequencies (k,) [rad/s], opened at each of the m commands."""
-    loops = (opened(loop, i) for i in range(loop.B.shape[-1]))
-    return jnp.stack([_at(A, b, c, dt, omega) for A, b, c in loops])
+def plant_responses(
+    model: Model, plant: Plant, controller: Controller, dt: float, omega: np.ndarray
+) -> Complex[Array, "k p m"]:
+    """Return the responses P of all signals to the commands, at frequencies (k,) [rad/s]."""
+    columns, z = _columns(model, controller), _z(dt, omega)
+    # Sensors show the command that was held before the sample.
+    return _at(z, plant.A, plant.B[:, columns], plant.C) + plant.D[:, columns] / z
 
 
-def response(
-    loop: SampledLoop, dt: float, omega: np.ndarray, *, of: int, to: int, set_point: bool
-) -> Complex[Array, " k"]:
-    """Return the closed loop's response (k,) of a signal at frequencies (k,) [rad/s], complex.
+def controller_responses(
+    step: LinearStep, dt: float, omega: np.ndarray
+) -> tuple[Complex[Array, "k m p"], Complex[Array, "k m r"]]:
+    """Return the responses of the commands to signals and to set points."""
+    A, B, E, C, D, F = step
+    z, p, r = _z(dt, omega), D.shape[1], F.shape[1]
+    both = jnp.broadcast_to(jnp.concatenate([D, F], axis=1)[None] + 0j, (len(z), len(D), p + r))
+    if A.size:
+        both = both + _at(z, A, jnp.concatenate([B, E], axis=1), C)
+    return both[..., :p], both[..., p:]
 
-    Args:
-        of: row of the signal.
-        to: number of the command that an excitation is added to, or of the set point.
-        set_point: True for a set point.
+
+def sensitivity(K: Complex[Array, "k m p"], P: Complex[Array, "k p m"]) -> Complex[Array, "k m m"]:
+    """Return the responses of acting commands to what is added to them, in closed loop.
+
+    The diagonal is 1 / (1 + L), with L the loop opened at one command.
     """
-    A, B, C, E, F, G = loop
-    b = E[:, to] + B @ F[:, to] if set_point else B[:, to]
-    return _at(A + B @ C, b, G[of], dt, omega)
+    return jnp.linalg.inv(jnp.eye(K.shape[-2])[None] - K @ P)
 
 
-def _at(A: Array, b: Array, c: Array, dt: float, omega: np.ndarray) -> Complex[Array, " k"]:
-    """Return c (z - A)^-1 b at frequencies (k,) [rad/s]."""
-    z = jnp.asarray(np.exp(1j * dt * np.asarray(omega)))[:, None, None]
-    eye = jnp.eye(A.shape[-1], dtype=z.dtype)[None]
-    x = jnp.linalg.solve(z * eye - A.astype(z.dtype)[None], b.astype(z.dtype)[None, :, None])
-    return x[:, :, 0] @ c.astype(z.dtype)
+def loop_responses(K: Complex[Array, "k m p"], P: Complex[Array, "k p m"]) -> Complex[Array, "m k"]:
+    """Return the loops L opened at each of the m commands, while the others are closed."""
+    return 1.0 / jnp.diagonal(sensitivity(K, P), axis1=-2, axis2=-1).T - 1.0
+
+
+def _z(dt: float, omega: np.ndarray) -> Complex[Array, "k 1 1"]:
+    return jnp.asarray(np.exp(1j * dt * np.asarray(omega)))[:, None, None]
+
+
+def _at(z: Complex[Array, "k 1 1"], A: Array, B: Array, C: Array) -> Complex[Array, "k p m"]:
+    """Return C (z - A)^-1 B."""
+    A, B, C = (M.astype(z.dtype)[None] for M in (A, B, C))
+    right = jnp.broadcast_to(B, (len(z), *B.shape[1:]))
+    return C @ jnp.linalg.solve(z * jnp.eye(A.shape[-1])[None] - A, right)
 
 
 _SQUARINGS = 11

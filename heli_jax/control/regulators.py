@@ -11,7 +11,14 @@ from heli_jax import naming
 from heli_jax.analysis.linear import linearize
 from heli_jax.control.controller import commanded, in_loop, measured, signals_of
 from heli_jax.control.laws import Cascade, Loop, Observer, StateFeedback
-from heli_jax.control.loops import Plant, plant_of, response, sampled_loop
+from heli_jax.control.loops import (
+    Plant,
+    controller_responses,
+    linear_step,
+    plant_of,
+    plant_responses,
+    sensitivity,
+)
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import require_known
 
@@ -205,12 +212,13 @@ def _response(
     controller = Cascade(
         loops=whole, dt=dt, references=tuple(by[0].signal for by in whole.values()), about=about
     )
-    loop = sampled_loop(model, plant, controller)
+    at = np.asarray([omega])
+    P = plant_responses(model, plant, controller, dt, at)
+    K, R = controller_responses(linear_step(model, plant, controller), dt, at)
+    moved = P @ sensitivity(K, P) @ (R if inner else jnp.eye(K.shape[-2])[None])
     # Set points are in the order of the loops, commands in that of the model's inputs.
-    at = (tuple(whole) if inner else commanded(model, controller)).index(name)
-    row = signals_of(model).index(signal)
-    found = response(loop, dt, np.asarray([omega]), of=row, to=at, set_point=bool(inner))
-    return complex(found[0])
+    column = (tuple(whole) if inner else commanded(model, controller)).index(name)
+    return complex(moved[0, signals_of(model).index(signal), column])
 
 
 def _in_flight(model: Model, params: Any, trimmed: Any, driven: Iterable[str]) -> tuple[Model, Any]:

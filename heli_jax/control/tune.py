@@ -29,13 +29,16 @@ from heli_jax.control.controller import (
 from heli_jax.control.loops import (
     Plant,
     SampledLoop,
+    controller_responses,
     frequencies,
     growth,
+    linear_step,
     loop_margins,
     loop_responses,
     plant_of,
-    response,
+    plant_responses,
     sampled_loop,
+    sensitivity,
 )
 from heli_jax.control.posterior import SteadyFlights
 from heli_jax.dynamics.model import Model
@@ -177,9 +180,8 @@ def tune(
     return Tuned(made, reached, costs, (before[0], after[0]), (before[1], after[1]))
 
 
-def _up_to(bandwidth: float) -> np.ndarray:
-    """Return the frequencies at which a phase is held [rad/s]."""
-    return np.geomspace(0.05 * bandwidth, bandwidth, 30)
+def _phase(response: Complex[Array, " f"]) -> Float[Array, " f"]:
+    return jnp.unwrap(jnp.angle(response))
 
 
 class Tuning:
@@ -224,6 +226,10 @@ class Tuning:
             inputs, **{n: getattr(inputs, n) + jnp.asarray(v) for n, v in changed.items()}
         )
         self.omega = frequencies(self.dt)
+        # Does not depend on the gains.
+        self.responding = jax.jit(
+            jax.vmap(lambda p: plant_responses(model, p, controller, self.dt, self.omega))
+        )(self.plants)
         first = jax.tree.map(lambda v: v[0], self.plants)
         slowest = growth(sampled_loop(model, first, controller), self.dt)
         self.most_growth = _CONTROLLED if slowest < _CONTROLLED else _DRIFTING
@@ -284,36 +290,43 @@ class Tuning:
         """
         controller = with_gains(self.controller, gains)
 
-        def of_one(plant: Plant) -> tuple[Array, ...]:
-            loop = sampled_loop(self.model, plant, controller)
-            apart = jnp.abs(1.0 + loop_responses(loop, self.dt, self.omega))
-            stable = self.most_growth - growth(loop, self.dt)
+        def of_one(plant: Plant, P: Array) -> tuple[Array, ...]:
+            step = linear_step(self.model, plant, controller)
+            K, R = controller_responses(step, self.dt, self.omega)
+            stable = self.most_growth - growth(sampled_loop(self.model, plant, controller), self.dt)
             ahead = [
-                jnp.unwrap(jnp.angle(self.following(loop, n, _up_to(w)))) + _LATE
+                jnp.where(self.omega <= w, _phase(self._following(K, R, P, n)), 0.0) + _LATE
                 for n, w in self.bandwidth.items()
             ]
-            return *apart, stable, *ahead
+            return *jnp.abs(1.0 + loop_responses(K, P)), stable, *ahead
 
         def least(values: Array) -> Array:
             return -jax.nn.logsumexp(-_SHARP * values) / _SHARP
 
-        return jnp.stack([least(v) for v in jax.vmap(of_one)(self.plants)])
+        return jnp.stack([least(v) for v in jax.vmap(of_one)(self.plants, self.responding)])
 
-    def following(self, loop: SampledLoop, name: str, omega: np.ndarray) -> Complex[Array, " k"]:
-        """Return a signal's response to its set point at frequencies (k,) [rad/s]."""
+    def _following(self, K: Array, R: Array, P: Array, name: str) -> Complex[Array, " f"]:
+        """Return a signal's response to its set point at every frequency."""
         row = signals_of(self.model).index(name)
         to = self.controller.references.index(name)
-        return response(loop, self.dt, omega, of=row, to=to, set_point=True)
+        return (P[:, [row]] @ sensitivity(K, P) @ R[..., [to]])[:, 0, 0]
 
     def followed(self, controller: Controller, name: str) -> Complex[np.ndarray, "k f"]:
         """Return all vehicles' responses of a signal to its set point, at every frequency."""
-        respond = jax.vmap(lambda loop: self.following(loop, name, self.omega))
-        return np.asarray(respond(self._loops(controller)))
+        return self._each(controller, lambda K, R, P: self._following(K, R, P, name))
 
     def responses(self, controller: Controller) -> Complex[np.ndarray, "k m f"]:
         """Return L of all vehicles at every command and frequency."""
-        respond = jax.vmap(lambda loop: loop_responses(loop, self.dt, self.omega))
-        return np.asarray(respond(self._loops(controller)))
+        return self._each(controller, lambda K, R, P: loop_responses(K, P))
+
+    def _each(self, controller: Controller, respond: Callable[..., Array]) -> np.ndarray:
+        """Return a function of the responses of controller and plant for all vehicles."""
+
+        def of_one(plant: Plant, P: Array) -> Array:
+            step = linear_step(self.model, plant, controller)
+            return respond(*controller_responses(step, self.dt, self.omega), P)
+
+        return np.asarray(jax.jit(jax.vmap(of_one))(self.plants, self.responding))
 
     def margins(self, controller: Controller) -> tuple[Margins, ...]:
         """Return the margins (k,) of the loop at each command."""
