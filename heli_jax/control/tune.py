@@ -180,6 +180,21 @@ def tune(
     return Tuned(made, reached, costs, (before[0], after[0]), (before[1], after[1]))
 
 
+@jax.custom_vjp
+def _with_finite_slopes(gains: Mapping[str, Array]) -> Mapping[str, Array]:
+    """Return the gains, without the derivatives of a vehicle that left the range of floats.
+
+    Its growth still has some.
+    """
+    return gains
+
+
+_with_finite_slopes.defvjp(
+    lambda gains: (gains, None),
+    lambda _, slopes: (jax.tree.map(lambda g: jnp.where(jnp.isfinite(g), g, 0.0), slopes),),
+)
+
+
 def _phase(response: Complex[Array, " f"]) -> Float[Array, " f"]:
     return jnp.unwrap(jnp.angle(response))
 
@@ -232,7 +247,7 @@ class Tuning:
         )(self.plants)
         first = jax.tree.map(lambda v: v[0], self.plants)
         slowest = growth(sampled_loop(model, first, controller), self.dt)
-        self.most_growth = _CONTROLLED if slowest < _CONTROLLED else _DRIFTING
+        self.most_growth = slowest / 3.0 if slowest < _CONTROLLED else _DRIFTING
 
     def params(self, vehicle: Any, gains: Mapping[str, Any]) -> Any:
         return self.closed.Params(**{**naming.asdict(vehicle), **gains})
@@ -259,7 +274,7 @@ class Tuning:
         """Return the mean cost of the vehicles."""
 
         def of_one(vehicle: Any) -> Array:
-            flown = self.run(vehicle, gains, adjoint=Scan())
+            flown = self.run(vehicle, _with_finite_slopes(gains), adjoint=Scan())
             return self._cost({**flown.deviations, **flown.commands})
 
         return jnp.mean(jax.vmap(of_one)(self.vehicles))
@@ -267,7 +282,7 @@ class Tuning:
     def _cost(self, flown: Mapping[str, Any]) -> Any:
         """Return the costs of flights with signals (..., N)."""
         total = sum((jnp.asarray(flown[n]) / size) ** 2 for n, size in self.most.items())
-        # A vehicle that left the range of floats has no gradient; it counts as a large cost.
+        # A vehicle that left the range of floats counts as a large cost.
         total = jnp.where(jnp.isfinite(total), total, _DIVERGED)
         return jnp.log1p(jnp.mean(jnp.minimum(total, _DIVERGED), axis=-1))
 

@@ -49,9 +49,7 @@ def minimise(
 
     def cost(x: np.ndarray, *of_round: Any) -> tuple[float, np.ndarray]:
         (value, _), slope = augmented(x, *of_round)
-        slope = np.asarray(slope, float)
-        # The line search goes back from a point that is too far, but not with NaN.
-        return float(value), slope if np.all(np.isfinite(slope)) else np.zeros_like(slope)
+        return float(value), np.asarray(slope, float)
 
     for _ in range(_ROUNDS):
         found = minimize(
