@@ -135,9 +135,9 @@ def main():
     wind = {"wind_x": gusts(1.0, 1.0, n, DT, rng), "wind_y": gusts(1.0, 1.0, n, DT, rng),
             "wind_z": gusts(0.5, 0.5, n, DT, rng)}  # fmt: skip
     scenario = Scenario(wind, {"x": np.where(np.arange(n) > 100, 0.1, 0.0)}, n)
-    robust = tuned(24, 0.3)
+    robust = tuned(64, 0.3)
     print(f"tuning converged: {robust.converged}; cost {robust.cost}, distance {robust.distance}")
-    tested, mean_alone = tuning(24, None, law), tuning(0, 1, law)
+    tested, mean_alone = tuning(64, None, law), tuning(0, 1, law)
     fig, axes = plt.subplots(2, 2, figsize=(10, 6), sharex=True, sharey="row")
     for column, (words, made) in enumerate((("mean", law), ("posterior", robust.controller))):
         distance, stable = tested.judged(made)

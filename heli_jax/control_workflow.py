@@ -20,6 +20,7 @@ from heli_jax.control.tune import Flown, Scenario, Tuned, Tuning, gusts, tune
 from heli_jax.dynamics.model import Model, require_constants
 from heli_jax.errors import InputError, located, require_known
 from heli_jax.report.saved_fit import SavedFit, load_fit
+from heli_jax.simulation.trajectory import STATUS
 from heli_jax.yaml_file import as_yaml
 
 
@@ -44,6 +45,12 @@ class ControlRun(NamedTuple):
     lost: int
     """Samples without steady flight."""
     directory: Path | None
+
+    @property
+    def sound(self) -> bool:
+        """True if all vehicles are stable, none diverges in flight, and the tuning converged."""
+        flown = np.all(self.flown.status < STATUS.index("not finite"))
+        return bool(flown) and self.stable == 1.0 and (self.tuned is None or self.tuned.converged)
 
 
 def run_control(
@@ -73,7 +80,7 @@ def run_control(
         run_directory.require_free(Path(out))
     saved = _fit(config, settings, fit, where)
     if any(n.startswith("wind_") for n in settings.gusts):
-        config = configuration.in_wind(config)
+        config = configuration.in_wind(config, "control.gusts")
     model = in_loop(config.model, settings.inputs)
     with config.located(""):
         require_constants(model, config.vehicle.params)

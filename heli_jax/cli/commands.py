@@ -405,8 +405,7 @@ def _control(options: argparse.Namespace) -> int:
     experiment = workflow.load_config(options.config, options.set)
     run = run_control(experiment, out, fit=options.fit, progress=options.say)
     controls.print_control(run, verbose=options.verbose)
-    converged = run.tuned is None or run.tuned.converged
-    return DONE if converged and run.stable == 1.0 else NOT_CONVERGED
+    return DONE if run.sound else NOT_CONVERGED
 
 
 def _compatibility(options: argparse.Namespace) -> int:

@@ -44,7 +44,7 @@ class ControlConfig(Section):
     law: Literal["lqr", "lqg", "pid"] = "lqr"
     """lqr: regulator with the true states; lqg: with a Kalman filter of the outputs in `sensors`;
     pid: the cascades of `loops`"""
-    rate: Positive
+    rate: Annotated[float, Field(gt=0, le=10_000)]
     """steps of the controller a second [Hz]"""
     signals: dict[str, AcceptableConfig] = {}
     """outputs and states, by name"""
@@ -77,7 +77,7 @@ class ControlConfig(Section):
     distance: Annotated[float, Field(ge=0, lt=1)] = 0.5
     """least distance of every loop from -1: 0.5 is a gain margin of 6 dB and a phase margin of 29
     deg"""
-    max_steps: Annotated[int, Field(ge=0)] = 40
+    max_steps: Annotated[int, Field(ge=0)] = 200
     """most steps of the tuning; 0: no tuning"""
     seed: Annotated[int, Field(ge=0)] = 0
     """seed of vehicles and gusts"""
@@ -86,10 +86,26 @@ class ControlConfig(Section):
     def _complete(self) -> "ControlConfig":
         if not self.inputs:
             raise ValueError("inputs: expected a commanded input, got none")
+        if not self.signals and self.law != "pid":
+            raise ValueError("signals: expected a signal to control, got none")
+        for name in (n for n in self.inputs if n.startswith("wind_")):
+            raise ValueError(f"inputs: expected an input that can be commanded, got {name!r}")
+        unused = {
+            "integral": self.integral and self.law != "pid",
+            "noise": self.noise and self.law != "lqg",
+        }
+        for key in (k for k, given in unused.items() if given):
+            raise ValueError(f"{key}: not for law: {self.law}, expected none")
+        for name, one in {**self.signals, **self.inputs}.items():
+            if one.full_stick is not None and self.law != "pid":
+                raise ValueError(f"inputs.{name}.full_stick: expected with law: pid alone")
+            if one.limit is not None and self.law != "pid" and name in self.signals:
+                raise ValueError(f"signals.{name}.limit: expected with law: pid alone")
         if (self.law == "pid") != bool(self.loops):
             raise ValueError(f"loops: expected with law: pid alone, got law: {self.law}")
-        if self.law == "lqg" and not self.sensors:
-            raise ValueError("sensors: expected the measured outputs of law: lqg, got none")
+        for key in ("sensors", "noise") if self.law == "lqg" else ():
+            if not getattr(self, key):
+                raise ValueError(f"{key}: expected with law: lqg, got none")
         for name, one in self.signals.items():
             if one.bandwidth is not None and one.step is None:
                 raise ValueError(f"signals.{name}.step: expected with bandwidth, got none")

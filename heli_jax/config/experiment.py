@@ -154,19 +154,22 @@ def _started(config: Config, path: Path, model: Model, logs: OpenedLogs) -> Mode
     return starting_at(model, _initial_state(config, model, path))
 
 
-def in_wind(experiment: Experiment) -> Experiment:
+def in_wind(experiment: Experiment, place: str = "simulate.wind") -> Experiment:
     """Return the experiment with a model that has the wind as inputs.
+
+    Args:
+        place: key of the wind, for messages.
 
     Raises:
         InputError: the model takes no wind.
     """
     config, path = experiment.config, experiment.path
     if isinstance(config.model, LinearConfig):
-        raise InputError(f"{path}: simulate.wind: a linear model takes no wind")
+        raise InputError(f"{path}: {place}: a linear model takes no wind")
     # Built again by name: the wind's inputs are part of the model, and so is the initial state.
     model = models.by_name(
         config.model,
-        f"{path}: simulate.wind",
+        f"{path}: {place}",
         path.absolute().parent,
         corrections=config.corrections,
         wind=True,

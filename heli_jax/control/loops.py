@@ -144,22 +144,38 @@ def _vector(values: Mapping[str, Any], names: Iterable[str]) -> Array:
     return jnp.stack(listed) if listed else jnp.zeros(0)
 
 
-def opened(loop: SampledLoop, i: int) -> tuple[Array, Array, Array]:
+def _opened(loop: SampledLoop, i: int) -> tuple[np.ndarray, ...]:
     """Return A, b, c of L = c (z - A)^-1 b with negative feedback, opened at one command.
 
     The other commands are closed. Leading batch dimensions are kept.
     """
-    A = loop.A + loop.B.at[..., i].set(0.0) @ loop.C
-    return A, loop.B[..., i], -loop.C[..., i, :]
+    A, B, C = map(np.asarray, loop)
+    others = np.arange(B.shape[-1]) != i
+    return A + B[..., others] @ C[..., others, :], B[..., i], -C[..., i, :]
 
 
 def loop_margins(loop: SampledLoop, dt: float) -> tuple[Margins, ...]:
     """Return the margins of loops (batch,), one for each command.
 
     Tustin's map takes the unit circle to the imaginary axis, with the same values of L.
+
+    Raises:
+        ValueError: a loop has a pole at half the sample rate, which the map takes to infinity.
     """
-    loops = [jax.device_get(opened(loop, i)) for i in range(loop.B.shape[-1])]
-    return tuple(margins(*_tustin(A, b, c, dt)) for A, b, c in loops)
+    loop = jax.device_get(loop)
+    size = np.abs(np.linalg.eigvals(loop.A + loop.B @ loop.C)).max(axis=-1)
+    # Next to a pole near half the sample rate a slow growth is small.
+    grows = size > 1.0 + _GROWS
+    found = []
+    for i in range(loop.B.shape[-1]):
+        A, b, c = _opened(loop, i)
+        try:
+            m = margins(*_tustin(A, b, c, dt))
+        except np.linalg.LinAlgError as e:
+            raise ValueError("the controller has a pole at half the sample rate") from e
+        lost = np.where(grows, np.nan, 0.0)
+        found.append(Margins(m.gain + lost, m.phase + lost, m.stable & ~grows))
+    return tuple(found)
 
 
 def _tustin(A: np.ndarray, b: np.ndarray, c: np.ndarray, dt: float) -> tuple[np.ndarray, ...]:
@@ -170,6 +186,11 @@ def _tustin(A: np.ndarray, b: np.ndarray, c: np.ndarray, dt: float) -> tuple[np.
     y = np.einsum("kj,kji->ki", c, back)
     gain = 2.0 / np.sqrt(dt)
     return (2.0 / dt) * (A - np.eye(n)) @ back, gain * x, gain * y, -np.einsum("ki,ki->k", c, x)
+
+
+_GROWS = 1e-5
+"""Growth of a sample above which a loop is unstable; positions without control drift by rounding.
+"""
 
 
 def frequencies(dt: float, count: int = 240, lowest: float = 0.1) -> np.ndarray:
@@ -183,7 +204,7 @@ def plant_responses(
     """Return the responses P of all signals to the commands, at frequencies (k,) [rad/s]."""
     columns, z = _columns(model, controller), _z(dt, omega)
     # Sensors show the command that was held before the sample.
-    return _at(z, plant.A, plant.B[:, columns], plant.C) + plant.D[:, columns] / z
+    return _at(z, plant.A, plant.B[:, columns], plant.C) + _complex(plant.D[:, columns]) / z
 
 
 def controller_responses(
@@ -192,7 +213,7 @@ def controller_responses(
     """Return the responses of the commands to signals and to set points."""
     A, B, E, C, D, F = step
     z, p, r = _z(dt, omega), D.shape[1], F.shape[1]
-    both = jnp.broadcast_to(jnp.concatenate([D, F], axis=1)[None] + 0j, (len(z), len(D), p + r))
+    both = jnp.broadcast_to(_complex(jnp.concatenate([D, F], axis=1)), (len(z), len(D), p + r))
     if A.size:
         both = both + _at(z, A, jnp.concatenate([B, E], axis=1), C)
     return both[..., :p], both[..., p:]
@@ -203,7 +224,7 @@ def sensitivity(K: Complex[Array, "k m p"], P: Complex[Array, "k p m"]) -> Compl
 
     The diagonal is 1 / (1 + L), with L the loop opened at one command.
     """
-    return jnp.linalg.inv(jnp.eye(K.shape[-2])[None] - K @ P)
+    return jnp.linalg.inv(jnp.eye(K.shape[-2], dtype=K.dtype)[None] - K @ P)
 
 
 def loop_responses(K: Complex[Array, "k m p"], P: Complex[Array, "k p m"]) -> Complex[Array, "m k"]:
@@ -215,11 +236,15 @@ def _z(dt: float, omega: np.ndarray) -> Complex[Array, "k 1 1"]:
     return jnp.asarray(np.exp(1j * dt * np.asarray(omega)))[:, None, None]
 
 
+def _complex(M: Array) -> Complex[Array, "1 p m"]:
+    return jax.lax.complex(M, jnp.zeros_like(M))[None]
+
+
 def _at(z: Complex[Array, "k 1 1"], A: Array, B: Array, C: Array) -> Complex[Array, "k p m"]:
     """Return C (z - A)^-1 B."""
-    A, B, C = (M.astype(z.dtype)[None] for M in (A, B, C))
+    A, B, C = map(_complex, (A, B, C))
     right = jnp.broadcast_to(B, (len(z), *B.shape[1:]))
-    return C @ jnp.linalg.solve(z * jnp.eye(A.shape[-1])[None] - A, right)
+    return C @ jnp.linalg.solve(z * jnp.eye(A.shape[-1], dtype=z.dtype)[None] - A, right)
 
 
 _SQUARINGS = 11

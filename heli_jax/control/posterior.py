@@ -48,6 +48,8 @@ def draws(fit: Any, count: int, seed: int = 0) -> dict[str, np.ndarray]:
             raise ValueError(
                 f"{name} is not identifiable: expected a prior for it, or a fixed value"
             )
+        if e.lower95 is None or e.upper95 is None:
+            raise ValueError(f"{name} has no interval in this fit, expected one that is adequate")
     content: Mapping[str, Any] | None = getattr(fit, "content", None)
     if content is None:
         order, correlation = fit.verdict.names, fit.verdict.correlation

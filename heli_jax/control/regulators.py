@@ -14,13 +14,19 @@ from heli_jax.control.laws import Cascade, Loop, Observer, StateFeedback
 from heli_jax.control.loops import (
     Plant,
     controller_responses,
+    growth,
     linear_step,
     plant_of,
     plant_responses,
+    sampled_loop,
     sensitivity,
 )
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import require_known
+
+_CLEAR = 0.5
+"""Least cosine of a response's phase, from that of an integrating or constant one, that decides the
+sign of a gain."""
 
 
 class _Plant(NamedTuple):
@@ -63,7 +69,7 @@ def lqr(
         dt: sample time of the controller [s].
         integral: largest acceptable integral of a signal's deviation [SI times s]; it removes the
             signal's steady error.
-        references: states with a set point.
+        references: signals with a set point, among those of `most`; each equals a state.
         limits: largest commands by input.
 
     Raises:
@@ -74,12 +80,15 @@ def lqr(
     plant = _plant(model, params, trimmed, driven, (*most, *integral))
     K = _regulator(plant, most, integral)
     n = len(plant.states)
+    # An output with a set point is fed back in place of the state that it equals.
+    read = {_state_of(plant, name): name for name in references}
+    signals = [read.get(s, s) for s in plant.states]
     return StateFeedback(
-        gains=_table(driven, plant.states, K[:, :n]),
+        gains=_table(driven, signals, K[:, :n]),
         integral=_table(driven, tuple(integral), -K[:, n:]) if integral else {},
         dt=dt,
         references=tuple(references),
-        about={s: plant.at[s] for s in (*plant.states, *integral) if s not in references},
+        about={s: plant.at[s] for s in (*signals, *integral) if s not in references},
         limits=dict(limits or {}),
     )
 
@@ -186,13 +195,30 @@ def pid(
             H = _response(model, plant, {**done, name: inner}, about, dt, name, signal, crossover)
             if not (np.isfinite(H) and abs(H) > 0.0):
                 raise ValueError(f"{name}: {signal} does not follow this input")
-            # The phase of an integrating or a constant response decides the sign.
-            p = float(np.copysign(1.0 / abs(H), np.cos(np.angle(H) + 0.25 * np.pi)))
-            i = 0.2 * crossover * p if signal in integral else None
-            inner = (Loop(p, i, None, signal, limits.get(signal)), *inner)
+            # The phase of an integrating or a constant response decides the sign, elsewhere the
+            # slower growth.
+            p, along = 1.0 / abs(H), np.cos(np.angle(H) + 0.25 * np.pi)
+            made = [
+                (Loop(k, 0.2 * crossover * k if signal in integral else None, None, signal,
+                      limits.get(signal)), *inner)
+                for k in (p, -p)
+            ]  # fmt: skip
+            if abs(along) > _CLEAR:
+                inner = made[int(along < 0.0)]
+            else:
+                laws = [_cascade({**done, name: by}, about, dt) for by in made]
+                grown = [float(growth(sampled_loop(model, plant, law), dt)) for law in laws]
+                inner = made[int(np.argmin(grown))]
         done[name] = inner
-    first = tuple(next(iter(by)) for by in loops.values())
-    return Cascade(loops=done, dt=dt, references=first, about=about)
+    return _cascade(done, about, dt)
+
+
+def _cascade(
+    loops: Mapping[str, tuple[Loop, ...]], about: Mapping[str, float], dt: float
+) -> Cascade:
+    """Return a cascade with set points of its outermost loops."""
+    first = tuple(by[0].signal for by in loops.values())
+    return Cascade(loops=dict(loops), dt=dt, references=first, about=dict(about))
 
 
 def _response(
@@ -209,13 +235,11 @@ def _response(
     inner = loops[name]
     # A loop of gain zero makes the input a command.
     whole = {**loops, name: inner or (Loop(0.0, signal=signal),)}
-    controller = Cascade(
-        loops=whole, dt=dt, references=tuple(by[0].signal for by in whole.values()), about=about
-    )
+    controller = _cascade(whole, about, dt)
     at = np.asarray([omega])
     P = plant_responses(model, plant, controller, dt, at)
     K, R = controller_responses(linear_step(model, plant, controller), dt, at)
-    moved = P @ sensitivity(K, P) @ (R if inner else jnp.eye(K.shape[-2])[None])
+    moved = P @ sensitivity(K, P) @ (R if inner else jnp.eye(K.shape[-2], dtype=K.dtype)[None])
     # Set points are in the order of the loops, commands in that of the model's inputs.
     column = (tuple(whole) if inner else commanded(model, controller)).index(name)
     return complex(moved[0, signals_of(model).index(signal), column])
@@ -335,8 +359,8 @@ def _state_of(plant: _Plant, name: str) -> str:
     Raises:
         ValueError: it is no single state.
     """
-    row = plant.signals[name]
+    row = plant.signals.get(name, np.zeros(0))
     at = np.flatnonzero(row)
     if len(at) != 1 or row[at[0]] != 1.0:
-        raise ValueError(f"references: expected outputs that equal a state, got {name!r}")
+        raise ValueError(f"references: expected signals that equal a weighted state, got {name!r}")
     return plant.states[at[0]]

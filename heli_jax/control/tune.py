@@ -48,7 +48,7 @@ from heli_jax.simulation.options import Scan
 from heli_jax.simulation.simulate import simulate, substeps_for
 
 _SHARP = 100.0
-"""Sharpness of the smooth minimum of |1 + L| over frequencies and vehicles."""
+"""Sharpness of the smooth minimum of |1 + L| over frequencies."""
 _CONTROLLED, _DRIFTING = -0.02, 0.05
 """Largest growth of a closed loop that is tuned [1/s]: of one whose modes all decay, and of one
 with positions or headings that drift."""
@@ -56,6 +56,8 @@ _DIVERGED = 1e12
 """Square of a deviation over its largest acceptable value that counts as diverged."""
 _LATE = 0.75 * np.pi
 """Lag of a response at its bandwidth [rad]."""
+_MOVING = 1e-4
+"""Rate at which a signal moves in steady flight [largest acceptable deviation a second]."""
 _WIDEST = 3.0
 """Largest change of a gain's logarithm."""
 
@@ -89,8 +91,8 @@ class Flown(NamedTuple):
     """Signals less their set points, or less their values in steady flight."""
     commands: dict[str, Any]
     """Commands as held before each sample."""
-    finite: Any
-    """True if the vehicle did not diverge out of the range of floats."""
+    status: Any
+    """Index in `simulation.trajectory.STATUS`."""
 
 
 class Tuned(NamedTuple):
@@ -153,9 +155,8 @@ def tune(
         k = jnp.asarray(start).at[moved].set(start[moved] * jnp.exp(z))
         return dict(zip(names, k, strict=True))
 
-    limits = np.append(
-        np.full(len(commanded(model, controller)), distance), np.zeros(1 + len(bandwidth or {}))
-    )
+    m, count = len(commanded(model, controller)), problem.plants.at.shape[0]
+    limits = np.repeat([distance] * m + [0.0] * (1 + len(problem.bandwidth)), count)
 
     @jax.jit
     @functools.partial(jax.value_and_grad, has_aux=True)
@@ -234,13 +235,14 @@ class Tuning:
         state, inputs = begin(
             self.closed, self.params(first[0], {}), SteadyFlights(*first[1:]), scenario.samples
         )
+        self._require_steady(self.params(first[0], {}), state, inputs)
         changed = {**scenario.inputs, **{SET + n: v for n, v in scenario.set_points.items()}}
         changed |= {NOISE + n: v for n, v in scenario.noise.items()}
         self.begun = state
         self.inputs = naming.replace(
             inputs, **{n: getattr(inputs, n) + jnp.asarray(v) for n, v in changed.items()}
         )
-        self.omega = frequencies(self.dt)
+        self.omega = np.unique([*frequencies(self.dt), *self.bandwidth.values()])
         # Does not depend on the gains.
         self.responding = jax.jit(
             jax.vmap(lambda p: plant_responses(model, p, controller, self.dt, self.omega))
@@ -248,6 +250,22 @@ class Tuning:
         first = jax.tree.map(lambda v: v[0], self.plants)
         slowest = growth(sampled_loop(model, first, controller), self.dt)
         self.most_growth = slowest / 3.0 if slowest < _CONTROLLED else _DRIFTING
+
+    def _require_steady(self, params: Any, state: Any, inputs: Any) -> None:
+        """Refuse weighted signals that change in the steady flight.
+
+        Raises:
+            ValueError: a signal changes, such as a position in forward flight.
+        """
+        u = jax.tree.map(lambda v: v[0], inputs)
+        rates = self.closed.vector_field(params, state, u)
+        _, slopes = jax.jvp(lambda s: measured(self.closed, params, s, u), (state,), (rates,))
+        for name in dict.fromkeys((*self.most, *self.controller.references)):
+            if abs(slope := float(slopes.get(name, 0.0))) > _MOVING * self.most.get(name, 1.0):
+                raise ValueError(
+                    f"{name} changes by {slope:.3g} a second in this steady flight: expected "
+                    "signals that stand still, or hover"
+                )
 
     def params(self, vehicle: Any, gains: Mapping[str, Any]) -> Any:
         return self.closed.Params(**{**naming.asdict(vehicle), **gains})
@@ -268,7 +286,7 @@ class Tuning:
             if not n.startswith((COMMAND, STATE))
         }
         held = {n: getattr(run.states, COMMAND + n) for n in commanded(self.model, self.controller)}
-        return Flown(off, held, run.finite)
+        return Flown(off, held, run.status)
 
     def cost(self, gains: Mapping[str, Array]) -> Float[Array, ""]:
         """Return the mean cost of the vehicles."""
@@ -297,7 +315,7 @@ class Tuning:
         return jax.device_get(jax.jit(jax.vmap(lambda p: self.run(p, gains)))(self.vehicles))
 
     def distances(self, gains: Mapping[str, Array]) -> Float[Array, " m"]:
-        """Return smooth minima over the vehicles: of |1 + L| by command, of stability, of phases.
+        """Return smooth minima over frequencies: |1 + L| by command and vehicle, stability, phases.
 
         Stability is the limit of growth less the growth of the closed loop [1/s]. The distance
         alone does not see it, since an unstable loop may be far from -1. Phases are those of the
@@ -313,12 +331,10 @@ class Tuning:
                 jnp.where(self.omega <= w, _phase(self._following(K, R, P, n)), 0.0) + _LATE
                 for n, w in self.bandwidth.items()
             ]
-            return *jnp.abs(1.0 + loop_responses(K, P)), stable, *ahead
+            apart = [*jnp.abs(1.0 + loop_responses(K, P)), stable, *ahead]
+            return tuple(-jax.nn.logsumexp(-_SHARP * v) / _SHARP for v in apart)
 
-        def least(values: Array) -> Array:
-            return -jax.nn.logsumexp(-_SHARP * values) / _SHARP
-
-        return jnp.stack([least(v) for v in jax.vmap(of_one)(self.plants, self.responding)])
+        return jnp.concatenate(jax.vmap(of_one)(self.plants, self.responding))
 
     def _following(self, K: Array, R: Array, P: Array, name: str) -> Complex[Array, " f"]:
         """Return a signal's response to its set point at every frequency."""

@@ -22,12 +22,14 @@ from heli_jax.report.origin import origin
 from heli_jax.report.page import filled, picture
 from heli_jax.report.style import label
 from heli_jax.report.tables import Table
+from heli_jax.simulation.trajectory import STATUS
 
 # `run` is a ControlRun of `heli_jax.control_workflow`, which imports this module.
 
 _FILES = ("control.json", "gains.csv")
 _SHARE = 0.99
 """Share of stable vehicles below which there is a doubt."""
+_OUTSIDE = STATUS.index("outside the model's range")
 _EDGES = (0.05, 0.95)
 """Quantiles of bands and tables."""
 
@@ -35,30 +37,39 @@ _EDGES = (0.05, 0.95)
 def summary(run: Any) -> str:
     """Return the share of stable vehicles, and the least margins, in a sentence or two."""
     count = len(run.margins[0].stable) + run.lost
-    if run.fit is None:
+    alone = run.fit is None
+    if alone:
         stable = "stable" if run.stable == 1.0 else "unstable"
         words = f"The vehicle of the configuration is {stable}."
     else:
         words = f"{percent(run.stable, 1)} of {count} vehicles of the posterior are stable."
+    if run.stable <= 1.0 - _EDGES[0]:
+        return words
+    # Of each vehicle's worst loop.
     gain, phase_margin = (
-        min(_quantile(getattr(m, kind), _EDGES[0]) for m in run.margins)
+        _quantile(np.min([getattr(m, kind) for m in run.margins], axis=0), _EDGES[0], run.lost)
         for kind in ("gain", "phase")
     )
-    if run.stable > 0.0:
-        often = "" if run.fit is None else " in 95 % of the vehicles"
-        words += (
-            f" Margins{often}: at least {number(gain, 3)} dB and {number(phase_margin, 3)} deg."
-        )
-    return words
+    often = "" if alone else " in 95 % of the vehicles"
+    words += f" All loops have a gain margin of at least {number(gain, 3)} dB{often}, and a phase "
+    return f"{words}margin of at least {number(phase_margin, 3)} deg{often}."
 
 
 def doubts(run: Any) -> list[str]:
     """Return what limits the trust in a controller."""
     found, tuned = [], run.tuned
-    if run.stable < _SHARE:
-        found.append(
-            f"{percent(1.0 - run.stable, 1)} of the vehicles are unstable. {_unstable(run)}"
-        )
+    unstable = 1.0 - float(np.mean(_stable(run)))
+    if unstable > 1.0 - _SHARE:
+        found.append(f"{percent(unstable, 1)} of the vehicles are unstable. {_unstable(run)}")
+    for words, share in (
+        ("diverge in this flight", np.mean(run.flown.status > _OUTSIDE)),
+        ("leave the model's range in this flight", np.mean(run.flown.status == _OUTSIDE)),
+    ):
+        if share > 1.0 - _SHARE:
+            found.append(
+                f"{percent(float(share), 1)} of the vehicles {words}, though the margins are those "
+                "of small deviations: smaller steps and gusts, or limits of the commands."
+            )
     if tuned is not None and not tuned.converged:
         found.append(
             "The tuning did not converge with control.distance kept: a larger control.max_steps, "
@@ -90,9 +101,14 @@ def doubts(run: Any) -> list[str]:
     return found
 
 
+def _stable(run: Any) -> np.ndarray:
+    """True (vehicles,) if all loops of a vehicle are stable."""
+    return np.all([m.stable for m in run.margins], axis=0)
+
+
 def _unstable(run: Any) -> str:
     """Return the growing mode of an unstable vehicle, by participation factors, and a remedy."""
-    at = int(np.argmin(np.all([m.stable for m in run.margins], axis=0)))
+    at = int(np.argmin(_stable(run)))
     A = run.tuning.closed_matrix(run.controller, at)
     size, right = np.linalg.eig(A)
     left = np.linalg.pinv(right)
@@ -116,17 +132,20 @@ def margins_table(run: Any) -> Table:
 
 
 def _pair(values: np.ndarray, unit: str, edge: float = _EDGES[0]) -> str:
-    """Return a quantile (default 5 %) and the median of the stable vehicles."""
+    """Return a quantile (default 5 %) and the median of the vehicles."""
     worst, middle = _quantile(values, edge), _quantile(values, 0.5)
     if not len(values) > 1:
         return f"{number(middle, 3)} {unit}"
     return f"{number(worst, 3)} {unit} (median {number(middle, 3)})"
 
 
-def _quantile(values: np.ndarray, share: float) -> float:
-    seen = values[~np.isnan(values)]
+def _quantile(values: np.ndarray, share: float, lost: int = 0) -> float:
+    """Return a quantile; unknown values and `lost` vehicles are the worst. NaN if it is one."""
+    worst = -np.inf if share <= 0.5 else np.inf
+    all_values = np.append(np.where(np.isnan(values), worst, values), np.full(lost, worst))
     # An infinite margin is no number to interpolate with.
-    return float(np.quantile(seen, share, method="lower")) if seen.size else float("nan")
+    found = float(np.quantile(all_values, share, method="lower"))
+    return float("nan") if found == worst and share <= 0.5 else found
 
 
 def flight_table(run: Any) -> Table:
@@ -137,9 +156,12 @@ def flight_table(run: Any) -> Table:
     for name, most in run.tuning.most.items():
         factor = stated[name].most / most
         rms = factor * np.sqrt(np.mean(np.square(both[name]), axis=1))
+        rms = np.where(run.flown.status > _OUTSIDE, np.inf, rms)
         unit = stated[name].unit or naming_unit(run, name) or ""
         kind = "command" if name in run.commands else "deviation"
-        low, high = (number(float(np.quantile(rms, q)), 3) for q in (0.5, _EDGES[1]))
+        low, high = (
+            number(float(np.quantile(rms, q, method="higher")), 3) for q in (0.5, _EDGES[1])
+        )
         rows.append(
             (name, kind, f"{low} {unit}", f"{high} {unit}", f"{stated[name].most:g} {unit}")
         )
@@ -264,7 +286,7 @@ def autopilot_files(run: Any) -> dict[str, str]:
     Both take rates in rad/s and give shares of full output, so inputs need `full_stick`.
     """
     settings = run.config.config.control
-    if not isinstance(run.controller, Cascade):
+    if not isinstance(run.controller, Cascade) or run.stable < _SHARE:
         return {}
     ardupilot, px4 = [], []
     for name, loops in run.controller.loops.items():
@@ -273,9 +295,14 @@ def autopilot_files(run: Any) -> dict[str, str]:
             continue
         # In SI, as the gains.
         full *= run.tuning.most[name] / settings.inputs[name].most
-        for loop in loops:
+        for i, loop in enumerate(loops):
             axis, _, rate = loop.signal.partition("_")
             if axis not in _ARDUPILOT or rate not in ("", "rate"):
+                continue
+            # Both have angle loops with one gain, around a rate loop.
+            if not rate and (loop.i is not None or loop is loops[-1]):
+                continue
+            if rate and i < len(loops) - 1:
                 continue
             scale = 1.0 / full if rate else 1.0
             terms = {"P": loop.p, "I": loop.i, "D": loop.d}
@@ -319,7 +346,8 @@ def _flight(run: Any) -> Chart:
 
 
 def _band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    low, high = np.quantile(np.nan_to_num(values), _EDGES, axis=0)
+    sound = values[np.isfinite(values).all(axis=1)]
+    low, high = np.quantile(sound if len(sound) else np.zeros_like(values), _EDGES, axis=0)
     return low, high
 
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,6 @@ from heli_jax.cli.commands import main
 from heli_jax.config.controller_file import read_controller
 from heli_jax.control.controller import signals_of
 from heli_jax.control.laws import content_of
-from heli_jax.control.loops import sampled_loop
 from heli_jax.control.posterior import draws, vehicles_of
 from heli_jax.control.regulators import lqr
 from heli_jax.control.tune import Scenario, Tuning, tune
@@ -21,6 +21,7 @@ from heli_jax.errors import InputError
 from heli_jax.identification.result import Estimate
 
 DT = 0.02
+CONFIGS = Path(__file__).parents[2] / "configs"
 CONFIG = """
 model: {linear: roll-flybarless}
 control:
@@ -115,6 +116,36 @@ control:
     assert not (tmp_path / "out" / "ardupilot.param").exists()  # no signal named roll
 
 
+def test_flights_that_diverge_are_a_doubt(tmp_path):
+    """Margins are those of small deviations."""
+    text = """
+model: helicopter
+vehicle: %s
+control:
+  law: lqr
+  rate: 50
+  max_steps: 0
+  duration: 6
+  signals:
+    x: {most: 0.1, unit: m, step: 40}
+    y: {most: 0.1, unit: m}
+    z: {most: 0.1, unit: m}
+    psi: {most: 10, unit: deg}
+  inputs:
+    x_roll: {most: 40, unit: mm}
+    x_pitch: {most: 40, unit: mm}
+    x_yaw: {most: 0.5}
+    x_collective: {most: 0.2}
+""" % (CONFIGS / "vehicles" / "x-cell-60.yaml")
+    assert run(tmp_path, text) == 4
+    content = json.loads((tmp_path / "out" / "control.json").read_text())
+    assert content["stable"] == 1.0
+    assert any("diverge" in words for words in content["doubts"])
+    moving = text.replace("duration: 6", "duration: 6\n  start: {forward_speed: 8}")
+    moving = moving.replace("step: 40", "step: 1")
+    assert run(tmp_path / "..", moving) == 2
+
+
 @pytest.mark.parametrize(
     ("change", "place"),
     [
@@ -126,6 +157,10 @@ control:
         (("gusts: {lat", "gusts: {wind_x"), "wind"),
         (("duration: 2", "duration: 0.01"), "duration"),
         (("rate: 50", "rate: 50\n  fit: nowhere"), "nowhere"),
+        (("rate: 50", "rate: 50\n  integral: [phi]"), "integral"),
+        (("rate: 50", "rate: 50\n  noise: {p: 0.1}"), "noise"),
+        (("law: lqr", "law: lqg\n  sensors: {p: {sd: 0.1}}"), "noise"),
+        (("most: 1.0", "most: 1.0, limit: 1.0"), "limit"),
     ],
 )
 def test_wrong_configurations_end_in_one_sentence(tmp_path, capsys, change, place):
@@ -158,9 +193,9 @@ def test_draws_have_the_intervals_and_the_correlation_of_the_fit():
     both = np.stack([np.log(found["a"] / 2.0), found["b"]])
     np.testing.assert_allclose(both.std(axis=1), [0.2, 0.5], rtol=0.03)
     assert np.corrcoef(both)[0, 1] == pytest.approx(0.8, abs=0.01)
-    unknown = estimate(1.0, None, None, None)
-    with pytest.raises(ValueError, match="not identifiable"):
-        draws(_Fitted({"a": unknown}, [[1.0]]), 10)
+    for unknown in (estimate(1.0, None, None, None), estimate(1.0, 0.1, None, None)):
+        with pytest.raises(ValueError, match="expected"):
+            draws(_Fitted({"a": unknown}, [[1.0]]), 10)
 
 
 @pytest.fixture(scope="module")
@@ -216,15 +251,13 @@ def test_tuning_keeps_the_bandwidth(tuning):
     def phases(controller):
         """Phases [deg] at the bandwidth, by closed-loop matrices in NumPy."""
         of = Tuning(model, vehicles, flights, controller, scenario, most)
-        found = []
-        for loop in range(6):
-            A, B, C, E, F, G = (
-                np.asarray(M[loop])
-                for M in jax.vmap(lambda p: sampled_loop(model, p, controller))(of.plants)
-            )
-            z = np.exp(1j * wanted * DT)
-            x = np.linalg.solve(z * np.eye(len(A)) - A - B @ C, E + B @ F)
-            found.append(np.angle((G @ x)[signals_of(model).index("phi"), 0], deg=True))
+        gains = controller.gains["lat"]
+        k = np.array([[float(gains.get(n, 0.0)) for n in signals_of(model)]])
+        row, z, found = signals_of(model).index("phi"), np.exp(1j * wanted * DT), []
+        for i in range(6):
+            A, B, C, *_ = (np.asarray(M[i]) for M in of.plants)
+            x = np.linalg.solve(z * np.eye(len(A)) - A + B @ k @ C, B * k[0, row])
+            found.append(np.angle((C @ x)[row, 0], deg=True))
         return np.array(found)
 
     found = tune(

@@ -33,7 +33,17 @@ from heli_jax.control.controller import (
     with_gains,
 )
 from heli_jax.control.laws import Cascade, Loop, StateFeedback
-from heli_jax.control.loops import growth, loop_margins, plant_of, response, sampled_loop
+from heli_jax.control.loops import (
+    SampledLoop,
+    controller_responses,
+    growth,
+    linear_step,
+    loop_margins,
+    plant_of,
+    plant_responses,
+    sampled_loop,
+    sensitivity,
+)
 from heli_jax.control.posterior import SteadyFlights
 from heli_jax.control.regulators import lqg, lqr, pid
 from heli_jax.dynamics.helicopter import helicopter
@@ -136,6 +146,27 @@ def test_lqr_gains_solve_the_riccati_equation(r50):
     K = np.linalg.solve(R, B.T @ scipy.linalg.solve_continuous_are(A, B, Q, R))
     ours = np.array([[float(law.gains[n][s]) for s in states] for n in inputs])
     np.testing.assert_allclose(ours, K, rtol=1e-8, atol=1e-10)
+
+
+def test_a_set_point_of_an_output_is_that_of_its_state():
+    model = helicopter()
+    params = load_vehicle("configs/vehicles/x-cell-60.yaml")
+    most = {"phi": 0.2, "theta": 0.2, "psi": 0.3, "x_roll": 4e-3, "x_pitch": 4e-3, "x_yaw": 0.5}
+    by_state = lqr(
+        model, params, hover := trim(model, params), most=most, dt=DT, references=("phi",)
+    )
+    by_output = lqr(model, params, hover, most=most, dt=DT, references=("roll",))
+    assert by_output.gains["x_roll"]["roll"] == by_state.gains["x_roll"]["phi"]
+    with pytest.raises(ValueError, match="state"):
+        lqr(model, params, hover, most=most, dt=DT, references=("x",))
+
+
+def test_a_slow_growth_beside_a_pole_near_half_the_sample_rate():
+    loop = SampledLoop(
+        *(np.array([M]) for M in (np.diag([1.004, -0.9998]), [[0.0], [1.0]], [[0.0, -1e-3]]))
+    )  # fmt: skip
+    (found,) = loop_margins(loop, DT)
+    assert not found.stable[0]
 
 
 def test_an_integral_removes_the_steady_error(r50):
@@ -312,8 +343,19 @@ def test_loops_of_a_cascade_cross_where_they_should(r50):
     closed = np.asarray(loop.A + loop.B @ loop.C)
     assert np.max(np.abs(np.linalg.eigvals(closed))) < 1.02  # the speeds are not controlled
     row = [*states].index("phi")
-    H = response(loop, DT, np.array([0.5, 20.0]), of=row, to=0, set_point=True)
+    omega = np.array([0.5, 20.0])
+    P = plant_responses(model, plant, law, DT, omega)
+    K, R = controller_responses(linear_step(model, plant, law), DT, omega)
+    H = np.asarray(P @ sensitivity(K, P) @ R)[:, row, 0]
     assert abs(H[0]) > 3 * abs(H[1])
+    b = Bd[:, [naming.names(model.Inputs).index(n) for n in wanted]]
+    k = np.zeros((2, len(A)))
+    for i, (angle, of_angle) in enumerate(by for by in law.loops.values()):
+        k[i, states.index(angle.signal)] = float(of_angle.p) * float(angle.p)
+        k[i, states.index(of_angle.signal)] = float(of_angle.p)
+    z = np.exp(1j * omega[0] * DT)
+    x = np.linalg.solve(z * np.eye(len(A)) - Ad + b @ k, b[:, 0] * k[0, row])
+    assert H[0] == pytest.approx(x[row], rel=1e-8)
 
 
 def test_gains_are_parameters_that_a_fit_estimates(roll):
