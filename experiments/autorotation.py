@@ -8,8 +8,11 @@ energy lands, with a first guess of its gains, after tuning, and with the gains 
 FOLDER has the figures landings.png and height-velocity.png.
 """
 
+import os
 from pathlib import Path
 from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads wait for each other in small matrices
 
 import jax
 import jax.numpy as jnp
@@ -84,7 +87,7 @@ def optimum(model: Any, params: Any, height: float) -> Any:
     S, K, M = ar.Grid()
     whole = ar.LandingProblem(model, params, entry, ar.Limits(), ar.CALM, ar.Grid(1, S * K, M))
     start = ar.fly(model, params, FIRST_GUESS, entry.state, ar.calm(model, 30.0))
-    _, single = whole.minimised(whole.sampled(start), 400)
+    _, single = whole.minimised(whole.sampled(start), 3000)
     end = jax.tree.map(lambda v: float(v[-1]), landing.trajectory.states)
     print(
         f"{height:g} m: {landing.message}, {landing.steps} steps, converged {landing.converged}\n"

@@ -547,7 +547,7 @@ def _segments(
 
 def land(
     model: Model, params: Any, entry: Trim, limits: Limits = Limits(), *, wind: Wind = CALM,
-    start: Trajectory | None = None, grid: Grid = Grid(), max_steps: int = 300,
+    start: Trajectory | None = None, grid: Grid = Grid(), max_steps: int = 2000,
 ) -> Landing:  # fmt: skip
     """Find the collective and longitudinal cyclic with the gentlest touchdown, by SciPy's SLSQP.
 
