@@ -58,6 +58,8 @@ _LATE = 0.75 * np.pi
 """Lag of a response at its bandwidth [rad]."""
 _MOVING = 1e-4
 """Rate at which a signal moves in steady flight [largest acceptable deviation a second]."""
+_TOLERANCE = 1e-5
+"""Relative change of the cost in a step at which a round of the tuning ends."""
 _WIDEST = 3.0
 """Largest change of a gain's logarithm."""
 
@@ -170,7 +172,7 @@ def tune(
         return found
 
     bounds = [(-_WIDEST, _WIDEST)] * moved.size
-    found = minimise(told, np.zeros(moved.size), limits.size, bounds, max_steps)
+    found = minimise(told, np.zeros(moved.size), limits.size, bounds, max_steps, _TOLERANCE)
     made = with_gains(controller, gains(jnp.asarray(found.x)))
     before, after = problem.judged(controller), problem.judged(made)
     if after[1] < before[1]:

@@ -33,6 +33,7 @@ def minimise(
     limits: int,
     bounds: Sequence[tuple[float, float]],
     max_steps: int,
+    tolerance: float = 1e-7,
 ) -> Minimum:
     """Return the minimum with no excess.
 
@@ -42,6 +43,7 @@ def minimise(
         limits: number of limits.
         bounds: lowest and highest value of each x.
         max_steps: most steps of all rounds.
+        tolerance: relative change of the function in a step at which a round ends.
     """
     from scipy.optimize import minimize  # commands that do not search need not wait for it
 
@@ -59,7 +61,7 @@ def minimise(
             jac=True,
             method="L-BFGS-B",
             bounds=bounds,
-            options={"maxiter": max_steps - steps, "ftol": 1e-5, "gtol": 1e-4},
+            options={"maxiter": max_steps - steps, "ftol": tolerance, "gtol": 10.0 * tolerance},
         )
         x, steps = found.x, steps + int(found.nit)
         if not limits:
