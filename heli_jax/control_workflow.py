@@ -148,6 +148,11 @@ def _numbers(
     require_known(settings.inputs, tuple(known), f"{where}.inputs", f"{words} input")
     require_known(settings.signals, tuple(signals), f"{where}.signals", f"{words} signal")
     require_known(settings.gusts, tuple(known), f"{where}.gusts", f"{words} input")
+    require_known(settings.integral, tuple(signals), f"{where}.integral", f"{words} signal")
+    drawn = (*known, *naming.names(model.State))
+    require_known(settings.noise, drawn, f"{where}.noise", f"{words} input or state")
+    for name, by in settings.loops.items():
+        require_known(by, tuple(signals), f"{where}.loops.{name}", f"{words} signal")
     most, integral, limits, steps = {}, {}, {}, {}
     stated: list[tuple[str, AcceptableConfig, type, str]] = [
         *((n, one, signals[n], f"{where}.signals.{n}") for n, one in settings.signals.items()),
