@@ -19,7 +19,13 @@ from heli_jax.config import (
 )
 from heli_jax.control.pilot import Pilot, attitude_hold
 from heli_jax.dynamics.check_model import cannot_start
-from heli_jax.dynamics.model import Model, require_constants, require_linear, zeros
+from heli_jax.dynamics.model import (
+    Model,
+    require_constants,
+    require_linear,
+    require_sample_time,
+    zeros,
+)
 from heli_jax.errors import InputError, located, require_known
 from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
@@ -293,6 +299,8 @@ def _run(
     inputs = model.Inputs(**{k: jnp.asarray(v) for k, v in driven.items()})
     # jit covers the whole run. Otherwise `simulate` would execute outputs and limits operation by
     # operation. Key and rate are constants of this program.
+    with located(f"{where}.rate"):
+        require_sample_time(model, 1.0 / settings.rate)
     run = jax.device_get(jax.jit(fly)(params, inputs, start, pilot))
     # Times are float64 in any precision of the run, so that they equal k/rate, as in a log.
     run = run._replace(times=np.arange(n) / settings.rate)
@@ -303,6 +311,11 @@ def _run(
 
 def _check_full_nonlinear(experiment: Experiment, settings: SimulateConfig, where: str) -> None:
     if is_full_nonlinear(experiment.model):
+        if settings.hold_attitude and experiment.model.sampled is not None:
+            raise InputError(
+                f"{where}.hold_attitude: expected a model without controller, which holds the "
+                "attitude already"
+            )
         late = [n for n, _ in experiment.model.delays]
         if settings.hold_attitude and late:
             raise InputError(

@@ -10,9 +10,11 @@ if TYPE_CHECKING:
 
 def print_control(run: "ControlRun", *, verbose: bool = False) -> None:
     """Print the share of stable vehicles, margins, the flight, and doubts."""
-    from heli_jax.report.control import doubts, flight_table, margins_table, summary
+    from heli_jax.report.control import doubts, flight_table, margins_table, summary, tuning
 
     print_text(summary(run))
+    if words := tuning(run):
+        print_text(words)
     print_page_table(margins_table(run))
     if verbose:
         print_page_table(flight_table(run))

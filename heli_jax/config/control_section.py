@@ -33,7 +33,7 @@ class GustConfig(Section):
     """Random change of an input, a first-order process."""
 
     sd: Positive
-    """standard deviation [SI]"""
+    """standard deviation [SI unit of the input, m/s for wind]"""
     tau: Positive = 1.0
     """correlation time [s]"""
 
@@ -59,8 +59,8 @@ class ControlConfig(Section):
     """signals with the sd of the white noise in what the controller reads; lqg: the measured
     outputs"""
     noise: dict[str, Positive] = {}
-    """lqg: square root of the spectral density of white noise [SI times sqrt(s)] at inputs, or of
-    the rates of states"""
+    """lqg: square root of the spectral density of white noise at inputs, or of the rates of states
+    [SI times sqrt(s)]: dx: 0.3 is an acceleration of 0.3 m/s^2 sqrt(s)"""
     start: StartConfig = StartConfig()
     """steady flight of the full helicopter"""
     gusts: dict[str, GustConfig] = {}
@@ -75,8 +75,8 @@ class ControlConfig(Section):
     vehicles: Annotated[int, Field(ge=1, le=1000)] = 16
     """vehicles for which the gains are tuned"""
     distance: Annotated[float, Field(ge=0, lt=1)] = 0.5
-    """least distance of every loop from -1: 0.5 is a gain margin of 6 dB and a phase margin of 29
-    deg"""
+    """least distance of every loop from -1: 0.5 is a gain margin of 6 dB upwards and 3.5 dB
+    downwards, and a phase margin of 29 deg"""
     max_steps: Annotated[int, Field(ge=0)] = 200
     """most steps of the tuning; 0: no tuning"""
     seed: Annotated[int, Field(ge=0)] = 0
@@ -97,18 +97,20 @@ class ControlConfig(Section):
         for key in (k for k, given in unused.items() if given):
             raise ValueError(f"{key}: not for law: {self.law}, expected none")
         for name, one in {**self.signals, **self.inputs}.items():
-            if one.full_stick is not None and self.law != "pid":
-                raise ValueError(f"inputs.{name}.full_stick: expected with law: pid alone")
+            if one.full_stick is not None and (self.law != "pid" or name in self.signals):
+                raise ValueError(f"{name}.full_stick: expected of an input with law: pid alone")
             if one.limit is not None and self.law != "pid" and name in self.signals:
                 raise ValueError(f"signals.{name}.limit: expected with law: pid alone")
-        if (self.law == "pid") != bool(self.loops):
+        if self.law == "pid" and not self.loops:
+            raise ValueError("loops: missing, law: pid needs them")
+        if self.law != "pid" and self.loops:
             raise ValueError(f"loops: expected with law: pid alone, got law: {self.law}")
         for key in ("sensors", "noise") if self.law == "lqg" else ():
             if not getattr(self, key):
                 raise ValueError(f"{key}: expected with law: lqg, got none")
         for name, one in self.signals.items():
             if one.bandwidth is not None and one.step is None:
-                raise ValueError(f"signals.{name}.step: expected with bandwidth, got none")
+                raise ValueError(f"signals.{name}.step: missing, bandwidth needs a set point")
         for name in set(self.loops) ^ set(self.inputs) if self.loops else ():
             raise ValueError(f"loops: expected the same names as inputs, got {name!r} in one")
         return self

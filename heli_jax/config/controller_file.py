@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 import jax.numpy as jnp
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
+from heli_jax.config.section import Finite, Positive
 from heli_jax.control.controller import Controller
 from heli_jax.control.laws import Cascade, Loop, Observer, StateFeedback
 from heli_jax.errors import InputError
@@ -13,9 +14,8 @@ from heli_jax.regular_file import read_regular
 
 _LARGEST = 10_000_000
 """Largest size of a file [bytes]."""
-_Number = Annotated[float, Field(allow_inf_nan=False)]
-_Table = dict[str, dict[str, _Number]]
-_Numbers = dict[str, _Number]
+_Table = dict[str, dict[str, Finite]]
+_Numbers = dict[str, Finite]
 
 
 class _Part(BaseModel):
@@ -26,7 +26,7 @@ class _StateFeedback(_Part):
     law: Literal["StateFeedback"]
     gains: _Table
     integral: _Table
-    dt: _Number
+    dt: Positive
     references: tuple[str, ...]
     about: _Numbers
     limits: _Numbers
@@ -35,11 +35,11 @@ class _StateFeedback(_Part):
 class _Observer(_Part):
     law: Literal["Observer"]
     gains: _Table
-    A: list[list[_Number]]
-    B: list[list[_Number]]
-    C: list[list[_Number]]
-    M: list[list[_Number]]
-    dt: _Number
+    A: list[list[Finite]]
+    B: list[list[Finite]]
+    C: list[list[Finite]]
+    M: list[list[Finite]]
+    dt: Positive
     references: tuple[str, ...]
     place: dict[str, str]
     about: _Numbers
@@ -49,18 +49,18 @@ class _Observer(_Part):
 
 
 class _Loop(_Part):
-    p: _Number
-    i: _Number | None
-    d: _Number | None
+    p: Finite
+    i: Finite | None
+    d: Finite | None
     signal: str
-    limit: _Number | None
-    lag: _Number
+    limit: Finite | None
+    lag: Finite
 
 
 class _Cascade(_Part):
     law: Literal["Cascade"]
     loops: dict[str, tuple[_Loop, ...]]
-    dt: _Number
+    dt: Positive
     references: tuple[str, ...]
     about: _Numbers
 
@@ -86,7 +86,8 @@ def read_controller(path: str | Path) -> Controller:
     except ValidationError as e:
         first = e.errors(include_url=False)[0]
         place = ".".join(map(str, first["loc"])) or "the file"
-        raise InputError(f"{path}: {place}: {first['msg']}") from None
+        got = f", got {first['input']!r:.60}" if first["loc"] else ""
+        raise InputError(f"{path}: {place}: {first['msg']}{got}") from None
     fields: dict[str, Any] = {
         n: jnp.asarray(v, float) if n in ("A", "B", "C", "M") else v for n, v in read if n != "law"
     }

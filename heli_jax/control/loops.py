@@ -193,7 +193,7 @@ _GROWS = 1e-5
 """
 
 
-def frequencies(dt: float, count: int = 240, lowest: float = 0.1) -> np.ndarray:
+def frequencies(dt: float, count: int = 300, lowest: float = 0.003) -> np.ndarray:
     """Return a grid of frequencies up to half the sample rate [rad/s]."""
     return np.geomspace(lowest, 0.98 * np.pi / dt, count)
 

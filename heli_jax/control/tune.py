@@ -1,6 +1,7 @@
 """Gains tuned by gradients through the nonlinear closed loop, for many vehicles at once."""
 
 import functools
+import itertools
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -58,6 +59,8 @@ _LATE = 0.75 * np.pi
 """Lag of a response at its bandwidth [rad]."""
 _MOVING = 1e-4
 """Rate at which a signal moves in steady flight [largest acceptable deviation a second]."""
+_SHOWN = 25
+"""Evaluations between two messages of progress."""
 _TOLERANCE = 1e-5
 """Relative change of the cost in a step at which a round of the tuning ends."""
 _WIDEST = 3.0
@@ -130,7 +133,8 @@ def tune(
     The cost is the mean over the vehicles of $\log(1 + \overline{\sum_j (e_j/m_j)^2 + \sum_i
     (u_i/m_i)^2})$ of the nonlinear closed loop, so that a diverging vehicle counts without drowning
     the others. Gains keep their signs. $|1 + L| \ge$ `distance` holds at every command, frequency
-    and vehicle: a gain margin of $-20\log_{10}(1-d)$ dB and a phase margin of $2\arcsin(d/2)$.
+    and vehicle: gain margins of $-20\log_{10}(1-d)$ dB upwards and $20\log_{10}(1+d)$ dB
+    downwards, and a phase margin of $2\arcsin(d/2)$.
 
     Args:
         vehicles: the model's Params with arrays (k,), such as draws of a posterior. All start in
@@ -166,9 +170,12 @@ def tune(
         excess = jnp.asarray(limits) - problem.distances(gains(z))
         return lagrangian(problem.cost(gains(z)), excess, multipliers, penalty), excess
 
+    tries = itertools.count()
+
     def told(*arguments: Any) -> Any:
         found = augmented(*arguments)
-        progress(f"cost with limits {float(found[0][0]):.4g}")
+        if next(tries) % _SHOWN == 0:
+            progress(f"tuning: cost with limits {float(found[0][0]):.4g}")
         return found
 
     bounds = [(-_WIDEST, _WIDEST)] * moved.size

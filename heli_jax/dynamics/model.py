@@ -384,6 +384,19 @@ def require_constants(model: Model, params: Record, given: Collection[str] = ())
         raise VehicleError(f"{', '.join(missing)} missing, model {model.name} needs {it}")
 
 
+def require_sample_time(model: Model, dt: Any, where: str = "dt") -> None:
+    """Refuse a sample time [s] at which the model's controller does not act.
+
+    Raises:
+        ValueError: with both times.
+    """
+    if model.sampled is not None and not np.allclose(dt, model.sampled.dt, rtol=1e-6, atol=0.0):
+        raise ValueError(
+            f"{where}: expected a sample time of {model.sampled.dt:g} s, that of the controller, "
+            f"got {float(np.ravel(dt)[0]):g} s"
+        )
+
+
 def reads(model: Model, params: Record, name: str) -> bool:
     """True if rates or outputs depend on a parameter (states and inputs one), or it is a delay.
 
@@ -425,4 +438,6 @@ def _at_one(model: Model, params: Record, name: str, value: float) -> np.ndarray
     u = model.Inputs(**dict.fromkeys(naming.names(model.Inputs), one))
     with np.errstate(all="ignore"):
         parts = field_and_output(model, filled, x, u)
+        if model.sampled is not None:
+            parts = (*parts, model.sampled.update(filled, x, u))
     return np.array([float(v) for v in jax.tree.leaves(parts)])

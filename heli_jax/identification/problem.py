@@ -13,7 +13,12 @@ from heli_jax import naming
 from heli_jax.analysis.spectra import ResponseOptions
 from heli_jax.dynamics.check_model import cannot_start, check_model, check_params
 from heli_jax.dynamics.disturbance import disturbances_of, sensor_noise
-from heli_jax.dynamics.model import Model, require_constants, require_linear
+from heli_jax.dynamics.model import (
+    Model,
+    require_constants,
+    require_linear,
+    require_sample_time,
+)
 from heli_jax.errors import VehicleError, nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.defaults import filtered_noise, offset_inputs
@@ -402,7 +407,7 @@ def _check_flight(flight: Flight, problem: Problem) -> None:
 def _check_model(problem: Problem) -> None:
     params, model = problem.start_params(), problem.model
     if model.sampled is not None:
-        _check_controller(problem, model.sampled.dt)
+        _check_controller(problem)
     for flight in problem.flights:
         # A flight's known parameters may complete the vehicle.
         own = naming.replace(params, **flight.known)
@@ -415,18 +420,14 @@ def _check_model(problem: Problem) -> None:
     require_linear(model, params)
 
 
-def _check_controller(problem: Problem, dt: float) -> None:
+def _check_controller(problem: Problem) -> None:
     """Raise if a fit of a closed loop has another method than output error, or another rate."""
     if problem.noise_model != "white":
         raise ValueError(
             f"method: expected output-error for a model with a controller, got {problem.method}"
         )
     for flight in problem.flights:
-        if not math.isclose(flight.dt, dt, rel_tol=1e-6):
-            raise ValueError(
-                f"flight {flight.name}: expected a sample time of {dt:g} s, that of the "
-                f"controller, got {flight.dt:g} s"
-            )
+        require_sample_time(problem.model, flight.dt, f"flight {flight.name}")
 
 
 def _check_free(name: str, free: Free, model: Model) -> None:

@@ -15,11 +15,20 @@ from heli_jax.control.controller import gains_of
 from heli_jax.control.laws import Cascade, StateFeedback, content_of
 from heli_jax.numbers import number, percent
 from heli_jax.report import style
-from heli_jax.report.charts import Chart, Numbers, Panel, Series, band, panel, time_limits
+from heli_jax.report.charts import (
+    Chart,
+    Numbers,
+    Panel,
+    Series,
+    band,
+    described,
+    panel,
+    time_limits,
+)
 from heli_jax.report.figures.bode import phase
 from heli_jax.report.files import as_json
 from heli_jax.report.origin import origin
-from heli_jax.report.page import filled, picture
+from heli_jax.report.page import filled, of_file, picture
 from heli_jax.report.style import label
 from heli_jax.report.tables import Table
 from heli_jax.simulation.trajectory import STATUS
@@ -30,6 +39,8 @@ _FILES = ("control.json", "gains.csv")
 _SHARE = 0.99
 """Share of stable vehicles below which there is a doubt."""
 _OUTSIDE = STATUS.index("outside the model's range")
+_LOWEST = 0.1
+"""Lowest frequency of Bode charts [rad/s]."""
 _EDGES = (0.05, 0.95)
 """Quantiles of bands and tables."""
 
@@ -45,14 +56,28 @@ def summary(run: Any) -> str:
         words = f"{percent(run.stable, 1)} of {count} vehicles of the posterior are stable."
     if run.stable <= 1.0 - _EDGES[0]:
         return words
-    # Of each vehicle's worst loop.
-    gain, phase_margin = (
-        _quantile(np.min([getattr(m, kind) for m in run.margins], axis=0), _EDGES[0], run.lost)
-        for kind in ("gain", "phase")
+    least = []
+    for kind, unit in (("gain", "dB"), ("phase", "deg")):
+        # Of each vehicle's worst loop.
+        values = np.array([getattr(m, kind) for m in run.margins])
+        worst = run.commands[int(np.argmin(np.nanmedian(values, axis=1)))]
+        size = _quantile(np.min(values, axis=0), _EDGES[0], run.lost)
+        least.append(f"{kind} margin {number(size, 3)} {unit} ({worst})")
+    often = "" if alone else "; 95 % of the vehicles have more"
+    return f"{words} Least {' and '.join(least)}{often}."
+
+
+def tuning(run: Any) -> str:
+    """Return the effect of the tuning in a sentence; empty without one."""
+    if run.tuned is None:
+        return ""
+    cost, distance = run.tuned.cost, run.tuned.distance
+    count = min(run.config.config.control.vehicles, len(run.margins[0].stable))
+    vehicles = "one vehicle" if count == 1 else f"{count} vehicles"
+    return (
+        f"Tuned for {vehicles}: cost from {number(cost[0], 3)} to {number(cost[1], 3)}, least "
+        f"distance of a loop from -1 from {number(distance[0], 3)} to {number(distance[1], 3)}."
     )
-    often = "" if alone else " in 95 % of the vehicles"
-    words += f" All loops have a gain margin of at least {number(gain, 3)} dB{often}, and a phase "
-    return f"{words}margin of at least {number(phase_margin, 3)} deg{often}."
 
 
 def doubts(run: Any) -> list[str]:
@@ -71,9 +96,15 @@ def doubts(run: Any) -> list[str]:
                 "of small deviations: smaller steps and gusts, or limits of the commands."
             )
     if tuned is not None and not tuned.converged:
+        wanted = run.config.config.control.distance
+        reason = (
+            f"keeps a distance of {number(tuned.distance[1], 3)} from -1 instead of {wanted:g}"
+            if tuned.distance[1] < wanted - 0.02
+            else "did not converge, or does not keep a bandwidth"
+        )
         found.append(
-            "The tuning did not converge with control.distance kept: a larger control.max_steps, "
-            "or gentler weights."
+            f"The tuning {reason}: a larger control.max_steps, smaller control.distance or "
+            "bandwidth, or gentler weights."
         )
     if run.lost:
         found.append(f"{run.lost} vehicles have no such steady flight, and count as unstable.")
@@ -95,8 +126,8 @@ def doubts(run: Any) -> list[str]:
         ]
         if hidden:
             found.append(
-                f"The regulator reads the true states {', '.join(hidden)}, which no output shows: "
-                "law: lqg estimates them."
+                f"No output measures {', '.join(hidden)}, so this law cannot fly as it is: law: "
+                "lqg estimates them."
             )
     return found
 
@@ -118,7 +149,7 @@ def _unstable(run: Any) -> str:
     rate = np.log(np.abs(size[k])) / run.controller.dt
     return (
         f"One grows at {number(float(rate), 2)} 1/s, mostly in {names[int(np.argmax(share))]}: "
-        "feed this state back, or use gentler weights or a larger control.distance."
+        "expected feedback of this state, gentler weights or slower loops, or a higher rate."
     )
 
 
@@ -165,7 +196,7 @@ def flight_table(run: Any) -> Table:
         rows.append(
             (name, kind, f"{low} {unit}", f"{high} {unit}", f"{stated[name].most:g} {unit}")
         )
-    return Table(("signal", "", "rms, median", "rms, 95 %", "acceptable"), rows)
+    return Table(("signal", "", "rms, median", "rms, 95 %", "most"), rows)
 
 
 def handling_table(run: Any) -> Table:
@@ -219,13 +250,17 @@ def write_control(folder: Path, run: Any, config: str) -> None:
     )
     responses = run.tuning.responses(run.controller)
     for i, name in enumerate(run.commands):
-        for kind, draw in (("bode", _bode), ("nichols", _nichols)):
-            made = functools.partial(draw, run, responses[:, i], name)
-            pictures.append(picture(f"{kind}-{name}", made, numbers, folder=folder / "figures"))
+        made = functools.partial(_bode, run, responses[:, i], name)
+        pictures.append(picture(f"bode-{name}", made, numbers, folder=folder / "figures"))
+        # An image, since charts of pages need rising x.
+        chart, file = _nichols(responses[:, i], name), folder / "figures" / f"nichols-{name}"
+        style.save(lambda chart=chart: chart, file)
+        pictures.append(of_file(file.with_suffix(".png"), chart.title, described(chart)))
     page = filled(
         "control.html.j2",
         title=run.config.path.stem,
         summary=summary(run),
+        tuning=tuning(run),
         doubts=doubts(run),
         margins=margins_table(run),
         handling=handling_table(run),
@@ -353,8 +388,9 @@ def _band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _bode(run: Any, L: np.ndarray, name: str) -> Chart:
     """Draw size and phase of a loop, opened at a command."""
-    hz, size = run.tuning.omega / (2.0 * np.pi), 20.0 * np.log10(np.abs(L))
-    turns = np.stack([phase(row) for row in L])
+    shown = run.tuning.omega >= _LOWEST
+    hz, size = run.tuning.omega[shown] / (2.0 * np.pi), 20.0 * np.log10(np.abs(L[:, shown]))
+    turns = np.stack([phase(row) for row in L[:, shown]])
     panels = [
         panel(text, [band(hz, *_band(v), style.BLUE), Series("", hz, v[0], style.BLACK)], 1.2,
               levels=levels)
@@ -364,7 +400,7 @@ def _bode(run: Any, L: np.ndarray, name: str) -> Chart:
     return Chart(title, "frequency [Hz]", (float(hz[0]), float(hz[-1])), tuple(panels), "", True)
 
 
-def _nichols(run: Any, L: np.ndarray, name: str) -> Chart:
+def _nichols(L: np.ndarray, name: str) -> Chart:
     """Draw size over phase of a loop, for the estimates and some vehicles."""
     lines: list[Series] = []
     for k in range(min(len(L), 20) - 1, -1, -1):
@@ -372,4 +408,6 @@ def _nichols(run: Any, L: np.ndarray, name: str) -> Chart:
         lines.append(Series("", phase(L[k]), 20.0 * np.log10(np.abs(L[k])), color, width=width))
     point = Series("-1", np.array([-180.0]), np.zeros(1), style.VERMILLION, "points", width=5.0)
     shown = panel("|L| [dB]", [*lines, point], 2.6, limits=(-40.0, 40.0), levels=(0.0,))
-    return Chart(f"Nichols chart, loop opened at {name}", "phase [deg]", (-360.0, 0.0), (shown,))
+    words = "Black: the vehicle of the estimates. Blue: other vehicles."
+    title = f"Nichols chart, loop opened at {name}"
+    return Chart(title, "phase [deg]", (-360.0, 0.0), (shown,), words)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PyTree
 
 from heli_jax import naming
 from heli_jax.dynamics.check_model import check_params
-from heli_jax.dynamics.model import Model
+from heli_jax.dynamics.model import Model, require_sample_time
 from heli_jax.naming import Number, Record
 from heli_jax.simulation.blocks import columns
 from heli_jax.simulation.discretize import discretize
@@ -171,22 +171,10 @@ def per_sample(
         method = Adaptive(method.solver, 1, controller, adjoint, options.max_steps, linear=linear)
     if model.sampled is not None:
         # A traced time cannot be compared: a Problem has compared it.
-        _check_sample_time(model.sampled.dt, options.dt)
+        if not isinstance(options.dt, core.Tracer):
+            require_sample_time(model, options.dt)
         method = AtSamples(method, model.sampled, linear)
     return method, args, term
-
-
-def _check_sample_time(controller: float, dt: Number) -> None:
-    """Raise if the controller of a model acts at another sample time than the simulation.
-
-    Raises:
-        ValueError: with both times.
-    """
-    if not isinstance(dt, core.Tracer) and not np.allclose(dt, controller, rtol=1e-6, atol=0.0):
-        raise ValueError(
-            f"dt: the controller acts every {controller:g} s, expected the same sample time, got "
-            f"{float(np.ravel(dt)[0]):g} s"
-        )
 
 
 class _Field(eqx.Module):

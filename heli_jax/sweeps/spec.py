@@ -17,6 +17,7 @@ from heli_jax.dynamics.model import (
     require_constants,
     require_continuous,
     require_linear,
+    require_sample_time,
 )
 from heli_jax.errors import nearest, require_kind
 from heli_jax.flights.flight import Flight
@@ -204,6 +205,8 @@ def job(
     _check_inputs(model, flights)
     _check_results(model, design, reduce, flights, options.trajectories)
     _check_precision(model, options.precision)
+    for flight in flights:
+        require_sample_time(model, flight.dt)
     # The exact step of a linear model leaves no solver error in the results.
     solver = options.solver or ("exact" if model.linear else "rk4")
     if solver == "exact" and not model.linear:

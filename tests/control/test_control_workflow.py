@@ -95,6 +95,9 @@ fit:
     e = found.fit.estimates["Lb"]
     assert found.fit.status == "converged"
     assert abs(e.value - 100.0) < 4.0 * e.sd < 10.0
+    config.write_text(LOOP.replace("rate: 50", "rate: 100"))
+    assert main(["simulate", str(config), "--out", str(tmp_path / "b.csv"), "--quiet"]) == 2
+    config.write_text(fitted)
     (tmp_path / "out" / "control.json").write_text('{"controller": {"law": "Cascade"}}')
     with pytest.raises(InputError, match=r"control\.json"):
         run_fit(config)

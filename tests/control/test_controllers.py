@@ -466,6 +466,9 @@ def test_gains_are_axes_of_sweeps(roll, backend):
     np.testing.assert_allclose(swept["end"].values, wanted, rtol=1e-9)
     with pytest.raises(ValueError, match="controller"):
         sweep(closed, p, flight, grid({axis: gains}), {"modes": Reduce("modes")})
+    slow = Flight(2 * DT, given, flight.outputs, sd=flight.sd)
+    with pytest.raises(ValueError, match="controller"):
+        sweep(closed, p, slow, grid({axis: gains}), {"end": Reduce("final", "phi")})
 
 
 class Bad(Controller):
