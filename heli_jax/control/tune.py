@@ -51,8 +51,8 @@ from heli_jax.simulation.simulate import simulate, substeps_for
 _SHARP = 100.0
 """Sharpness of the smooth minimum of |1 + L| over frequencies."""
 _CONTROLLED, _DRIFTING = -0.02, 0.05
-"""Largest growth of a closed loop that is tuned [1/s]: of one whose modes all decay, and of one
-with positions or headings that drift."""
+"""Growth of the law's loop below which all its modes decay, and largest growth of a tuned loop with
+positions or headings that drift [1/s]."""
 _DIVERGED = 1e12
 """Square of a deviation over its largest acceptable value that counts as diverged."""
 _LATE = 0.75 * np.pi
@@ -252,7 +252,7 @@ class Tuning:
             inputs, **{n: getattr(inputs, n) + jnp.asarray(v) for n, v in changed.items()}
         )
         self.omega = np.unique([*frequencies(self.dt), *self.bandwidth.values()])
-        # Does not depend on the gains.
+        # These do not depend on the gains.
         self.responding = jax.jit(
             jax.vmap(lambda p: plant_responses(model, p, controller, self.dt, self.omega))
         )(self.plants)
