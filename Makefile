@@ -32,7 +32,7 @@ test: .venv/.installed
 	$(BIN)/ruff format --check .
 	$(BIN)/codespell
 	@$(BIN)/pyright & types=$$!; \
-	$(BIN)/python -m pytest -n 2 --dist worksteal; tests=$$?; \
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal; tests=$$?; \
 	wait $$types && exit $$tests
 
 docs: .venv/.installed

@@ -46,6 +46,7 @@ def test_the_feedback_lands_and_no_energy_appears(params, flight):
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_the_programme_has_the_derivatives_of_finite_differences(model, params, entry, flight):
     problem = ar.LandingProblem(model, params, entry, ar.Limits(), ar.CALM, GRID)
     rng = np.random.default_rng(0)

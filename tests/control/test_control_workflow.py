@@ -119,6 +119,7 @@ control:
     assert not (tmp_path / "out" / "ardupilot.param").exists()  # no signal named roll
 
 
+@pytest.mark.slow
 def test_flights_that_diverge_are_a_doubt(tmp_path):
     """Margins are those of small deviations."""
     text = """

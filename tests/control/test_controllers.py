@@ -148,6 +148,7 @@ def test_lqr_gains_solve_the_riccati_equation(r50):
     np.testing.assert_allclose(ours, K, rtol=1e-8, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_set_point_of_an_output_is_that_of_its_state():
     model = helicopter()
     params = load_vehicle("configs/vehicles/x-cell-60.yaml")
@@ -406,6 +407,7 @@ def test_noise_of_a_sensor_acts_as_the_opposite_set_point(roll):
         with_controller(model, law, noise=("nothing",))
 
 
+@pytest.mark.slow
 def test_a_closed_loop_is_steady_in_the_trim_of_its_helicopter(helicopter_with_hold):
     closed, params = helicopter_with_hold
     at = trim(closed, params, Condition(forward_speed=3.0))
