@@ -94,6 +94,7 @@ def gaussian_moments(theta, u, n, dt, delay):
     return rates_of((d, M, delay), u, dt), S + sd**2 * np.eye(n)
 
 
+@pytest.mark.slow
 def test_a_delay_is_applied_once_with_gusts(tmp_path):
     n, dt, delay = 100, 0.04, 0.12
     of = late(tmp_path, delay, ["d", "M"], "filter-error", n)

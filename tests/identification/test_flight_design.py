@@ -91,7 +91,9 @@ def test_a_prior_is_not_repeated():
     assert found.needed(best, {"k": 0.005}) == np.inf
 
 
-@pytest.mark.parametrize("method", ["output-error", "filter-error"])
+@pytest.mark.parametrize(
+    "method", ["output-error", pytest.param("filter-error", marks=pytest.mark.slow)]
+)
 def test_gradient_against_differences(method):
     of = problem()
     if method == "filter-error":
