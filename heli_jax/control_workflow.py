@@ -14,6 +14,7 @@ from heli_jax.analysis.trim import Condition
 from heli_jax.config import Experiment
 from heli_jax.config.control_section import AcceptableConfig, ControlConfig
 from heli_jax.control.controller import Controller, commanded, in_loop
+from heli_jax.control.loops import all_stable
 from heli_jax.control.posterior import SteadyFlights, draws, vehicles_of
 from heli_jax.control.regulators import lqg, lqr, pid
 from heli_jax.control.tune import Flown, Scenario, Tuned, Tuning, gusts, tune
@@ -109,7 +110,7 @@ def run_control(
         progress("flights of the samples")
         tuning = Tuning(model, vehicles, flights, controller, scenario, most, bandwidth)
     margins = tuning.margins(controller)
-    kept = np.all([m.stable for m in margins], axis=0)
+    kept = all_stable(margins)
     run = ControlRun(
         config, model, saved, controller, tuned, commanded(model, controller), margins, tuning,
         tuning.flown(controller), float(np.sum(kept) / (len(kept) + lost)), lost,

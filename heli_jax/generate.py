@@ -297,10 +297,10 @@ def _run(
         )
 
     inputs = model.Inputs(**{k: jnp.asarray(v) for k, v in driven.items()})
-    # jit covers the whole run. Otherwise `simulate` would execute outputs and limits operation by
-    # operation. Key and rate are constants of this program.
     with located(f"{where}.rate"):
         require_sample_time(model, 1.0 / settings.rate)
+    # jit covers the whole run. Otherwise `simulate` would execute outputs and limits operation by
+    # operation. Key and rate are constants of this program.
     run = jax.device_get(jax.jit(fly)(params, inputs, start, pilot))
     # Times are float64 in any precision of the run, so that they equal k/rate, as in a log.
     run = run._replace(times=np.arange(n) / settings.rate)

@@ -4,9 +4,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import jax.numpy as jnp
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
-from heli_jax.config.section import Finite, Positive
+from heli_jax.config.section import Finite, Positive, Section
 from heli_jax.control.controller import Controller
 from heli_jax.control.laws import Cascade, Loop, Observer, StateFeedback
 from heli_jax.errors import InputError
@@ -18,11 +18,7 @@ _Table = dict[str, dict[str, Finite]]
 _Numbers = dict[str, Finite]
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True)
-
-
-class _StateFeedback(_Part):
+class _StateFeedback(Section):
     law: Literal["StateFeedback"]
     gains: _Table
     integral: _Table
@@ -32,7 +28,7 @@ class _StateFeedback(_Part):
     limits: _Numbers
 
 
-class _Observer(_Part):
+class _Observer(Section):
     law: Literal["Observer"]
     gains: _Table
     A: list[list[Finite]]
@@ -48,7 +44,7 @@ class _Observer(_Part):
     limits: _Numbers
 
 
-class _Loop(_Part):
+class _Loop(Section):
     p: Finite
     i: Finite | None
     d: Finite | None
@@ -57,7 +53,7 @@ class _Loop(_Part):
     lag: Finite
 
 
-class _Cascade(_Part):
+class _Cascade(Section):
     law: Literal["Cascade"]
     loops: dict[str, tuple[_Loop, ...]]
     dt: Positive
@@ -82,7 +78,7 @@ def read_controller(path: str | Path) -> Controller:
     path = path / "control.json" if path.is_dir() else path
     data = read_regular(path, "the control.json of `heli-jax control`", _LARGEST)
     try:
-        read = TypeAdapter(_File).validate_json(data).controller
+        read = _File.model_validate_json(data, strict=True).controller
     except ValidationError as e:
         first = e.errors(include_url=False)[0]
         place = ".".join(map(str, first["loc"])) or "the file"

@@ -154,6 +154,11 @@ def _opened(loop: SampledLoop, i: int) -> tuple[np.ndarray, ...]:
     return A + B[..., others] @ C[..., others, :], B[..., i], -C[..., i, :]
 
 
+_GROWS = 1e-5
+"""Growth of a sample above which a loop is unstable; positions without control drift by rounding.
+"""
+
+
 def loop_margins(loop: SampledLoop, dt: float) -> tuple[Margins, ...]:
     """Return the margins of loops (batch,), one for each command.
 
@@ -188,9 +193,9 @@ def _tustin(A: np.ndarray, b: np.ndarray, c: np.ndarray, dt: float) -> tuple[np.
     return (2.0 / dt) * (A - np.eye(n)) @ back, gain * x, gain * y, -np.einsum("ki,ki->k", c, x)
 
 
-_GROWS = 1e-5
-"""Growth of a sample above which a loop is unstable; positions without control drift by rounding.
-"""
+def all_stable(margins: Iterable[Margins]) -> np.ndarray:
+    """True (batch,) if the loops at all commands of a vehicle are stable."""
+    return np.all([m.stable for m in margins], axis=0)
 
 
 def frequencies(dt: float, count: int = 300, lowest: float = 0.003) -> np.ndarray:

@@ -30,6 +30,7 @@ from heli_jax.control.controller import (
 from heli_jax.control.loops import (
     Plant,
     SampledLoop,
+    all_stable,
     controller_responses,
     frequencies,
     growth,
@@ -382,5 +383,5 @@ class Tuning:
 
     def judged(self, controller: Controller) -> tuple[float, float]:
         """Return the least distance and the share of stable vehicles."""
-        stable = np.all([m.stable for m in self.margins(controller)], axis=0)
+        stable = all_stable(self.margins(controller))
         return float(np.min(np.abs(1.0 + self.responses(controller)))), float(np.mean(stable))

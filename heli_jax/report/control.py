@@ -13,6 +13,7 @@ from heli_jax.analysis.handling_qualities import handling_qualities
 from heli_jax.analysis.response_curves import Curve, Point
 from heli_jax.control.controller import gains_of
 from heli_jax.control.laws import Cascade, StateFeedback, content_of
+from heli_jax.control.loops import all_stable
 from heli_jax.numbers import number, percent
 from heli_jax.report import style
 from heli_jax.report.charts import (
@@ -83,7 +84,7 @@ def tuning(run: Any) -> str:
 def doubts(run: Any) -> list[str]:
     """Return what limits the trust in a controller."""
     found, tuned = [], run.tuned
-    unstable = 1.0 - float(np.mean(_stable(run)))
+    unstable = 1.0 - float(np.mean(all_stable(run.margins)))
     if unstable > 1.0 - _SHARE:
         found.append(f"{percent(unstable, 1)} of the vehicles are unstable. {_unstable(run)}")
     for words, share in (
@@ -132,14 +133,9 @@ def doubts(run: Any) -> list[str]:
     return found
 
 
-def _stable(run: Any) -> np.ndarray:
-    """True (vehicles,) if all loops of a vehicle are stable."""
-    return np.all([m.stable for m in run.margins], axis=0)
-
-
 def _unstable(run: Any) -> str:
     """Return the growing mode of an unstable vehicle, by participation factors, and a remedy."""
-    at = int(np.argmin(_stable(run)))
+    at = int(np.argmin(all_stable(run.margins)))
     A = run.tuning.closed_matrix(run.controller, at)
     size, right = np.linalg.eig(A)
     left = np.linalg.pinv(right)
@@ -176,7 +172,7 @@ def _quantile(values: np.ndarray, share: float, lost: int = 0) -> float:
     all_values = np.append(np.where(np.isnan(values), worst, values), np.full(lost, worst))
     # An infinite margin is no number to interpolate with.
     found = float(np.quantile(all_values, share, method="lower"))
-    return float("nan") if found == worst and share <= 0.5 else found
+    return float("nan") if found == worst else found
 
 
 def flight_table(run: Any) -> Table:
